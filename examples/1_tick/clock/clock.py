@@ -1,0 +1,12 @@
+"""Says what time it is, once per second."""
+
+from datetime import datetime
+
+from neuros.hooks import neuros_tick
+
+
+@neuros_tick(seconds=1.0, outputs="time")
+def tick(node):
+    packet = node.make_packet("time")
+    packet.data = datetime.now().strftime("%H:%M:%S")
+    return packet

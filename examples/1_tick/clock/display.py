@@ -1,0 +1,8 @@
+"""Shows the time that it is told."""
+
+from neuros.hooks import neuros_function
+
+
+@neuros_function(inputs="time")
+def show(node, time):
+    node.get_ros_node().get_logger().info(f"It is {time.data}")

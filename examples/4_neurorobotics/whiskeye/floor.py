@@ -1,0 +1,76 @@
+"""The same experiment in one loop without NeuROS: how fast it could be at best.
+
+The same model, network, figure and cadence of the figure as in project.json; what NeuROS adds or
+gains (nodes side by side) is the ratio to this. Prints one line of JSON.
+
+    python floor.py --duration 20 --rate 1 --seed 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from head_direction import HeadDirectionNetwork
+from heading_error import heading_error, yaw_of
+from heading_plot import HeadingPlot
+
+IMU_PERIOD_S = 0.02
+FOLDER = Path(__file__).resolve().parent
+
+
+def run(duration_s: float = 20.0, rate_rad_s: float = 1.0, seed: int = 1) -> dict[str, Any]:
+    """Simulate; only the loop is timed, not the construction of model, network and figure."""
+    model = mujoco.MjModel.from_xml_path(str(FOLDER / "whiskeye.xml"))
+    data = mujoco.MjData(model)
+    data.actuator("pose_theta").ctrl = rate_rad_s
+    data.actuator("neck_gmbl").ctrl = math.pi / 2
+    steps = round(IMU_PERIOD_S / model.opt.timestep)
+    imu, velocity, body = model.site("imu_body").id, np.zeros(6), data.body("body")
+    network = HeadDirectionNetwork(seed)
+    network.settle()
+    plot = HeadingPlot()
+    estimates: dict[int, float] = {}
+    truths: dict[int, float] = {}
+
+    start = time.perf_counter()
+    for packet in range(1, round(duration_s / IMU_PERIOD_S) + 1):
+        stamp_ns = packet * round(IMU_PERIOD_S * 1e9)
+        mujoco.mj_step(model, data, steps)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, imu, velocity, 1)
+        w, x, y, z = body.xquat.tolist()
+        truths[stamp_ns] = yaw_of(x, y, z, w)
+        plot.redraw_if_due(estimates, truths)
+        estimates[stamp_ns] = network.step(float(velocity[2]), IMU_PERIOD_S)
+        plot.redraw_if_due(estimates, truths)
+    wall_s = time.perf_counter() - start
+
+    return {
+        "simulated_s": duration_s,
+        "wall_s": wall_s,
+        "real_time_factor": duration_s / wall_s,
+        "redraws": plot.redraws,
+        **asdict(heading_error(plot.redraw(estimates, truths))),
+    }
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--duration", type=float, default=20.0, help="simulated seconds")
+    parser.add_argument("--rate", type=float, default=1.0, help="yaw rate in rad/s")
+    parser.add_argument("--seed", type=int, default=1, help="of the network")
+    arguments = parser.parse_args()
+    print(json.dumps(run(arguments.duration, arguments.rate, arguments.seed)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""A spiking head-direction network: two rings of neurons that hold, and turn, one bump of activity.
+
+Double ring after Xie, Hahnloser & Seung, "Double-ring network model of the head-direction system",
+Phys. Rev. E 66, 041902 (2002), in spiking neurons. Every neuron has a preferred heading. All
+synapses are inhibitory, weakest about the preferred heading of the sender, so a bump of activity
+inhibits everything but itself and stays where it is. The synapses of ring L are rotated by +phi,
+those of ring R by -phi: each ring alone would push the bump, together they are in balance. A turn
+raises the current into one ring and lowers it in the other by the same amount; the bump moves at a
+speed proportional to the difference, to either side.
+
+No ROS and no NeuROS in here. NEST has one kernel per process: one network per process at a time.
+NEST is imported with the first network, after the number of threads has been fixed.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+NEURONS_PER_RING = 120
+TAU_SYNAPSE_MS = 50.0
+BACKGROUND_PA = 1000.0
+INHIBITION_PA_PER_HZ = 24.0  # J0
+MODULATION_PA_PER_HZ = 20.0  # J1
+ROTATION_RAD = math.radians(45.0)  # phi
+DRIVE_PA_PER_RAD_S = 29.9
+RESOLUTION_MS = 0.1
+DELAY_MS = 1.0
+INITIAL_BUMP_PA = 150.0
+INITIAL_BUMP_MS = 200.0
+SETTLE_WINDOW_S = 0.02
+
+
+class HeadDirectionNetwork:
+    """Integrates a yaw rate into a heading.
+
+    Args:
+        seed: of the initial membrane potentials, the only randomness; 1 to 2**32 - 1.
+
+    The heading starts at zero, which is what is decoded at the end of :meth:`settle`.
+    Deterministic: the same seed and the same steps give the same headings, bit for bit.
+    """
+
+    def __init__(self, seed: int = 1) -> None:
+        self._nest = nest = _import_nest()
+        nest.ResetKernel()
+        nest.set(resolution=RESOLUTION_MS, local_num_threads=1, rng_seed=seed, print_time=False)
+        self._angles = 2.0 * np.pi * (np.arange(NEURONS_PER_RING) + 0.5) / NEURONS_PER_RING
+        self._left, self._right = self._ring(), self._ring()
+        self._neurons = self._left + self._right
+        for ring, rotation in ((self._left, ROTATION_RAD), (self._right, -ROTATION_RAD)):
+            self._connect(ring, rotation)
+        self._drive_left, self._drive_right = nest.Create("dc_generator", 2)
+        nest.Connect(self._drive_left, self._left, syn_spec={"delay": DELAY_MS})
+        nest.Connect(self._drive_right, self._right, syn_spec={"delay": DELAY_MS})
+        self._recorder = nest.Create("spike_recorder")
+        nest.Connect(self._neurons, self._recorder, syn_spec={"delay": DELAY_MS})
+        self._first_id = int(self._neurons[0].global_id)
+        self._phasors = np.tile(np.exp(1j * self._angles), 2)
+        self._raw_rad = self._zero_rad = self._heading_rad = 0.0
+        self._rate_rad_s = 0.0
+        self._min_delay_ms = float(nest.min_delay)
+
+    @property
+    def heading_rad(self) -> float:
+        """The last heading, in (-pi, pi], counter-clockwise positive."""
+        return self._heading_rad
+
+    @property
+    def quantum_s(self) -> float:
+        """Steps must last a whole number of these: other lengths change the spikes."""
+        return self._min_delay_ms / 1000.0
+
+    def settle(self, duration_s: float = 1.5) -> float:
+        """Start the bump and let it come to rest; what is decoded at the end becomes heading zero.
+
+        Takes ``duration_s`` of the network's time, at least 1 s. Returns the heading, 0. One 20 ms
+        window scatters by 1 to 2 degrees, so the end is the mean over the last half second.
+        """
+        windows = round(duration_s / SETTLE_WINDOW_S)
+        if duration_s < 1.0:
+            raise ValueError(f"settling for {duration_s!r} s is too short: the bump needs 1 s")
+        self._start_bump()
+        decoded = []
+        for _ in range(windows):
+            self.step(0.0, SETTLE_WINDOW_S)
+            decoded.append(self._raw_rad)
+        self._zero_rad = float(np.angle(np.exp(1j * np.array(decoded[-25:])).sum()))
+        self._heading_rad = 0.0
+        return self._heading_rad
+
+    def step(self, rate_rad_s: float, duration_s: float) -> float:
+        """Turn at ``rate_rad_s`` for ``duration_s``; returns the heading decoded over that time.
+
+        Raises ``ValueError`` where the duration is not a whole number of :attr:`quantum_s`.
+        """
+        quanta = round(duration_s / self.quantum_s)
+        if quanta < 1 or abs(quanta * self.quantum_s - duration_s) > 1e-6:
+            raise ValueError(
+                f"a step of {duration_s!r} s is not a whole number of {self.quantum_s} s"
+            )
+        self._set_drive(rate_rad_s)
+        self._recorder.n_events = 0
+        self._nest.Simulate(quanta * self._min_delay_ms)
+        self._decode()
+        return self._heading_rad
+
+    def _set_drive(self, rate_rad_s: float) -> None:
+        if rate_rad_s != self._rate_rad_s:
+            self._drive_left.amplitude = DRIVE_PA_PER_RAD_S * rate_rad_s
+            self._drive_right.amplitude = -DRIVE_PA_PER_RAD_S * rate_rad_s
+            self._rate_rad_s = rate_rad_s
+
+    def _decode(self) -> None:
+        """Population vector over the spikes of the last step; without spikes the heading stays."""
+        senders = self._recorder.events["senders"]
+        if len(senders) == 0:
+            return
+        vector = self._phasors[np.asarray(senders) - self._first_id].sum()
+        self._raw_rad = float(np.angle(vector))
+        turned = self._raw_rad - self._zero_rad
+        self._heading_rad = math.atan2(math.sin(turned), math.cos(turned))
+
+    def _ring(self) -> Any:
+        return self._nest.Create(
+            "iaf_psc_alpha",
+            NEURONS_PER_RING,
+            params={
+                "C_m": 250.0,
+                "tau_m": 10.0,
+                "t_ref": 2.0,
+                "E_L": -70.0,
+                "V_reset": -70.0,
+                "V_th": -55.0,
+                "tau_syn_ex": TAU_SYNAPSE_MS,
+                "tau_syn_in": TAU_SYNAPSE_MS,
+                "I_e": BACKGROUND_PA,
+                "V_m": self._nest.random.uniform(-70.0, -55.0),
+            },
+        )
+
+    def _connect(self, senders: Any, rotation_rad: float) -> None:
+        """Connect one ring to both, leaving weights of zero out (they cost time for nothing)."""
+        angles = self._angles
+        cosine = np.cos(angles[:, None] - angles[None, :] - rotation_rad)  # (receiver, sender)
+        per_hz = -INHIBITION_PA_PER_HZ + MODULATION_PA_PER_HZ * cosine
+        # An alpha synapse of peak w carries w * e * tau of charge per spike, so the mean current at
+        # 1 Hz is w * e * tau / 1000 pA; the sum over 2 N senders is a mean over headings.
+        weights = 1000.0 / (math.e * TAU_SYNAPSE_MS * 2 * NEURONS_PER_RING) * per_hz
+        ids = np.array(senders.tolist())
+        for receivers in (self._left, self._right):
+            post, pre = np.nonzero(weights)
+            self._nest.Connect(
+                ids[pre],
+                np.array(receivers.tolist())[post],
+                "one_to_one",
+                {"weight": weights[post, pre], "delay": np.full(post.size, DELAY_MS)},
+            )
+
+    def _start_bump(self) -> None:
+        """A current with one maximum, for a moment, breaks the symmetry of the ring."""
+        generators = self._nest.Create(
+            "dc_generator",
+            NEURONS_PER_RING,
+            params={
+                "amplitude": INITIAL_BUMP_PA * np.cos(self._angles - np.pi),
+                "stop": self._nest.biological_time + INITIAL_BUMP_MS,
+            },
+        )
+        for ring in (self._left, self._right):
+            self._nest.Connect(generators, ring, "one_to_one", {"delay": DELAY_MS})
+
+
+def _import_nest() -> ModuleType:
+    """NEST in one thread. More threads only lose time here, and OpenMP reads its limit once."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("PYNEST_QUIET", "1")
+    import nest
+
+    nest.verbosity = nest.VerbosityLevel.ERROR
+    return nest

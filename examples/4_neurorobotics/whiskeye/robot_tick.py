@@ -1,0 +1,24 @@
+"""WhiskEye in MuJoCo, one IMU period of physics (20 ms) every TICK_SECONDS of wall time."""
+
+import os
+
+from turning_robot import start_turning
+
+from neuros.hooks import Optional, neuros_initialise, neuros_tick
+
+
+@neuros_initialise()
+def start(node):
+    start_turning(node)
+
+
+@neuros_tick(
+    seconds=float(os.environ.get("TICK_SECONDS", "0.02")),
+    outputs=[Optional("imu"), Optional("pose")],
+)
+def simulate(node):
+    robot = node.get_user_data()
+    robot.sim.step_to_next()
+    if robot.is_done:
+        robot.end(node)
+    return robot.sim.read("imu"), robot.sim.read("pose")

@@ -1,0 +1,219 @@
+"""``neuros``: the parser, the commands, and the exit codes.
+
+=== ===========================================================
+0   ended normally
+1   a node failed, or a deadlock
+2   wrong usage of the command line
+3   invalid project
+4   something is missing on this machine (package, engine, image)
+130 ended by Ctrl+C
+143 ended by SIGTERM
+=== ===========================================================
+
+Heavy imports are late: ``neuros --help`` must not wait for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from neuros import __version__
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
+
+EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT = 1, 2, 3, 4
+
+_EXIT_CODES = """\
+exit codes:
+  0    ended normally
+  1    a node failed, or a deadlock
+  2    wrong usage
+  3    invalid project: every problem is listed with its file and line
+  4    something is missing on this machine
+  130  ended by Ctrl+C (a second one kills at once)
+  143  ended by SIGTERM
+"""
+
+
+def console_script() -> None:
+    """Entry point of the installed ``neuros`` command."""
+    sys.exit(main(sys.argv[1:]))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run one command; returns its exit code. Errors are written for the user."""
+    options = parser().parse_args(arguments)
+    try:
+        return int(options.command(options))
+    except ProjectError as error:
+        _complain(str(error))
+        count = len(error.problems)
+        _complain(f"{count} problem{'' if count == 1 else 's'}; nothing was started")
+        return EXIT_PROJECT
+    except UsageError as error:
+        _complain(f"neuros: {error}")
+        return EXIT_USAGE
+    except EnvironmentFault as error:
+        _complain(f"neuros: {error}")
+        return EXIT_ENVIRONMENT
+    except NeurosError as error:
+        _complain(f"neuros: {error}")
+        return EXIT_NODE
+    except KeyboardInterrupt:
+        return 130
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole grammar of the command line."""
+    result = argparse.ArgumentParser(
+        prog="neuros",
+        description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
+        epilog=_EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("--version", action="version", version=f"neuros {__version__}")
+    commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_launch(commands)
+    _add_validate(commands)
+    _add_graph(commands)
+    _add_node(commands)
+    return result
+
+
+def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    launch = commands.add_parser(
+        "launch",
+        help="run a project",
+        description="Run a project: start its nodes, connect them, and stay until all have ended.",
+        epilog=_EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_project(launch)
+    launch.add_argument(
+        "-n",
+        "--node",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="start only this node (repeatable); the others may run elsewhere",
+    )
+    launch.add_argument(
+        "-d",
+        "--domain-id",
+        type=int,
+        metavar="ID",
+        help="ROS domain (default: ROS_DOMAIN_ID; else 0 where the project has external topics"
+        " or -n is used; else the first free one of 1 to 101)",
+    )
+    launch.add_argument(
+        "--backend",
+        choices=("auto", "docker", "process", "in-process"),
+        default="auto",
+        help="where nodes run: each in a container, each in a process, or all in one process"
+        " (default: auto, which is docker where an engine and the images are there, else process)",
+    )
+    launch.add_argument(
+        "--duration",
+        metavar="SECONDS",
+        help="end after this time from the first hook on, drained: 30, or 30sim in simulated time",
+    )
+    launch.add_argument(
+        "-o",
+        "--output",
+        metavar="DIR",
+        help="the run folder; new or empty (default: runs/<project>/<utc time>)",
+    )
+    launch.add_argument("--dry-run", action="store_true", help="print what would be started")
+    launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
+    launch.set_defaults(command=_launch)
+
+
+def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    validate = commands.add_parser(
+        "validate",
+        help="check a project without running it",
+        description="Check a project and list every problem with its file, line and column.",
+    )
+    _add_project(validate)
+    validate.set_defaults(command=_validate)
+
+
+def _add_graph(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    graph = commands.add_parser(
+        "graph",
+        help="show the nodes and connections of a project",
+        description="Show the nodes and connections of a project without running it.",
+    )
+    _add_project(graph)
+    graph.add_argument(
+        "--format",
+        choices=("text", "mermaid"),
+        default="text",
+        help="for the terminal, or a Mermaid diagram for Markdown (default: text)",
+    )
+    graph.set_defaults(command=_graph)
+
+
+def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """What containers and processes run; it is started by ``launch``, not by people."""
+    node = commands.add_parser("node", add_help=False)
+    node.add_argument("node_files", nargs="+")
+    node.add_argument("--in-memory", action="store_true")
+    node.add_argument("--duration-sim", type=float)
+    node.add_argument("--debug", action="store_true")
+    node.set_defaults(command=_node)
+
+
+def _add_project(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
+    )
+    command.add_argument(
+        "-p", "--project", dest="project_option", metavar="PROJECT", help="the same, as an option"
+    )
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="PATH=VALUE",
+        help="change a key of the project: nodes.NAME.KEY...=VALUE or"
+        " connections.SRC.OUT.DST.IN.KEY=VALUE (JSON if it parses; always text in environment;"
+        " nothing removes the key)",
+    )
+
+
+def _launch(options: argparse.Namespace) -> int:
+    from neuros.cli.launch import launch
+
+    return launch(options)
+
+
+def _validate(options: argparse.Namespace) -> int:
+    from neuros.cli.projects import load
+
+    project = load(options)
+    print(
+        f"{project.file}: valid: {len(project.nodes)} nodes,"
+        f" {len(project.connections)} connections"
+    )
+    return 0
+
+
+def _graph(options: argparse.Namespace) -> int:
+    from neuros.cli.projects import load
+    from neuros.project.graph import graph_mermaid, graph_text
+
+    project = load(options)
+    print(graph_mermaid(project) if options.format == "mermaid" else graph_text(project))
+    return 0
+
+
+def _node(options: argparse.Namespace) -> int:
+    from neuros.cli.node import run_node
+
+    return run_node(options)
+
+
+def _complain(text: str) -> None:
+    print(text, file=sys.stderr)

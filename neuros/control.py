@@ -1,0 +1,101 @@
+"""The control channel between the supervisor and the processes that hold the nodes.
+
+A Unix socket in the run folder carries one JSON object per line. It is no part of the data path:
+nodes report once per second, on a change of state and at the end; the supervisor answers rarely.
+
+=========== ========================================================= =====================
+kind        sent by a process of nodes                                fields
+=========== ========================================================= =====================
+hello       when it is there                                          nodes, pid
+report      once per second, on demand, at the end                    node, ... (see runtime)
+first_hook  when a node has started its first hook                    node
+shutdown    when a plugin calls ``node.shutdown``                     node, reason, drain_s
+failed      when a node fails                                         node, text, hook, where
+explanation in answer to ``explain``                                  node, lines
+=========== ========================================================= =====================
+
+======= ================================================ ======
+kind    sent by the supervisor                           fields
+======= ================================================ ======
+probe   report between two events, all at one moment     number
+explain say why nothing moves
+drain   stop the hooks that send unasked
+stop    start no further hook, finalise and end
+======= ================================================ ======
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+SOCKET_NAME = "control.sock"
+
+
+class Lines:
+    """A connected socket as a sequence of JSON objects, one per line."""
+
+    def __init__(self, connected: socket.socket) -> None:
+        self.socket = connected
+        self._rest = b""
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self.socket.fileno()
+
+    def send(self, kind: str, **fields: Any) -> bool:
+        """Send one object; returns False if the other end is gone."""
+        try:
+            self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
+        except OSError:
+            return False
+        return True
+
+    def receive(self) -> list[Mapping[str, Any]] | None:
+        """What has arrived, after one read; ``None`` once the other end is gone."""
+        try:
+            data = self.socket.recv(1 << 16)
+        except (BlockingIOError, InterruptedError):
+            return []
+        except OSError:
+            return None
+        if not data:
+            return None
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return [json.loads(line) for line in lines]
+
+    def close(self) -> None:
+        """Hang up."""
+        self.socket.close()
+
+
+@contextlib.contextmanager
+def _short_path(path: Path) -> Iterator[str]:
+    """A name for ``path`` that fits into the 107 bytes which Unix sockets allow."""
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
+
+
+def listen(run_folder: Path) -> socket.socket:
+    """The supervisor's end: a listening socket in the run folder."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    with _short_path(run_folder / SOCKET_NAME) as name:
+        listening.bind(name)
+    listening.listen(256)
+    return listening
+
+
+def connect(run_folder: Path) -> Lines:
+    """A node's end; raises ``OSError`` where no supervisor listens."""
+    connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    with _short_path(run_folder / SOCKET_NAME) as name:
+        connected.connect(name)
+    return Lines(connected)

@@ -1,0 +1,71 @@
+"""Where a node's wall time goes: executing, waiting for input, blocked by a receiver, or idle.
+
+Between two events nothing of a node changes, so the time between them has one cause, which is
+asked for once, when the next event arrives.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from neuros.core.hook import Hook
+
+
+class State(str, Enum):
+    """What a node does at a moment."""
+
+    REGISTERING = "registering"
+    EXECUTING = "executing"
+    WAITING = "waiting"
+    BLOCKED = "blocked"
+    IDLE = "idle"
+    SCHEDULING = "scheduling"
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Why a node does nothing: a state, and the input or connection behind it."""
+
+    state: State
+    cause: str = ""
+
+
+REGISTERING = Rest(State.REGISTERING)
+SCHEDULING = Rest(State.SCHEDULING)
+IDLE = Rest(State.IDLE)
+
+
+@dataclass
+class Accounts:
+    """Nanoseconds of wall time by cause; executing time is kept by each hook."""
+
+    totals_ns: Counter[Rest] = field(default_factory=Counter)
+
+    def spend(self, rest: Rest, duration_ns: int) -> None:
+        """Book time in which the node did nothing."""
+        self.totals_ns[rest] += duration_ns
+
+
+def cause_of_rest(hooks: Iterable[Hook]) -> Rest:
+    """What holds up the node: a receiver, else a missing input, else only its clock.
+
+    A hook that could run (and will, at the next event) makes it ``SCHEDULING``. Before its time a
+    tick hook waits for nothing but its clock.
+    """
+    waiting: Rest | None = None
+    blocked: Rest | None = None
+    for hook in hooks:
+        if not (hook.is_enabled and hook.is_due):
+            continue
+        if hook.is_ready():
+            return SCHEDULING
+        if hook.is_missing_input():
+            if waiting is None:
+                slot = next(slot for slot in hook.slots if slot.missing)
+                waiting = Rest(State.WAITING, slot.name)
+        elif blocked is None:
+            blocked = Rest(State.BLOCKED, str(hook.blocking_outlets()[0].connection))
+    return blocked or waiting or IDLE

@@ -1,0 +1,244 @@
+"""One hook of a running node: what it waits for, and what it has done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from neuros.core.flow import Outlet
+from neuros.core.inputs import InputSlot, Mailbox
+from neuros.errors import HookError
+from neuros.hooks import HookKind, HookSpec, OutputSpec
+from neuros.project.model import Port
+
+
+class Output:
+    """One output of the node and the connections that it feeds.
+
+    ``packet_type`` is the message class that a hook must return for it, ``None`` if any will do.
+    """
+
+    __slots__ = ("connections", "outlets", "packet_type", "port")
+
+    def __init__(self, port: Port, outlets: Sequence[Outlet], packet_type: type | None) -> None:
+        self.port = port
+        self.outlets = tuple(outlets)
+        self.connections = tuple(outlet.connection for outlet in outlets)
+        self.packet_type = packet_type
+
+
+class Hook:
+    """A hook and its state; readiness is kept up to date by counting, not by looking.
+
+    Attributes:
+        blocked: number of its outlets that are blocked now.
+        is_due: False only for a tick between two due times, and for a source with nothing to send.
+        is_enabled: whether the node's phase of life lets it run at all.
+        executions, busy_ns: how often it ran, and for how long in all.
+    """
+
+    __slots__ = (
+        "blocked",
+        "busy_ns",
+        "due_ns",
+        "executions",
+        "is_due",
+        "is_enabled",
+        "loops",
+        "missed_ticks",
+        "name",
+        "optional_outputs",
+        "outputs",
+        "period_ns",
+        "slots",
+        "spec",
+    )
+
+    def __init__(
+        self, spec: HookSpec, slots: Sequence[InputSlot], outputs: Mapping[str, Output]
+    ) -> None:
+        self.spec = spec
+        self.name = spec.name
+        self.slots = tuple(slots)
+        self.outputs = tuple(outputs[port.name] for port in spec.outputs)
+        self.optional_outputs = tuple(port.is_optional for port in spec.outputs)
+        self.blocked = 0
+        self.is_due = spec.period_s is None
+        self.is_enabled = False
+        self.executions = 0
+        self.busy_ns = 0
+        self.due_ns = 0
+        self.missed_ticks = 0
+        self.period_ns = 0 if spec.period_s is None else max(1, round(spec.period_s * 1e9))
+        self.loops = tuple(self._loops())
+        for outlet in self.outlets():
+            outlet.hooks.append(self)
+            self.blocked += outlet.is_blocked
+
+    def outlets(self) -> list[Outlet]:
+        """Every connection that the hook may send on."""
+        return [outlet for output in self.outputs for outlet in output.outlets]
+
+    def is_ready(self) -> bool:
+        """Whether it may start now: input, output and timer condition, and the node's phase."""
+        if not (self.is_enabled and self.is_due) or self.is_missing_input():
+            return False
+        return self.can_send()
+
+    def can_send(self) -> bool:
+        """Whether none of its outlets is blocked, but for packets that its own start would take."""
+        return not self.blocked or len(self._freed_outlets()) == self.blocked
+
+    def is_missing_input(self) -> bool:
+        """Whether a required input has no packet."""
+        for slot in self.slots:  # noqa: SIM110 - any() over a generator takes thrice as long
+            if slot.missing:
+                return True
+        return False
+
+    def is_blocked(self) -> bool:
+        """Whether it has all inputs, and only its receivers hold it up."""
+        return (
+            self.is_enabled and self.is_due and not self.is_missing_input() and not self.can_send()
+        )
+
+    def blocking_outlets(self) -> list[Outlet]:
+        """The outlets that hold it up."""
+        freed = self._freed_outlets()
+        return [outlet for outlet in self.outlets() if outlet.is_blocked and outlet not in freed]
+
+    def has_packet(self) -> bool:
+        """Whether a start would take a packet."""
+        return any(slot.has_packet() for slot in self.slots)
+
+    def set_due(self, start_ns: int, now_ns: int) -> None:
+        """Set the next due time, ``start + k * period`` after now; passed ones coalesce."""
+        ticks_passed = (now_ns - start_ns) // self.period_ns
+        if self.due_ns:
+            self.missed_ticks += ticks_passed - (self.due_ns - start_ns) // self.period_ns
+        self.due_ns = start_ns + (ticks_passed + 1) * self.period_ns
+        self.is_due = False
+
+    def packets_of(self, result: Any) -> Sequence[Any]:
+        """What the hook returned, one entry per declared output.
+
+        Raises:
+            HookError: if the count, a type, or a missing packet is not what was declared.
+        """
+        outputs = self.outputs
+        if not outputs:
+            if result is not None:
+                raise self.error(f"returned {_kind(result)}, but declares no outputs")
+            return ()
+        if result is None:
+            packets: Sequence[Any] = (None,) * len(outputs)
+        elif isinstance(result, tuple | list):
+            packets = result
+        else:
+            packets = (result,)
+        if len(packets) != len(outputs):
+            names = ", ".join(output.port.name for output in outputs)
+            raise self.error(
+                f"returned {_count(len(packets), 'packet')}, but declares"
+                f" {_count(len(outputs), 'output')} ({names})"
+            )
+        for output, is_optional, packet in zip(
+            outputs, self.optional_outputs, packets, strict=True
+        ):
+            if packet is None:
+                if not is_optional:
+                    raise self.error(
+                        f"returned no packet for output '{output.port.name}': return one, or"
+                        f' declare it as Optional("{output.port.name}")'
+                    )
+            elif output.packet_type is not None and not isinstance(packet, output.packet_type):
+                raise self.error(
+                    f"returned {_kind(packet)} for output '{output.port.name}', which carries"
+                    f' {output.port.type}: use node.make_packet("{output.port.name}")'
+                )
+        return packets
+
+    def error(self, text: str) -> HookError:
+        """A ``HookError`` with the address of this hook."""
+        return HookError(text, hook=self.name, where=self.spec.where)
+
+    def _loops(self) -> list[tuple[Outlet, InputSlot, Mailbox]]:
+        """Connections from this hook to itself."""
+        return [
+            (outlet, slot, mailbox)
+            for outlet in self.outlets()
+            for slot in self.slots
+            for mailbox in slot.mailboxes
+            if mailbox.inlet.key is outlet.connection
+        ]
+
+    def _freed_outlets(self) -> list[Outlet]:
+        """The blocked ones of its outlets whose packets its own start would acknowledge."""
+        return [
+            outlet
+            for outlet, slot, mailbox in self.loops
+            if outlet.is_blocked
+            and slot.would_take(mailbox)
+            and outlet.frees(mailbox.inlet.position_if_taken(mailbox))
+        ]
+
+
+class Source(Hook):
+    """Packets from outside the hooks (a simulator's own thread), sent as if a hook returned them.
+
+    It is due while it holds an offer; several wait in line.
+    """
+
+    __slots__ = ("_accepted", "_offers")
+
+    def __init__(self, names: Sequence[str], outputs: Mapping[str, Output]) -> None:
+        spec = HookSpec(HookKind.FUNCTION, _offer, (), tuple(OutputSpec(name) for name in names))
+        super().__init__(spec, (), outputs)
+        self.name = f"submit({', '.join(names)})"
+        self._offers: dict[object, tuple[Sequence[Any], Callable[[], None]]] = {}
+        self._accepted: Callable[[], None] = _nobody
+        self.is_due = False
+
+    def offer(self, packets: Sequence[Any], accepted: Callable[[], None]) -> Callable[[], None]:
+        """Hold packets, one per output, until the engine takes them; returns how to withdraw."""
+        ticket = object()
+        self._offers[ticket] = (packets, accepted)
+        self.is_due = True
+
+        def withdraw() -> None:
+            self._offers.pop(ticket, None)
+            self.is_due = bool(self._offers)
+
+        return withdraw
+
+    def take(self) -> Sequence[Any]:
+        """Give away the oldest offer."""
+        packets, self._accepted = self._offers.pop(next(iter(self._offers)))
+        self.is_due = bool(self._offers)
+        return packets
+
+    def accept(self) -> None:
+        """Tell who made the offer taken last that it has been sent."""
+        accepted, self._accepted = self._accepted, _nobody
+        accepted()
+
+    def error(self, text: str) -> HookError:
+        """A ``HookError``; an offer comes from no line of the plugin."""
+        return HookError(text, hook=self.name)
+
+
+def _offer() -> None:
+    """Stands for the function of a :class:`Source`."""
+
+
+def _nobody() -> None:
+    """Nobody to tell."""
+
+
+def _kind(value: object) -> str:
+    kind = type(value)
+    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

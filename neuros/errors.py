@@ -1,0 +1,92 @@
+"""Every error that NeuROS raises on purpose.
+
+::
+
+    NeurosError
+    ├── ProjectError        the project files are wrong        exit code 3
+    ├── UsageError          the command line is wrong          exit code 2
+    ├── EnvironmentFault    something is missing on this machine   exit code 4
+    ├── NodeError           a node failed                      exit code 1
+    │   ├── HookError       ... in a hook of its plugin
+    │   ├── PluginError     ... while its plugin was loaded
+    │   ├── ModelError      ... since its simulator cannot be set up as declared
+    │   └── ProtocolError   ... since a neighbour broke the rules of a connection
+    └── DeadlockError       no node can ever run again         exit code 1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class NeurosError(Exception):
+    """Base of all errors that NeuROS raises on purpose; its text is written for the user."""
+
+
+@dataclass(frozen=True, order=True)
+class Problem:
+    """One thing wrong in a project file.
+
+    ``line`` and ``column`` count from 1; ``pointer`` is a JSON pointer (RFC 6901).
+    """
+
+    file: str
+    line: int
+    column: int
+    pointer: str
+    text: str
+    hint: str = ""
+
+    def __str__(self) -> str:
+        hint = f" ({self.hint})" if self.hint else ""
+        return f"{self.file}:{self.line}:{self.column}: {self.pointer}: {self.text}{hint}"
+
+
+class ProjectError(NeurosError):
+    """All problems of a project at once."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(sorted(set(problems)))
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class UsageError(NeurosError):
+    """The command line asks for something that makes no sense."""
+
+
+class EnvironmentFault(NeurosError):
+    """A package, an engine or an image that the run needs is missing on this machine."""
+
+
+class NodeError(NeurosError):
+    """A node failed."""
+
+
+class HookError(NodeError):
+    """A hook is declared wrongly, failed, or returned what it must not return.
+
+    ``where`` is ``file:line`` of the hook in the plugin.
+    """
+
+    def __init__(self, text: str, *, hook: str = "", where: str = "") -> None:
+        self.text, self.hook, self.where = text, hook, where
+        super().__init__(
+            ": ".join(part for part in (where, hook and f"hook '{hook}'", text) if part)
+        )
+
+
+class PluginError(NodeError):
+    """A plugin cannot be imported, or declares no hooks."""
+
+
+class ModelError(NodeError):
+    """A simulator cannot be set up as its node file declares."""
+
+
+class ProtocolError(NodeError):
+    """A neighbour broke the rules of a connection (for instance a lossless one lost a packet)."""
+
+
+class DeadlockError(NeurosError):
+    """Nothing runs, nothing is under way, and nothing could wake a node any more."""

@@ -1,0 +1,94 @@
+"""What ``install.py`` does: make ``.venv``, install NeuROS into it, prove that it imports.
+
+It runs on a bare Python, before anything is installed: standard library only, and nothing of
+NeuROS but its errors. Everything that can be missing on a machine ends in one sentence with the
+command that mends it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes.util
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from neuros.errors import EnvironmentFault
+from neuros.installation.environment import Environment, extras_of
+from neuros.installation.machine import Machine, system_install
+from neuros.installation.progress import Progress
+
+STANDARD_EXTRAS = ("mujoco", "nest", "plot")
+DEVELOPER_EXTRAS = ("dev", "docs")
+
+
+def main(arguments: Sequence[str], root: str) -> int:
+    """Run ``install.py``; returns its exit code (0, 1 a test failed, 4 or 130).
+
+    Raises:
+        SystemExit: from argparse, with 2 for wrong arguments and 0 for ``--help``.
+    """
+    folder, progress = Path(root), Progress(sys.stdout)
+    options = _options(arguments, extras_of((folder / "pyproject.toml").read_text("utf-8")))
+    try:
+        Machine.here().require_support()
+        environment = Environment(folder, options.extras, progress)
+        if not (options.yes or environment.is_installed or _agrees(environment.folder)):
+            return 130
+        environment.install()
+        if options.test:
+            progress.step("installed; running the checks and tests")
+            return subprocess.call([str(environment.python), str(folder / "tests" / "run")])
+    except EnvironmentFault as fault:
+        progress.fail(f"install.py: {fault}")
+        return 4
+    except KeyboardInterrupt:
+        progress.fail("install.py: interrupted; run it again to go on")
+        return 130
+    for row in _next_steps(folder, environment.extras):
+        progress.step(row)
+    return 0
+
+
+def _options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespace:
+    further = [extra for extra in known if extra not in STANDARD_EXTRAS]
+    parser = argparse.ArgumentParser(
+        prog="install.py",
+        description="Make .venv and install NeuROS into it, with MuJoCo, NEST and Matplotlib.",
+        epilog="Exit codes: 0 installed, 1 a test failed, 2 usage, 4 something is missing on this "
+        "machine, 130 cancelled.",
+    )
+    parser.add_argument("-y", "--yes", action="store_true", help="ask nothing")
+    parser.add_argument(
+        "--extras", metavar="A,B", default="", help=f"install more: {', '.join(further)}"
+    )
+    parser.add_argument("--dev", action="store_true", help="the same as --extras dev,docs")
+    parser.add_argument("--test", action="store_true", help="then run all checks and tests")
+    options = parser.parse_args(arguments)
+    extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
+    extras.update(DEVELOPER_EXTRAS if options.dev else ())
+    extras.update(("dev",) if options.test else ())
+    if unknown := sorted(extras - set(known)):
+        parser.error(f"no such extra: {', '.join(unknown)} (there are {', '.join(known)})")
+    options.extras = sorted(extras)
+    return options
+
+
+def _agrees(folder: Path) -> bool:
+    """Ask once, where there is somebody to answer."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return True
+    answer = input(f"This fills {folder} (0.6 GB) with packages from PyPI. Go on? [Y/n] ")
+    return answer.strip().lower() in ("", "y", "yes")
+
+
+def _next_steps(root: Path, extras: Sequence[str]) -> list[str]:
+    rows = []
+    if not any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa")):
+        remedy = system_install(apt="libegl1 libgl1-mesa-dri libosmesa6", dnf="mesa-libEGL")
+        rows.append(f"simulated cameras need a graphics library: {remedy}")
+    example = "4_neurorobotics/whiskeye" if "nest" in extras else "3_physics_simulation/elevator"
+    is_here = Path.cwd() == root
+    launch = "./launch.py examples" if is_here else f"{root / 'launch.py'} {root / 'examples'}"
+    return [*rows, f"installed; the next command: {launch}/{example}"]

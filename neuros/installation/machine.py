@@ -1,0 +1,102 @@
+"""The machine that NeuROS is to be installed on: what it must have, and how to mend it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from neuros.errors import EnvironmentFault
+
+OLDEST, NEWEST, NEWEST_FOR_NEST = (3, 10), (3, 14), (3, 13)
+
+_DOCKER = 'docker run --rm -it --platform linux/amd64 -v "$PWD":/neuros -w /neuros python:3.12 bash'
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What decides whether the packages of ROS 2 exist for this Python."""
+
+    python: tuple[int, int]
+    implementation: str
+    system: str
+    processor: str
+    glibc: tuple[int, ...]
+    """Empty with another C library."""
+
+    @classmethod
+    def here(cls) -> Machine:
+        """The machine, and the Python, that this runs on."""
+        libc, version = platform.libc_ver()
+        return cls(
+            python=sys.version_info[:2],
+            implementation=platform.python_implementation(),
+            system=platform.system(),
+            processor=platform.machine() if sys.maxsize > 2**32 else "a 32-bit Python",
+            glibc=tuple(map(int, re.findall(r"\d+", version))) if libc == "glibc" else (),
+        )
+
+    def require_support(self) -> None:
+        """Raise ``EnvironmentFault`` where no packages exist."""
+        if self.system != "Linux" or self.processor != "x86_64":
+            raise EnvironmentFault(
+                "the Python packages of ROS 2 exist for Linux on x86_64 only, and this is "
+                f"{self.system} on {self.processor}: use Docker, {_DOCKER}"
+            )
+        if self.glibc < (2, 28):
+            raise EnvironmentFault(
+                "the Python packages of ROS 2 need glibc 2.28 or newer (Debian 10, Ubuntu 20.04), "
+                f"which this system does not have: use Docker, {_DOCKER}"
+            )
+        if self.implementation != "CPython" or not OLDEST <= self.python <= NEWEST:
+            raise EnvironmentFault(
+                f"NeuROS needs CPython {dotted(OLDEST)} to {dotted(NEWEST)}, and this is "
+                f"{self.implementation} {dotted(self.python)}: run {other_python()} install.py"
+            )
+
+
+def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment in which the Python of ``.venv`` finds its own packages and no others.
+
+    A sourced ROS 2, or a parent that runs in a ``.venv`` of its own, would come first otherwise.
+    """
+    foreign = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "AMENT_PREFIX_PATH"}
+    foreign |= {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "RMW_IMPLEMENTATION"}
+    foreign |= {"PIP_TARGET", "PIP_PREFIX", "PIP_USER", "PIP_ROOT"}
+    return {key: value for key, value in environment.items() if key not in foreign}
+
+
+def explain_missing_library(text: str) -> str:
+    """Add the remedy to a message about a missing shared library; others stay as they are."""
+    missing = re.search(r"(lib[\w.+-]+): cannot open shared object", text)
+    if not missing:
+        return text
+    remedy = system_install(
+        apt="libgl1 libegl1 libgomp1 libstdc++6", dnf="libglvnd-glx libglvnd-egl libgomp libstdc++"
+    )
+    return f"{text}; {missing.group(1)} belongs to the operating system: {remedy}"
+
+
+def system_install(*, apt: str, dnf: str) -> str:
+    """The command that installs packages of the operating system."""
+    sudo = "" if os.geteuid() == 0 else "sudo "
+    if shutil.which("apt-get"):
+        return f"{sudo}apt-get install -y {apt}"
+    if shutil.which("dnf"):
+        return f"{sudo}dnf install -y {dnf}"
+    return f"install what Debian calls {apt}"
+
+
+def other_python() -> str:
+    """A supported Python that is on the path, or the one to install."""
+    names = [f"python3.{minor}" for minor in range(NEWEST_FOR_NEST[1], OLDEST[1] - 1, -1)]
+    return next((name for name in names if shutil.which(name)), "python3.12")
+
+
+def dotted(version: tuple[int, ...]) -> str:
+    """``(3, 12)`` as ``3.12``."""
+    return ".".join(map(str, version))

@@ -1,0 +1,105 @@
+"""pip: run where it can be watched, and explained where it fails."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from neuros.errors import EnvironmentFault
+from neuros.installation.machine import clean_environment, other_python, system_install
+from neuros.installation.progress import Progress
+
+_PIP_INSTALL = (
+    *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
+    *("--progress-bar", "off", "--prefer-binary", "--editable"),
+)
+
+
+def install(python: Path, root: Path, extras: Sequence[str], progress: Progress) -> None:
+    """Install the source tree at ``root``, editable, with its extras, for ``python`` (in a venv).
+
+    Raises:
+        EnvironmentFault: with a sentence for the user; pip's own output is in a log file.
+    """
+    folder = python.parent.parent
+    free_bytes, need_bytes = shutil.disk_usage(folder).free, _needed_bytes(extras)
+    if free_bytes < need_bytes:
+        raise EnvironmentFault(
+            f"{root} has {free_bytes / 1e9:.1f} GB free and the packages need "
+            f"{need_bytes / 1e9:.1f} GB: make room (df -h)"
+        )
+    log, names = folder / "neuros-install.log", f"[{','.join(extras)}]"
+    progress.step(f"installing neuros{names} from PyPI (log: {log})")
+    output = _follow([str(python), *_PIP_INSTALL, f".{names}"], root, log, progress)
+    if output is not None:
+        errors = [row for row in output.splitlines() if "error" in row.lower()]
+        for row in (errors or output.splitlines())[-6:]:
+            progress.step(f"  {row.strip()[:300]}")
+        raise EnvironmentFault(f"{explain_pip_failure(output)} (log: {log})")
+
+
+def _follow(command: Sequence[str], root: Path, log: Path, progress: Progress) -> str | None:
+    """Run pip and show what it does; ``None``, or all that it wrote if it failed."""
+    rows: list[str] = []
+    with (
+        log.open("w", encoding="utf-8") as file,
+        subprocess.Popen(
+            command,
+            cwd=root,
+            env=clean_environment(os.environ),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+        ) as process,
+    ):
+        for row in process.stdout or ():
+            file.write(row)
+            rows.append(row)
+            if row.startswith("Installing collected packages"):
+                progress.step(f"unpacking {row.count(',') + 1} packages")
+            elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
+                progress.detail(row.strip())
+    return "".join(rows) if process.returncode else None
+
+
+def explain_pip_failure(output: str) -> str:
+    """What made pip fail, from all that it wrote: one sentence, cause and remedy."""
+    for pattern, sentence in (
+        ("No space left on device", "the disk is full: make room (df -h)"),
+        (
+            "CERTIFICATE_VERIFY_FAILED",
+            "the certificate of the package index is not trusted: "
+            "export PIP_CERT=/path/to/your/authority.pem",
+        ),
+        (
+            "Name or service not known|name resolution|NewConnectionError|ConnectTimeout|"
+            "ReadTimeout|ProxyError|Network is unreachable|Max retries exceeded|"
+            "Connection refused|Connection reset",
+            "the package index https://pypi.org cannot be reached: check the network "
+            "(behind a proxy: export HTTPS_PROXY=http://HOST:PORT), then install.py again",
+        ),
+        (
+            r"(command|unable to execute) '?\S*(gcc|g\+\+|cc|clang)\b|Python\.h: No such file",
+            "a package has to be compiled and there is no C compiler: "
+            + system_install(apt="build-essential python3-dev", dnf="gcc gcc-c++ python3-devel"),
+        ),
+        (
+            "No matching distribution found|Could not find a version",
+            f"a package does not exist for this Python: run {other_python()} install.py",
+        ),
+        ("Permission denied", "a file cannot be written: sudo chown -R $(id -un) ."),
+    ):
+        if re.search(pattern, output):
+            return sentence
+    return "pip failed"
+
+
+def _needed_bytes(extras: Sequence[str]) -> float:
+    """Room for the packages and for pip's copies of them while it works."""
+    per_extra = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9}
+    return 1.0e9 + sum(per_extra.get(extra, 0.0) for extra in extras)

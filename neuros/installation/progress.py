@@ -1,0 +1,42 @@
+"""Progress that is visible on a terminal and readable in a log."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from typing import TextIO
+
+_QUIET_S = 10.0
+
+
+class Progress:
+    """One line per step, with the time since the start; on a terminal, details in place."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._is_terminal = stream, stream.isatty()
+        self._start = self._last = time.monotonic()
+
+    def step(self, text: str) -> None:
+        """Say what happens now."""
+        self._last = time.monotonic()
+        self._write(f"{self._line(text)}\n")
+
+    def detail(self, text: str) -> None:
+        """Show that something moves: at once on a terminal, else after ten quiet seconds."""
+        if self._is_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            self._write(self._line(f"  {text}")[:width])
+        elif time.monotonic() - self._last >= _QUIET_S:
+            self.step(f"  {text}")
+
+    def fail(self, text: str) -> None:
+        """Say what ended it."""
+        self._write(f"{text}\n")
+
+    def _line(self, text: str) -> str:
+        return f"[{time.monotonic() - self._start:6.1f} s] {text}"
+
+    def _write(self, text: str) -> None:
+        clear = "\r\x1b[K" if self._is_terminal else ""
+        self._stream.write(clear + text)
+        self._stream.flush()

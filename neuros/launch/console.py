@@ -1,0 +1,213 @@
+"""What a run shows on the console: the lines that its nodes write to their logs.
+
+Nodes write their own log files; the launcher only reads along. So a slow terminal never holds up
+a node, and the logs are complete whatever happens to the launcher.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
+"""What ROS 2 prints unless ``RCUTILS_CONSOLE_OUTPUT_FORMAT`` says otherwise."""
+
+_RECORD = re.compile(r"\[(?P<severity>[A-Z]+)\] \[\d+\.\d{9}\] \[(?P<name>[^\]\s]+)\]: ?")
+_TOKEN = re.compile(r"\{(\w+)\}")
+_RESET = "\x1b[0m"
+_NODE_COLOURS = ("36", "32", "35", "34", "96", "92", "95", "94")
+_SEVERITY_COLOURS = {"DEBUG": "2", "WARN": "33", "ERROR": "31", "FATAL": "1;31"}
+
+# ECMA-48: control sequences, of which SGR ("...m") sets colours; then strings such as window
+# titles, which end with BEL or ST; then all other escape sequences.
+_ESCAPE = re.compile(
+    r"\x1b\[(?P<sgr>[0-9;:]*)m"
+    r"|(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"
+    r"|(?:\x1b[\]PX^_]|[\x90\x98\x9d-\x9f])[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?"
+    r"|\x1b[ -/]*[0-~]?"
+)
+_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1a\x1c-\x1f\x7f-\x9f\u2028\u2029]|\x1b(?!\[[0-9;:]*m)")
+_READ_BYTES = 1 << 16
+_LONGEST_LINE_BYTES = 1 << 16
+
+
+class LogTail:
+    """Shows complete lines of several growing files, each in a colour of its own.
+
+    Args:
+        files: the name to show, usually the node's, and the file, which need not exist yet.
+        write: takes text of whole lines, with the line feed.
+        colours: whether to colour; if not, colours that nodes write themselves go, too.
+    """
+
+    def __init__(
+        self, files: Mapping[str, Path], write: Callable[[str], None], colours: bool
+    ) -> None:
+        palette = {
+            name: _NODE_COLOURS[index % len(_NODE_COLOURS)] for index, name in enumerate(files)
+        }
+        self._painter = _Painter(palette if colours else {})
+        self._files = [_GrowingFile(name, path) for name, path in files.items()]
+        self._write = write
+
+    def poll(self) -> bool:
+        """Show what is new, at most 64 KiB per file; whether anything was."""
+        found = False
+        for file in self._files:
+            lines = file.read_lines()
+            found = found or file.has_grown
+            self._show(file.name, lines)
+        return found
+
+    def drain(self) -> None:
+        """Show all that is left, incomplete last lines too, and close the files."""
+        while self.poll():
+            pass
+        for file in self._files:
+            self._show(file.name, file.take_rest())
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; a second call has no effect."""
+        for file in self._files:
+            file.close()
+
+    def __enter__(self) -> LogTail:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _show(self, name: str, lines: list[bytes]) -> None:
+        if lines:
+            self._write("".join(f"{self._painter.paint(name, line)}\n" for line in lines))
+
+
+def format_record(
+    severity: str, name: str, text: str, time_ns: int | None = None, layout: str = LAYOUT
+) -> str:
+    """One log record as ROS 2 prints it, without the line feed.
+
+    ``time_ns`` is Unix time, now if ``None``. ``layout`` is a value of
+    ``RCUTILS_CONSOLE_OUTPUT_FORMAT``; what it names of source code (file, line) stays empty.
+    """
+    at_ns = time.time_ns() if time_ns is None else time_ns
+    values = {
+        "severity": severity,
+        "name": name,
+        "message": text,
+        "time": f"{at_ns // 1_000_000_000}.{at_ns % 1_000_000_000:09d}",
+        "time_as_nanoseconds": str(at_ns),
+        "function_name": "",
+        "file_name": "",
+        "line_number": "",
+    }
+    return _TOKEN.sub(lambda match: values.get(match[1], match[0]), layout)
+
+
+def wants_colours(stream: TextIO, environ: Mapping[str, str]) -> bool:
+    """Whether to colour what goes to ``stream``.
+
+    ``RCUTILS_COLORIZED_OUTPUT`` (0 or 1) decides, else ``NO_COLOR`` (https://no-color.org), else
+    whether it is a terminal that can.
+    """
+    told = environ.get("RCUTILS_COLORIZED_OUTPUT")
+    if told in ("0", "1"):
+        return told == "1"
+    if environ.get("NO_COLOR"):
+        return False
+    return stream.isatty() and environ.get("TERM") != "dumb"
+
+
+class _GrowingFile:
+    def __init__(self, name: str, path: Path) -> None:
+        self.name = name
+        self.has_grown = False
+        self._path = path
+        self._descriptor: int | None = None
+        self._rest = b""
+        self._is_closed = False
+
+    def read_lines(self) -> list[bytes]:
+        """The lines that are complete now, without line feeds."""
+        data = self._read()
+        self.has_grown = bool(data)
+        if not data:
+            return []
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        while len(self._rest) > _LONGEST_LINE_BYTES:  # do not wait for its end
+            lines.append(self._rest[:_LONGEST_LINE_BYTES])
+            self._rest = self._rest[_LONGEST_LINE_BYTES:]
+        return lines
+
+    def take_rest(self) -> list[bytes]:
+        rest, self._rest = self._rest, b""
+        return [rest] if rest else []
+
+    def close(self) -> None:
+        self._is_closed = True
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _read(self) -> bytes:
+        if self._is_closed:
+            return b""
+        if self._descriptor is None:
+            try:
+                self._descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+            except OSError:
+                return b""
+        return os.read(self._descriptor, _READ_BYTES)
+
+
+class _Painter:
+    """Makes of a line in a log one for the console. No colours where ``palette`` is empty."""
+
+    def __init__(self, palette: Mapping[str, str]) -> None:
+        self._palette = palette
+
+    def paint(self, name: str, line: bytes) -> str:
+        text = clean(line.decode("utf-8", "backslashreplace"), keep_colours=bool(self._palette))
+        record = _RECORD.search(text) if "] [" in text else None
+        if record is None or _without_colours(text[: record.start()]):
+            return self._coloured(name, f"[{name}] {text}")
+        # A host may write records of any of its nodes.
+        owner = record["name"] if record["name"] in self._palette else name
+        mark = _SEVERITY_COLOURS.get(record["severity"])
+        if not self._palette or not mark:
+            return self._coloured(owner, text)
+        head = f"[{record['severity']}]"
+        rest = text[record.start() + len(head) :]
+        return f"\x1b[{mark}m{head}{_RESET}{self._coloured(owner, rest)}"
+
+    def _coloured(self, name: str, text: str) -> str:
+        colour = self._palette.get(name)
+        return f"\x1b[{colour}m{text}{_RESET}" if colour else text
+
+
+def clean(text: str, *, keep_colours: bool) -> str:
+    r"""One line without what could do something to a terminal.
+
+    Escape sequences go, except colours if they are to stay; other control characters are shown as
+    ``\x07``. Of a line that was overwritten with carriage returns, the last version stays.
+    """
+    text = text.rstrip("\r").rpartition("\r")[2]
+    text = _ESCAPE.sub(
+        lambda match: match[0] if keep_colours and match["sgr"] is not None else "", text
+    )
+    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+
+
+def _without_colours(text: str) -> str:
+    return _ESCAPE.sub("", text)

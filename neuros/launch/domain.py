@@ -1,0 +1,188 @@
+"""Which ROS domain a run uses, and the lock that keeps two runs from taking the same one.
+
+A lock file ``neuros-domain-<id>.lock`` in the temporary folder of the machine is locked with
+``flock`` for the run: the lock dies with the process (and its guardian, which inherits it), also
+by SIGKILL. Runs that picked the first free domain hold it exclusively; runs that were told which
+domain to use share it, so that they may join each other and nobody else picks it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import tempfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import TracebackType
+
+from neuros.errors import EnvironmentFault, UsageError
+
+AUTOMATIC = range(1, 102)
+"""Domains to pick from: up to 101 their ports stay below those that Linux gives out itself."""
+_HIGHEST = 232
+_UDP_TABLES = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
+
+
+class DomainLock:
+    """A ROS domain, held while this is open.
+
+    Attributes:
+        id: the domain id.
+        reason: what to print, "ROS domain 7 (first free)".
+        path: the lock file, or ``None`` if there is none; removed on release.
+    """
+
+    def __init__(self, domain: int, reason: str, lock: tuple[Path, int] | None = None) -> None:
+        self.id = domain
+        self.reason = f"ROS domain {domain} ({reason})"
+        self.path: Path | None = lock[0] if lock else None
+        self._descriptor: int | None = lock[1] if lock else None
+
+    def fileno(self) -> int | None:
+        """The locked file descriptor, which the guardian holds as well; ``None`` without lock."""
+        return self._descriptor
+
+    def release(self) -> None:
+        """Give it up; a second call has no effect."""
+        if self._descriptor is None or self.path is None:
+            return
+        remove_lock(self._descriptor, self.path)
+        os.close(self._descriptor)
+        self._descriptor = None
+
+    def __enter__(self) -> DomainLock:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.release()
+
+
+def choose_domain(
+    explicit: int | None,
+    environ: Mapping[str, str],
+    has_external_topics_or_partial: bool,
+    *,
+    folder: Path | None = None,
+) -> DomainLock:
+    """The domain for a run: ``explicit``, else ``ROS_DOMAIN_ID``, else 0 or the first free one.
+
+    0, where everybody is, if the project has external topics or is started in part, since then
+    others have to find it. ``folder`` is where lock files are, normally the temporary folder that
+    all users of the machine share. Raises ``UsageError`` for an id that is none, and
+    ``EnvironmentFault`` if all domains are taken.
+    """
+    folder = folder or _shared_folder()
+    text = environ.get("ROS_DOMAIN_ID", "").strip()
+    if explicit is not None:
+        return _told(_valid(str(explicit), "-d/--domain-id"), "-d", folder)
+    if text:
+        return _told(_valid(text, "ROS_DOMAIN_ID"), "ROS_DOMAIN_ID", folder)
+    if has_external_topics_or_partial:
+        return _told(0, "default, where other ROS nodes are", folder)
+    ports = _udp_ports()
+    for domain in AUTOMATIC:
+        if _is_used_without_lock(domain, ports):
+            continue
+        if lock := _lock(folder, domain, fcntl.LOCK_EX):
+            return DomainLock(domain, "first free", lock)
+    raise EnvironmentFault(
+        f"all ROS domains from {AUTOMATIC[0]} to {AUTOMATIC[-1]} are in use on this machine: end "
+        "other runs, or choose one with -d/--domain-id"
+    )
+
+
+def remove_lock(descriptor: int, path: Path) -> None:
+    """Remove the lock file unless another run holds it, too, or has made a new one."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if _is_same_file(descriptor, path):
+            path.unlink()
+
+
+def _told(domain: int, reason: str, folder: Path) -> DomainLock:
+    lock = _lock(folder, domain, fcntl.LOCK_SH)
+    if lock is None:
+        reason += "; another run uses it, too"
+    return DomainLock(domain, reason, lock)
+
+
+def _valid(text: str, source: str) -> int:
+    # Nothing but ASCII digits: int() would also take "1_0", "+1" and other scripts' digits.
+    if text.isascii() and text.isdigit() and int(text) <= _HIGHEST:
+        return int(text)
+    raise UsageError(f"{source}: {text!r} is no ROS domain id: use a whole number from 0 to 101")
+
+
+def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:
+    """The locked file, or ``None`` if somebody else holds it or it cannot be opened."""
+    path = folder / f"neuros-domain-{domain}.lock"
+    while True:
+        descriptor = _open(path)
+        if descriptor is None:
+            return None
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            return None
+        if _is_same_file(descriptor, path):
+            return path, descriptor
+        os.close(descriptor)  # its former holder has just removed it
+
+
+def _open(path: Path) -> int | None:
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW
+    try:
+        # Linux refuses O_CREAT on another user's file in a shared folder (fs.protected_regular).
+        return os.open(path, flags)
+    except FileNotFoundError:
+        pass
+    except OSError:
+        return None
+    try:
+        descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+    except FileExistsError:
+        return _open(path)
+    except OSError:
+        return None
+    os.fchmod(descriptor, 0o666)  # whatever the umask: all users take part
+    return descriptor
+
+
+def _is_same_file(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _shared_folder() -> Path:
+    # Not TMPDIR, which may differ from user to user.
+    shared = Path("/tmp")
+    return shared if os.access(shared, os.W_OK | os.X_OK) else Path(tempfile.gettempdir())
+
+
+def _is_used_without_lock(domain: int, udp_ports: Collection[int]) -> bool:
+    """Whether a DDS participant is there that is none of ours (DDSI-RTPS 2.5, 9.6.2).
+
+    Discovery multicast is on 7400 + 250 x domain, unicast on + 10 + 2 x participant, + 1 for data.
+    """
+    base = 7400 + 250 * domain
+    return any(base <= port < base + 76 for port in udp_ports)
+
+
+def _udp_ports() -> set[int]:
+    """UDP ports that are bound in this network namespace."""
+    ports: set[int] = set()
+    for table in _UDP_TABLES:
+        with contextlib.suppress(OSError), open(table) as lines:
+            next(lines)
+            # "  sl  local_address ..." with local_address "0100007F:1CE8", all hexadecimal
+            ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
+    return ports

@@ -1,0 +1,128 @@
+"""The end of a run: one record (``run.json``) and one table, from the last reports of the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from neuros.project.model import Connection, NodeFile, Project
+
+
+class Ended(Protocol):
+    """How a run ended, as far as a record needs it."""
+
+    exit_code: int
+    reason: str
+    reports: dict[str, Mapping[str, Any]]
+    report_times_s: dict[str, float]
+    ended_s: float
+
+
+def run_record(
+    project: Project, files: Sequence[NodeFile], ended: Ended, wall_s: float
+) -> dict[str, Any]:
+    """Everything that is known about a run, ready for JSON. Times are in seconds."""
+    sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
+    sim_s = max(sim_times, default=None)
+    return {
+        "project": project.name,
+        "file": str(project.file),
+        "exit_code": ended.exit_code,
+        "reason": ended.reason,
+        "wall_s": wall_s,
+        "sim_s": sim_s,
+        "real_time_factor": None if sim_s is None or wall_s <= 0 else sim_s / wall_s,
+        "connections": [_connection(c, ended.reports) for c in _connections(files)],
+        "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
+    }
+
+
+def run_table(record: Mapping[str, Any]) -> str:
+    """The record as text: connections, nodes, and times."""
+    from tabulate import tabulate
+
+    connections = tabulate(
+        [
+            [c["connection"], *(c[key] for key in ("sent", "received", "consumed", "discarded"))]
+            for c in record["connections"]
+        ],
+        headers=["connection", "sent", "received", "consumed", "discarded"],
+        missingval="?",
+    )
+    nodes = tabulate(
+        [[name, *_shares(node)] for name, node in record["nodes"].items()],
+        headers=["node", "busy", "waiting", "blocked", "remark"],
+        missingval="?",
+        disable_numparse=True,
+        colalign=("left", "right", "right", "right", "left"),
+    )
+    parts = [connections] if record["connections"] else []
+    return "\n\n".join([*parts, nodes, _times(record)])
+
+
+def _connections(files: Sequence[NodeFile]) -> list[Connection]:
+    every = {connection for file in files for connection in file.connections}
+    return sorted(every, key=lambda connection: connection.index)
+
+
+def _connection(connection: Connection, reports: Mapping[str, Any]) -> dict[str, Any]:
+    key = str(connection)
+    outgoing = _ledger(reports, connection.source_node, "outgoing").get(key, {})
+    incoming = _ledger(reports, connection.destination_node, "incoming").get(key, {})
+    fields = ("received", "consumed", "discarded", "unread", "longest_discard")
+    return {
+        "connection": key,
+        "discard_limit": connection.discard_limit,
+        "queue_size": connection.queue_size,
+        "sent": outgoing.get("sent"),
+        **{field: incoming.get(field) for field in fields},
+    }
+
+
+def _ledger(reports: Mapping[str, Any], node: str, part: str) -> Mapping[str, Any]:
+    report = reports.get(node)
+    if report is None or report["ledger"] is None:
+        return {}
+    found: Mapping[str, Any] = report["ledger"][part]
+    return found
+
+
+def _node(name: str, ended: Ended) -> dict[str, Any]:
+    report = ended.reports.get(name)
+    if report is None or report["ledger"] is None:
+        return {"report": None}
+    is_final = bool(report.get("is_final"))
+    age_s = ended.ended_s - ended.report_times_s[name]
+    ledger = report["ledger"]
+    return {
+        "accounting": ledger["accounting"],
+        "hooks": ledger["hooks"],
+        "sim_time": report["sim_time"],
+        "report": "final" if is_final else f"last report {age_s:.1f} s before the end",
+    }
+
+
+def _shares(node: Mapping[str, Any]) -> list[str]:
+    if node["report"] is None:
+        return ["?", "?", "?", "never reported"]
+    spent = node["accounting"]
+    running_s = spent["total"] - spent["registering"]
+
+    def share(seconds: float) -> str:
+        return f"{seconds / running_s:.0%}" if running_s > 0 else "-"
+
+    remark = "" if node["report"] == "final" else node["report"]
+    return [
+        *(share(sum(spent[kind].values())) for kind in ("executing", "waiting", "blocked")),
+        remark,
+    ]
+
+
+def _times(record: Mapping[str, Any]) -> str:
+    wall = f"wall time {record['wall_s']:.2f} s"
+    if record["sim_s"] is None:
+        return wall
+    return (
+        f"simulated time {record['sim_s']:.2f} s, {wall},"
+        f" real-time factor {record['real_time_factor']:.2f}"
+    )

@@ -1,0 +1,206 @@
+"""All seams of NeuROS on one page.
+
+The engine (:mod:`neuros.core`) knows nothing of ROS, processes or physics. Whatever touches the
+world stands behind one of these protocols: an adapter implements it (floor 4), the runtime and the
+supervisor use it (floor 5), the command line picks it (floor 6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+from neuros.project.model import Connection, Node, NodeFile, Port
+
+Packet: TypeAlias = Any
+"""One ROS message."""
+
+
+class Logger(Protocol):
+    """Where a node writes to: rclpy's logger, or one that looks the same."""
+
+    def debug(self, message: str) -> object: ...
+    def info(self, message: str) -> object: ...
+    def warning(self, message: str) -> object: ...
+    def error(self, message: str) -> object: ...
+
+
+class Inbox(Protocol):
+    """What a transport tells a node. Called in the node's own thread, between hooks."""
+
+    def on_packet(self, connection: Connection, packet: Packet) -> None:
+        """A packet has arrived on a connection to this node."""
+
+    def on_external_packet(self, port: Port, packet: Packet) -> None:
+        """A packet has arrived on the external topic of an input."""
+
+    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+        """Every taker at the far end has started on the packets up to ``position`` (from 1)."""
+
+    def on_registered(self, connection: Connection) -> None:
+        """The far end of an output's connection is there: the first packet cannot vanish."""
+
+
+class Transport(Protocol):
+    """Carries the packets of one node to its neighbours and back."""
+
+    def open(self, inbox: Inbox) -> None:
+        """Create the endpoints and begin to announce this node to its neighbours."""
+
+    def send(self, connections: Sequence[Connection], packet: Packet) -> None:
+        """Send one packet on all these connections of one output."""
+
+    def send_external(self, port: Port, packet: Packet) -> None:
+        """Publish on the external topic of an output."""
+
+    def acknowledge(self, connection: Connection, position: int) -> None:
+        """Tell the sender that every taker has started on the packets up to ``position``."""
+
+    def waiting_for(self) -> Sequence[Connection]:
+        """Connections whose other end has not been found yet."""
+
+    def make_packet(self, type_name: str) -> Packet:
+        """A new message with default values, for a type in ROS notation."""
+
+    def close(self) -> None:
+        """Give up all endpoints; further calls have no effect."""
+
+
+class EventLoop(Protocol):
+    """The one thread in which all nodes of a process run: one event at a time, oldest first."""
+
+    @property
+    def has_waiting_events(self) -> bool:
+        """Whether events of engines wait."""
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Handle ``event`` after everything that already waits. Loop thread only."""
+
+    def post_loop_back(self, event: Callable[[], None]) -> None:
+        """The same, and after everything that waits outside (in ROS), too."""
+
+    def post_from_thread(self, event: Callable[[], None]) -> None:
+        """Like :meth:`post`, from any thread; wakes the loop."""
+
+    def add_timer(
+        self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]
+    ) -> None:
+        """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
+
+    def run(self) -> None:
+        """Handle events until :meth:`stop`."""
+
+    def stop(self) -> None:
+        """End :meth:`run` after the current event. Any thread."""
+
+
+class Middleware(Protocol):
+    """What joins the nodes of this process to each other and to the rest of the world."""
+
+    @property
+    def loop(self) -> EventLoop: ...
+
+    def transport(self, file: NodeFile) -> Transport:
+        """The transport of one node; creates its ROS node."""
+
+    def ros_node(self, file: NodeFile) -> Any:
+        """The real ``rclpy.node.Node`` of a node that has a transport."""
+
+    def mark_own_entities(self, file: NodeFile) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it."""
+
+    def has_foreign_entities(self, file: NodeFile) -> bool:
+        """Whether a plugin has subscriptions, timers, services or clients on its ROS node."""
+
+    def copy(self, packet: Packet) -> Packet:
+        """A packet that shares nothing with this one."""
+
+    def message_class(self, type_name: str) -> type:
+        """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
+
+    def close(self) -> None:
+        """Let what was sent last leave, then give up everything."""
+
+
+class NodeContext(Protocol):
+    """The ``node`` that hooks receive, as far as simulators need it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def run_dir(self) -> Path: ...
+    @property
+    def description(self) -> Node:
+        """The node as its file declares it (ports, ``mujoco`` keys, environment)."""
+
+    def make_packet(self, output: str) -> Packet: ...
+    def get_logger(self) -> Logger: ...
+
+    def resolve_path(self, path: str) -> Path:
+        """An existing file, looked up as paths in node files are. Raises ``ModelError``."""
+
+    def own_simulated_time(self, read_s: Callable[[], float]) -> None:
+        """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
+
+    def submit(self, packets: Mapping[str, Packet], cancelled: Callable[[], bool]) -> bool:
+        """Send from another thread, as if a hook with those outputs had returned them.
+
+        Waits while a reliable connection of one of the outputs is blocked; returns False, without
+        having sent, once ``cancelled()`` is true or the node ends.
+        """
+
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call ``callback`` once when the node ends, after its finalise hooks."""
+
+    def fail(self, error: BaseException) -> None:
+        """End the node as failed by ``error``, which no hook raised. Any thread."""
+
+
+class Simulator(Protocol):
+    """A world with a time of its own."""
+
+    @property
+    def sim_time(self) -> float:
+        """Simulated seconds since the start."""
+
+    @property
+    def timestep(self) -> float:
+        """Simulated seconds per step."""
+
+    def step_synchronous(self, count: int = 1) -> None: ...
+    def step_to_next(self) -> None: ...
+    def read(self, output: str) -> Packet | None: ...
+    def run_asynchronous(self, real_time_factor: float | None = 1.0) -> None: ...
+    def pause(self) -> None: ...
+    def resume(self) -> None: ...
+    def reset(self) -> None: ...
+
+
+class RunningNode(Protocol):
+    """A started process or container, and the nodes that live in it."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The nodes in it."""
+
+    def poll(self) -> str | None:
+        """``None`` while it runs, then how it ended: "exit code 1", "killed by SIGKILL"."""
+
+    def terminate(self) -> None:
+        """Ask it to end (SIGTERM)."""
+
+    def kill(self) -> None:
+        """End it now."""
+
+
+class Launcher(Protocol):
+    """A back end: knows how to start nodes, and nothing of what they do."""
+
+    def start(
+        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+    ) -> Sequence[RunningNode]:
+        """Start all nodes; ``environment`` is added to the environment of each."""
+
+    def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
+        """One line per thing that :meth:`start` would start."""

@@ -1,0 +1,1 @@
+"""What a project is: its model, and how it is loaded, validated and split."""

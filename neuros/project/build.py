@@ -1,0 +1,122 @@
+"""From a draft to the model: paths and message types resolved, environment made text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from neuros.errors import Problem
+from neuros.project.draft import Draft
+from neuros.project.message_types import normalised, unknown_type
+from neuros.project.model import Connection, Node, Port
+from neuros.project.paths import PathError
+from neuros.project.source import Element
+
+STANDARD_CONTAINERS = frozenset(
+    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
+)
+"""NeuROS's own images: they have the message packages that this machine has."""
+
+
+class Builder:
+    """Builds nodes and connections, as far as they have the right form.
+
+    Attributes:
+        problems: what was found on the way: missing files, unknown types. What they concern is
+            left out of the nodes, which are of no use then.
+    """
+
+    def __init__(self, draft: Draft) -> None:
+        self._roots = draft.roots
+        self.problems: list[Problem] = []
+
+    def node(self, element: Element) -> Node:
+        """The node that an object describes."""
+        environment: dict[str, str] = {}
+        paths: list[str] = []
+        variables = element.member("environment")
+        if variables is not None and isinstance(variables.value, dict):
+            for name, member in variables.value.items():
+                value, is_path = self._variable(member)
+                environment[name] = value
+                if is_path:
+                    paths.append(name)
+        return Node(
+            name=element.string("name") or "",
+            container=element.string("container") or "",
+            plugin=self._file(element, "plugin") or Path(),
+            script=self._file(element, "script"),
+            inputs=self._ports(element, "inputs"),
+            outputs=self._ports(element, "outputs"),
+            environment=environment,
+            file=element.source.file,
+            pointer=element.pointer,
+            environment_paths=tuple(sorted(paths)),
+        )
+
+    def _file(self, element: Element, key: str) -> Path | None:
+        member = element.member(key)
+        if member is None or not isinstance(member.value, str) or not member.value:
+            return None
+        return self._find(member, folder_allowed=False)
+
+    def _find(self, member: Element, *, folder_allowed: bool, advice: str = "") -> Path | None:
+        try:
+            return self._roots.find(
+                member.value, member.source.folder, folder_allowed=folder_allowed
+            )
+        except PathError as error:
+            self.problems.append(member.problem(error.text, error.hint or advice))
+            return None
+
+    def _variable(self, member: Element) -> tuple[str, bool]:
+        """The value of an environment variable, and whether it is a path."""
+        value = member.value
+        if isinstance(value, bool | int | float):
+            return member.text, False
+        if not isinstance(value, str) or value[:1] not in ("#", "@") or "\0" in value:
+            return str(value), False
+        if value[:2] in ("##", "@@"):
+            return value[1:], False
+        advice = f"write '{value[0]}{value}' if it is no path"
+        return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
+
+    def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
+        container = (node.string("container") or "").partition(":")[0]
+        must_be_here = container in STANDARD_CONTAINERS
+        return tuple(
+            self._port(port, must_be_here=must_be_here)
+            for port in node.items(side)
+            if isinstance(port.value, dict)
+        )
+
+    def _port(self, element: Element, *, must_be_here: bool) -> Port:
+        written = element.string("type") or ""
+        type_name = normalised(written)
+        unknown = type_name and unknown_type(type_name, must_be_here=must_be_here)
+        if unknown:
+            self.problems.append(element.value["type"].problem(*unknown))
+        mujoco = element.member("mujoco")
+        keys: dict[str, Any] = {} if mujoco is None else {"mujoco": mujoco.plain}
+        return Port(
+            name=element.string("name") or "",
+            type=type_name or written,
+            external_topic=element.string("external_topic"),
+            gazebo_type=element.string("gazebo_type"),
+            **keys,
+        )
+
+
+def connection(element: Element, index: int) -> Connection:
+    """The connection that a valid object describes."""
+    values = element.plain
+    limit = values.get("discard_limit")
+    return Connection(
+        source_node=values["source_node"],
+        source_output=values["source_output"],
+        destination_node=values["destination_node"],
+        destination_input=values["destination_input"],
+        discard_limit=None if limit is None else int(limit),
+        queue_size=int(values.get("queue_size", 1)),
+        index=index,
+    )

@@ -1,0 +1,101 @@
+"""From files to a project: read, override, judge, build. All problems at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from neuros.errors import Problem, ProjectError
+from neuros.project.build import Builder, connection
+from neuros.project.checks import mistakes, remarks
+from neuros.project.draft import Draft, read_draft
+from neuros.project.model import Project
+from neuros.project.overrides import apply_override
+from neuros.project.paths import Roots
+from neuros.project.scanner import SourceError, display_name
+from neuros.project.suggest import did_you_mean
+
+PROJECT_FILE = "project.json"
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A valid project, and what may be a mistake in it all the same."""
+
+    project: Project
+    warnings: tuple[Problem, ...] = ()
+
+
+def load_project(
+    path: Path,
+    *,
+    workspace: Path,
+    overrides: Sequence[str] = (),
+    folder: Path | None = None,
+) -> Loaded:
+    """Load and check a project.
+
+    Args:
+        path: the project file, or a folder that holds ``project.json``.
+        workspace: the folder that ``@path`` starts from.
+        overrides: the texts of ``--set``, applied in this order.
+        folder: the project's folder, if it is not the one of the file: the expanded project of
+            a run lies in the folder of the run.
+
+    Raises:
+        ProjectError: with every problem there is.
+    """
+    file = _project_file(path)
+    roots = Roots((folder or file.parent).resolve(), workspace.resolve())
+    try:
+        draft = read_draft(file, roots)
+    except SourceError as error:
+        raise ProjectError([error.problem]) from None
+    for text in overrides:
+        draft.problems += apply_override(draft, text)
+    builder = Builder(draft)
+    nodes = tuple(builder.node(element) for element in draft.nodes)
+    problems = [*draft.problems, *_judgements(draft), *builder.problems]
+    if problems:
+        raise ProjectError(problems)
+    project = Project(
+        name=_name(roots.project, file),
+        nodes=nodes,
+        connections=tuple(connection(c, index) for index, c in enumerate(draft.connections)),
+        file=roots.project / file.name,
+        description=draft.root.string("description") or "",
+    )
+    return Loaded(project, tuple(remarks(draft)))
+
+
+def _judgements(draft: Draft) -> list[Problem]:
+    # Imported here, so that whoever imports this module does not pay for jsonschema.
+    from neuros.project.validate import violations
+
+    return [*violations(draft), *mistakes(draft)]
+
+
+def _project_file(path: Path) -> Path:
+    """The project file, by its absolute path (the file itself may be a symbolic link)."""
+    if path.is_dir():
+        file = path.resolve() / PROJECT_FILE
+        if not file.is_file():
+            text = f"the folder '{path}' has no {PROJECT_FILE}"
+            others = sorted(other.name for other in path.glob("*.json"))
+            hint = f"it has {', '.join(others)}" if others else ""
+            raise ProjectError([Problem(display_name(file), 1, 1, "/", text, hint)])
+        return file
+    file = path.parent.resolve() / path.name
+    if not file.exists():
+        names = (entry.name for entry in file.parent.glob("*"))
+        hint = did_you_mean(file.name, names)
+        problem = Problem(display_name(file), 1, 1, "/", "there is no such file", hint)
+        raise ProjectError([problem])
+    return file
+
+
+def _name(folder: Path, file: Path) -> str:
+    """What a run of the project is called: the folder, and the file where it is a variant."""
+    name = folder.name or "project"
+    return name if file.name == PROJECT_FILE else f"{name}-{file.stem}"

@@ -1,0 +1,78 @@
+"""Message types: their notation, and whether they exist on this machine.
+
+Importing a message package costs tens of milliseconds. To see whether it has a message it is
+enough to find the package and to look at the names that its ``msg`` package imports; only where
+that list does not have the name (packages may build it in other ways) is it really imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+from neuros.project.suggest import did_you_mean
+
+_NOTATION = re.compile(r"([A-Za-z]\w*)(?:\.msg\.|/msg/)([A-Za-z]\w*)", re.ASCII)
+_IMPORTED = re.compile(r"^\s*from\s+\S+\s+import\s+(\w+)", re.MULTILINE)
+
+
+def normalised(text: str) -> str | None:
+    """``std_msgs/msg/String`` for that or ``std_msgs.msg.String``, ``None`` for anything else."""
+    match = _NOTATION.fullmatch(text)
+    return f"{match[1]}/msg/{match[2]}" if match else None
+
+
+def unknown_type(type_name: str, *, must_be_here: bool) -> tuple[str, str] | None:
+    """What is wrong with a normalised type, and a hint; ``None`` if nothing is, or nobody knows.
+
+    Args:
+        must_be_here: whether it is wrong too if its package is not installed on this machine.
+    """
+    package, _, name = type_name.split("/")
+    folder = _message_folder(package)
+    if folder is None:
+        if not must_be_here:
+            return None
+        return (
+            f"unknown message type '{type_name}': there is no message package '{package}' here",
+            did_you_mean(package, _installed_packages()),
+        )
+    names = _IMPORTED.findall((folder / "__init__.py").read_text(encoding="utf-8"))
+    if name in names or _really_has(package, name):
+        return None
+    return (
+        f"unknown message type '{type_name}': '{package}' has no message '{name}'",
+        did_you_mean(name, names),
+    )
+
+
+def _message_folder(package: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return None
+    for location in (spec.submodule_search_locations or ()) if spec else ():
+        folder = Path(location, "msg")
+        if (folder / "__init__.py").is_file():
+            return folder
+    return None
+
+
+def _really_has(package: str, name: str) -> bool:
+    try:
+        return hasattr(importlib.import_module(f"{package}.msg"), name)
+    except Exception:  # whatever a broken package raises: the message cannot be used
+        return False
+
+
+def _installed_packages() -> set[str]:
+    folders = [Path(entry) for entry in sys.path if Path(entry).is_dir()]
+    return {
+        package.name
+        for folder in folders
+        for package in folder.glob("*_*")
+        if (package / "msg" / "__init__.py").is_file()
+    }

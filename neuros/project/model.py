@@ -1,0 +1,168 @@
+"""A project as data: what the files say, resolved and checked, and nothing that runs.
+
+Everything here is frozen. :mod:`neuros.project.load` reads it from files,
+:mod:`neuros.project.split` cuts it into one :class:`NodeFile` per node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or output of a node.
+
+    Attributes:
+        name: unique among the inputs, or among the outputs, of its node.
+        type: message type in ROS notation, ``"std_msgs/msg/String"``.
+        external_topic: the plain ROS topic that it is bound to, or ``None``.
+        mujoco: the sensor or actuator behind it as the node file declares it, empty if none.
+        gazebo_type: kept from published project files; it has no effect.
+    """
+
+    name: str
+    type: str
+    external_topic: str | None = None
+    mujoco: Mapping[str, Any] = field(default_factory=lambda: _NOTHING, hash=False)
+    gazebo_type: str | None = None
+
+
+@dataclass(frozen=True)
+class Node:
+    """One plugin in one container.
+
+    Attributes:
+        plugin: absolute path of the Python file with the hooks.
+        script: absolute path of a shell script that runs before the node, or ``None``.
+        environment: environment variables, with ``#path`` and ``@path`` already resolved.
+        file: the file that describes the node, for messages; ``pointer`` is its place in there.
+        environment_paths: names of the environment variables that are such paths, sorted.
+    """
+
+    name: str
+    container: str
+    plugin: Path
+    script: Path | None = None
+    inputs: tuple[Port, ...] = ()
+    outputs: tuple[Port, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=lambda: _NOTHING, hash=False)
+    file: Path = Path()
+    pointer: str = ""
+    environment_paths: tuple[str, ...] = ()
+
+    def input(self, name: str) -> Port:
+        """The input of that name; raises ``KeyError``."""
+        return _named(self.inputs, name)
+
+    def output(self, name: str) -> Port:
+        """The output of that name; raises ``KeyError``."""
+        return _named(self.outputs, name)
+
+    @property
+    def owns_time(self) -> bool:
+        """Whether the node has a simulator, or publishes a clock."""
+        return any(port.mujoco for port in (*self.inputs, *self.outputs)) or any(
+            port.type == "rosgraph_msgs/msg/Clock" for port in self.outputs
+        )
+
+
+@dataclass(frozen=True)
+class Connection:
+    """``source_node.source_output -> destination_node.destination_input``.
+
+    Attributes:
+        discard_limit: packets that may be lost in a row; ``None`` is BEST_EFFORT.
+        queue_size: unread packets that the receiver holds, K.
+        index: its place in the project file, from 0; the order of the packets of an ``All`` input.
+    """
+
+    source_node: str
+    source_output: str
+    destination_node: str
+    destination_input: str
+    discard_limit: int | None = None
+    queue_size: int = 1
+    index: int = 0
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether it has a discard limit, and so acknowledgements."""
+        return self.discard_limit is not None
+
+    @property
+    def window(self) -> int:
+        """Outstanding packets at which the sender blocks, K + N (for BEST_EFFORT: K)."""
+        return self.queue_size + (self.discard_limit or 0)
+
+    @property
+    def topic(self) -> str:
+        """The topic that ``/data``, ``/ack`` and ``/reg`` are appended to."""
+        return (
+            f"/neuros/{self.source_node}/{self.source_output}"
+            f"/{self.destination_node}/{self.destination_input}"
+        )
+
+    def __str__(self) -> str:
+        return (
+            f"{self.source_node}.{self.source_output}"
+            f" -> {self.destination_node}.{self.destination_input}"
+        )
+
+
+@dataclass(frozen=True)
+class Folders:
+    """The folders that a node may read (project, workspace) and write (run), as it sees them."""
+
+    project: Path
+    workspace: Path
+    run: Path
+
+
+@dataclass(frozen=True)
+class NodeFile:
+    """The content of ``node.json``: a node and its own connections, nothing else.
+
+    ``index`` is the node's place in the project file, from 0.
+    """
+
+    node: Node
+    connections: tuple[Connection, ...]
+    folders: Folders
+    index: int = 0
+
+
+@dataclass(frozen=True)
+class Project:
+    """A whole project, valid in itself."""
+
+    name: str
+    nodes: tuple[Node, ...]
+    connections: tuple[Connection, ...]
+    file: Path
+    description: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the project file."""
+        return self.file.parent
+
+    def node(self, name: str) -> Node:
+        """The node of that name; raises ``KeyError``."""
+        for node in self.nodes:
+            if node.name == name:
+                return node
+        raise KeyError(name)
+
+
+def _named(ports: tuple[Port, ...], name: str) -> Port:
+    for port in ports:
+        if port.name == name:
+            return port
+    raise KeyError(name)

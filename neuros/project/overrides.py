@@ -1,0 +1,121 @@
+"""``--set``: values from the command line in the place of those in the files.
+
+::
+
+    nodes.NAME.KEY...=VALUE
+    connections.SRC.OUT.DST.IN.KEY=VALUE
+
+``VALUE`` is JSON if it parses and a text otherwise; in ``environment`` it is always a text. Without
+a value the key is removed. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
+other lists an index.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from neuros.errors import Problem
+from neuros.project.draft import Draft
+from neuros.project.scanner import SourceError, parse
+from neuros.project.source import Element, Source, escape
+from neuros.project.suggest import did_you_mean
+
+_ENDS = ("source_node", "source_output", "destination_node", "destination_input")
+_NODE_FORM = "nodes.NAME.KEY=VALUE"
+_CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
+
+
+def apply_override(draft: Draft, text: str) -> list[Problem]:
+    """Apply one ``--set`` to a draft; what is wrong with the text itself is returned."""
+    override = _Override(Source(f"--set {text}", draft.roots.project, text))
+    target, equals, _ = text.partition("=")
+    kind, *steps = target.split(".")
+    form = {"nodes": _NODE_FORM, "connections": _CONNECTION_FORM}.get(kind)
+    if form is None:
+        hint = did_you_mean(kind, ("nodes", "connections"))
+        return [override.problem("must begin with 'nodes.' or 'connections.'", hint)]
+    names = len(_ENDS) if kind == "connections" else 1
+    if not equals or len(steps) <= names or not all(steps[: names + 1]):
+        return [override.problem("is not of the form", form)]
+    parent = _node(draft, steps[0]) if names == 1 else _connection(draft, steps[:names])
+    if isinstance(parent, str):
+        what = f"there is no {kind.removesuffix('s')} '{'.'.join(steps[:names])}'"
+        return [] if not draft.is_complete else [override.problem(what, parent)]
+    return override.apply(parent, steps[names:])
+
+
+def _node(draft: Draft, name: str) -> Element | str:
+    names = [node.string("name") or "" for node in draft.nodes]
+    return draft.nodes[names.index(name)] if name in names else did_you_mean(name, names)
+
+
+def _connection(draft: Draft, ends: list[str]) -> Element | str:
+    known = [".".join(c.string(end) or "" for end in _ENDS) for c in draft.connections]
+    wanted = ".".join(ends)
+    if wanted in known:
+        return draft.connections[known.index(wanted)]
+    return did_you_mean(wanted, known)
+
+
+@dataclass
+class _Override:
+    source: Source
+
+    @property
+    def _value_start(self) -> int:
+        return self.source.text.index("=") + 1
+
+    def problem(self, text: str, hint: str = "") -> Problem:
+        return self.source.problem(0, "", text, hint)
+
+    def apply(self, parent: Element, steps: list[str]) -> list[Problem]:
+        is_text = steps[0] == "environment" and len(steps) > 1
+        if is_text:
+            steps = [steps[0], ".".join(steps[1:])]  # names of variables may contain dots
+        removes = self._value_start == len(self.source.text)
+        for step in steps[:-1]:
+            key = self._key(parent, step)
+            if isinstance(key, Problem):
+                return [key]
+            if key == step and parent.member(step) is None:
+                if removes:
+                    return []
+                parent.value[step] = self._element({}, f"{parent.pointer}/{escape(step)}")
+            parent = parent.value[key]
+        key = self._key(parent, steps[-1])
+        if isinstance(key, Problem):
+            return [key]
+        if removes:
+            if isinstance(key, int) or key in parent.value:
+                del parent.value[key]
+            return []
+        element, problems = self._value(f"{parent.pointer}/{escape(str(key))}", is_text)
+        parent.value[key] = element
+        return problems
+
+    def _key(self, parent: Element, step: str) -> str | int | Problem:
+        """The key or index behind a step; a key need not exist yet."""
+        if isinstance(parent.value, dict):
+            return step
+        if not isinstance(parent.value, list):
+            return self.problem(f"'{step}' leads nowhere: there is no object around it")
+        names = [item.string("name") or "" for item in parent.value]
+        if step in names:
+            return names.index(step)
+        if step.isascii() and step.isdigit() and int(step) < len(names):
+            return int(step)
+        return self.problem(f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names))
+
+    def _value(self, pointer: str, is_text: bool) -> tuple[Element, list[Problem]]:
+        if not is_text:
+            try:
+                element, problems = parse(self.source, self._value_start, pointer)
+            except SourceError:
+                pass
+            else:
+                element.key_start = self._value_start
+                return element, problems
+        return self._element(self.source.text[self._value_start :], pointer), []
+
+    def _element(self, value: object, pointer: str) -> Element:
+        return Element(value, self.source, self._value_start, len(self.source.text), pointer)

@@ -1,0 +1,86 @@
+"""Where the paths in project files point to, and that they stay where they belong."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from neuros.project.suggest import did_you_mean
+
+
+class PathError(Exception):
+    """A path that points to nothing, or to something that a project may not touch."""
+
+    def __init__(self, text: str, hint: str = "") -> None:
+        self.text, self.hint = text, hint
+        super().__init__(text)
+
+
+@dataclass(frozen=True)
+class Roots:
+    """The folders that paths of a project may point into, both resolved.
+
+    A path is looked up from the folder of the file that names it, then from the project's folder;
+    ``@path`` from the workspace. A leading ``#`` is allowed everywhere and says the usual. Slashes
+    behind ``#`` and ``@`` have no meaning, as in ``#/model.xml``.
+    """
+
+    project: Path
+    workspace: Path
+
+    def find(self, text: str, here: Path, *, folder_allowed: bool = False) -> Path:
+        """The resolved path; ``here`` is the folder of the file that names it.
+
+        Raises :class:`PathError`.
+        """
+        if "\0" in text:
+            raise PathError("a path cannot contain a NUL character")
+        outside: Path | None = None
+        for candidate in self._candidates(text, here):
+            path = _resolved(candidate)
+            if path is None:
+                continue
+            if not self.is_inside(path):
+                outside = outside or path
+            elif path.is_dir() and not folder_allowed:
+                raise PathError(f"'{text}' is a folder, not a file")
+            else:
+                return path
+        if outside is not None:
+            raise PathError(
+                f"'{text}' leaves the project's folder",
+                "paths may point into the folder of the project file, and with '@' into the "
+                "workspace",
+            )
+        raise PathError(f"there is no file '{text}'", self._similar(text, here))
+
+    def is_inside(self, path: Path) -> bool:
+        """Whether a resolved path lies in one of the folders."""
+        return path.is_relative_to(self.project) or path.is_relative_to(self.workspace)
+
+    def _candidates(self, text: str, here: Path) -> list[Path]:
+        if text.startswith("@"):
+            return [self.workspace / text[1:].lstrip("/")]
+        if text.startswith("#"):
+            rest = text[1:].lstrip("/")
+            absolute = [Path(text[1:])] if text.startswith("#/") else []
+            return [here / rest, self.project / rest, *absolute]
+        return [here / text, self.project / text]
+
+    def _similar(self, text: str, here: Path) -> str:
+        for candidate in self._candidates(text, here):
+            folder = _resolved(candidate.parent)
+            if folder is not None and folder.is_dir() and self.is_inside(folder):
+                hint = did_you_mean(candidate.name, os.listdir(folder))
+                if hint:
+                    return hint
+        return ""
+
+
+def _resolved(path: Path) -> Path | None:
+    """The path without symbolic links, ``None`` if it does not exist."""
+    try:
+        return path.resolve(strict=True)
+    except (OSError, RuntimeError):  # Python up to 3.12 reports a loop of links as RuntimeError
+        return None

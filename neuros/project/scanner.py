@@ -1,0 +1,186 @@
+"""Reads JSON and remembers where everything stands.
+
+Python's ``json`` keeps neither the positions of keys and values nor duplicate keys (the last one
+wins silently), and both are needed to tell a user what is wrong where. Of the libraries that keep
+positions, json-source-map returns a dictionary with one entry per pointer, so that duplicates
+are lost again, and has had no release for years; json5 reports no positions. So this is a scanner
+of its own for objects and arrays, around the standard library's decoder for everything else: what
+is valid, and what it means, stays the standard library's decision.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NoReturn
+
+from neuros.errors import Problem
+from neuros.project.source import Element, Source, escape
+
+_MAX_DEPTH = 100
+_SPACE = re.compile(r"[ \t\n\r]*")
+
+
+class SourceError(Exception):
+    """A file that cannot be read, or is no JSON."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        super().__init__(str(problem))
+
+
+def display_name(path: Path) -> str:
+    """A path as messages show it: relative to the current folder where it lies in there."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def read_file(path: Path) -> tuple[Element, list[Problem]]:
+    """Read a JSON file; the problems are its duplicate keys. Raises :class:`SourceError`."""
+    name = display_name(path)
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise SourceError(Problem(name, 1, 1, "/", f"cannot be read: {reason}")) from error
+    except UnicodeDecodeError as error:
+        before = error.object[: error.start].decode("utf-8")
+        problem = Source(name, path.parent, before).problem(
+            len(before), "", "is not valid UTF-8", "save the file as UTF-8"
+        )
+        raise SourceError(problem) from error
+    return parse(Source(name, path.parent, text, path))
+
+
+def parse(source: Source, start: int = 0, pointer: str = "") -> tuple[Element, list[Problem]]:
+    """Parse the JSON document from ``start`` to the end. Raises :class:`SourceError`."""
+    scanner = _Scanner(source)
+    element = scanner.document(start, pointer)
+    return element, scanner.duplicates
+
+
+@dataclass
+class _Scanner:
+    source: Source
+    duplicates: list[Problem] = field(default_factory=list)
+    depth: int = 0
+
+    @cached_property
+    def _decoder(self) -> json.JSONDecoder:
+        return json.JSONDecoder(parse_constant=_refuse_constant)
+
+    def document(self, start: int, pointer: str) -> Element:
+        if self.source.text.startswith("\ufeff"):
+            self._fail(0, pointer, "the file begins with a byte order mark", "save it without")
+        element = self._value(self._skip(start), pointer)
+        end = self._skip(element.end)
+        if end != len(self.source.text):
+            self._fail(end, pointer, "there is more text after the end of the document")
+        return element
+
+    def _value(self, start: int, pointer: str) -> Element:
+        opening = self.source.text[start : start + 1]
+        if opening not in ("{", "["):
+            return self._scalar(start, pointer)
+        self.depth += 1
+        if self.depth > _MAX_DEPTH:
+            self._fail(start, pointer, "is nested too deeply")
+        element = Element({} if opening == "{" else [], self.source, start, start, pointer)
+        read = self._object_item if opening == "{" else self._array_item
+        element.end = self._sequence(element, "}" if opening == "{" else "]", read)
+        self.depth -= 1
+        return element
+
+    def _scalar(self, start: int, pointer: str) -> Element:
+        try:
+            value, end = self._decoder.raw_decode(self.source.text, start)
+        except json.JSONDecodeError as error:
+            return self._fail_value(start, error, pointer)
+        except ValueError as error:  # NaN and the like, or an integer of thousands of digits
+            self._fail(start, pointer, str(error))
+        return Element(value, self.source, start, end, pointer)
+
+    def _sequence(self, parent: Element, closing: str, read: Any) -> int:
+        """Read items up to the closing bracket; returns the position behind it."""
+        text, position = self.source.text, self._skip(parent.start + 1)
+        if text.startswith(closing, position):
+            return position + 1
+        while True:
+            position = self._skip(read(parent, position))
+            if text.startswith(closing, position):
+                return position + 1
+            if not text.startswith(",", position):
+                what = "a member" if closing == "}" else "an item"
+                self._fail(position, parent.pointer, f"expected ',' or '{closing}' after {what}")
+            comma, position = position, self._skip(position + 1)
+            if text.startswith(closing, position):
+                self._fail(comma, parent.pointer, f"a comma before '{closing}'", "remove the comma")
+
+    def _array_item(self, parent: Element, start: int) -> int:
+        item = self._value(start, f"{parent.pointer}/{len(parent.value)}")
+        parent.value.append(item)
+        return item.end
+
+    def _object_item(self, parent: Element, start: int) -> int:
+        if not self.source.text.startswith('"', start):
+            self._fail(start, parent.pointer, "expected a key in double quotes")
+        key = self._scalar(start, parent.pointer)
+        pointer = f"{parent.pointer}/{escape(key.value)}"
+        colon = self._skip(key.end)
+        if not self.source.text.startswith(":", colon):
+            self._fail(colon, pointer, "expected ':' after the key")
+        member = self._value(self._skip(colon + 1), pointer)
+        member.key_start = start
+        first = parent.value.get(key.value)
+        if first is not None:
+            line, _ = self.source.place(first.key_start)
+            self.duplicates.append(
+                member.key_problem(f"the key '{key.value}' occurs twice", f"first in line {line}")
+            )
+        parent.value[key.value] = member
+        return member.end
+
+    def _skip(self, position: int) -> int:
+        match = _SPACE.match(self.source.text, position)
+        return match.end() if match else position
+
+    def _fail_value(self, start: int, error: json.JSONDecodeError, pointer: str) -> NoReturn:
+        if self.source.text.startswith('"', start):
+            message = error.msg.removesuffix(" at").replace(" starting", "")
+            hint = "is the closing quote missing?" if "\\" not in message else ""
+            text = f"bad string: {message[0].lower()}{message[1:]}"
+            self._fail(error.pos, pointer, text, hint)
+        self._fail(start, pointer, "expected a value")
+
+    def _fail(self, position: int, pointer: str, text: str, hint: str = "") -> NoReturn:
+        rest = self.source.text[position : position + 2]
+        if not rest:
+            hint = hint or "the file ends here"
+        elif rest[0] == "#" or rest in ("//", "/*"):
+            hint = "JSON has no comments"
+        elif rest[0] == "'":
+            hint = "JSON has double quotes only"
+        raise SourceError(self.source.problem(position, pointer, f"syntax error: {text}", hint))
+
+
+def place_of(file: Path, pointer: str) -> tuple[int, int]:
+    """Line and column of a pointer in a file; (1, 1) where there is none any more."""
+    try:
+        element, _ = read_file(file)
+        parts = [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]
+        for part in parts:
+            value = element.value
+            element = value[int(part)] if isinstance(value, list) else value[part]
+    except (SourceError, LookupError, ValueError, TypeError):
+        return 1, 1
+    return element.source.place(element.start)
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")

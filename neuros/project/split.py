@@ -1,0 +1,175 @@
+"""One project file for the user, one ``node.json`` per node; and both back again.
+
+``merge(split(project)) == project``, where ``merge`` is told what no node knows: the name, the file
+and the description of the project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
+
+_ENDS = ("source_node", "source_output", "destination_node", "destination_input")
+
+
+def _unchanged(path: Path) -> Path:
+    return path
+
+
+def split(
+    project: Project,
+    folders_for: Callable[[Node], Folders],
+    translate: Callable[[Path], Path] = _unchanged,
+) -> tuple[NodeFile, ...]:
+    """Cut a project into one part per node, in the order of the nodes.
+
+    Args:
+        folders_for: the folders of a node, as that node sees them.
+        translate: from a path on this machine to the path of the same thing for the nodes. The
+            file that a node is described in is not translated: it is for messages to the user.
+    """
+    return tuple(
+        NodeFile(
+            node=_translated(node, translate),
+            connections=tuple(
+                connection
+                for connection in project.connections
+                if node.name in (connection.source_node, connection.destination_node)
+            ),
+            folders=folders_for(node),
+            index=index,
+        )
+        for index, node in enumerate(project.nodes)
+    )
+
+
+def merge(
+    node_files: Iterable[NodeFile], *, name: str, file: Path, description: str = ""
+) -> Project:
+    """Put a project together again; the order of the parts does not matter."""
+    parts = sorted(node_files, key=lambda part: part.index)
+    connections = {c.index: c for part in parts for c in part.connections}
+    return Project(
+        name=name,
+        nodes=tuple(part.node for part in parts),
+        connections=tuple(connections[index] for index in sorted(connections)),
+        file=file,
+        description=description,
+    )
+
+
+def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
+    """The content of ``node.json``."""
+    node, folders = node_file.node, node_file.folders
+    return {
+        "node": {**_node_keys(node), "environment": dict(node.environment)},
+        "connections": [
+            {**_connection_keys(connection), "index": connection.index}
+            for connection in node_file.connections
+        ],
+        "folders": {
+            "project": str(folders.project),
+            "workspace": str(folders.workspace),
+            "run": str(folders.run),
+        },
+        "index": node_file.index,
+        "file": str(node.file),
+        "pointer": node.pointer,
+        "environment_paths": list(node.environment_paths),
+    }
+
+
+def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
+    """The inverse of :func:`node_file_to_json`; raises ``KeyError`` for anything else."""
+    node = content["node"]
+    script = node.get("script")
+    return NodeFile(
+        node=Node(
+            name=node["name"],
+            container=node["container"],
+            plugin=Path(node["plugin"]),
+            script=None if script is None else Path(script),
+            inputs=tuple(Port(**port) for port in node.get("inputs", ())),
+            outputs=tuple(Port(**port) for port in node.get("outputs", ())),
+            environment=dict(node.get("environment", {})),
+            file=Path(content["file"]),
+            pointer=content["pointer"],
+            environment_paths=tuple(content.get("environment_paths", ())),
+        ),
+        connections=tuple(Connection(**connection) for connection in content["connections"]),
+        folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
+        index=content["index"],
+    )
+
+
+def project_to_json(project: Project) -> dict[str, Any]:
+    """The expanded project: every node in place, every path absolute, every value a text.
+
+    It is a valid project file, to be loaded with the folder of the original project.
+    """
+    content: dict[str, Any] = {"description": project.description} if project.description else {}
+    content["nodes"] = [
+        {**_node_keys(node), "environment": _environment(node)} for node in project.nodes
+    ]
+    content["connections"] = [_connection_keys(c) for c in project.connections]
+    return content
+
+
+def _translated(node: Node, translate: Callable[[Path], Path]) -> Node:
+    return replace(
+        node,
+        plugin=translate(node.plugin),
+        script=None if node.script is None else translate(node.script),
+        environment={
+            key: str(translate(Path(value))) if key in node.environment_paths else value
+            for key, value in node.environment.items()
+        },
+    )
+
+
+def _node_keys(node: Node) -> dict[str, Any]:
+    keys: dict[str, Any] = {
+        "name": node.name,
+        "container": node.container,
+        "plugin": str(node.plugin),
+    }
+    if node.script is not None:
+        keys["script"] = str(node.script)
+    keys["inputs"] = [_port_keys(port) for port in node.inputs]
+    keys["outputs"] = [_port_keys(port) for port in node.outputs]
+    return keys
+
+
+def _port_keys(port: Port) -> dict[str, Any]:
+    keys: dict[str, Any] = {"name": port.name, "type": port.type}
+    if port.external_topic is not None:
+        keys["external_topic"] = port.external_topic
+    if port.mujoco:
+        keys["mujoco"] = dict(port.mujoco)
+    if port.gazebo_type is not None:
+        keys["gazebo_type"] = port.gazebo_type
+    return keys
+
+
+def _connection_keys(connection: Connection) -> dict[str, Any]:
+    keys: dict[str, Any] = {end: getattr(connection, end) for end in _ENDS}
+    if connection.discard_limit is not None:
+        keys["discard_limit"] = connection.discard_limit
+    if connection.queue_size != 1:
+        keys["queue_size"] = connection.queue_size
+    return keys
+
+
+def _environment(node: Node) -> dict[str, str]:
+    """The environment as a project file writes it."""
+    return {key: _written(node, key, value) for key, value in node.environment.items()}
+
+
+def _written(node: Node, key: str, value: str) -> str:
+    if key in node.environment_paths:
+        return f"#{value}"
+    return value[0] + value if value[:1] in ("#", "@") else value

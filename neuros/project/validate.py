@@ -1,0 +1,161 @@
+"""What the schema says of a project, in sentences; and whether its nodes fit into one process.
+
+The schema is the only grammar of the configuration. What it cannot express (names that occur
+twice, connections that end nowhere) is in :mod:`neuros.project.checks`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from neuros.errors import Problem
+from neuros.project.draft import Draft
+from neuros.project.model import Project
+from neuros.project.scanner import display_name, place_of
+from neuros.project.source import Element
+from neuros.project.suggest import did_you_mean, listed
+
+SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
+
+_KINDS = {
+    "object": "an object",
+    "array": "a list",
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "null": "null",
+}
+
+
+def violations(draft: Draft) -> list[Problem]:
+    """Everything in the files of a project that violates the schema."""
+    found = _violations_of(draft.root, "project")
+    for node in draft.nodes:
+        if node.source is not draft.root.source:
+            found += _violations_of(node, "node")
+    return found
+
+
+def schema(name: str) -> dict[str, Any]:
+    """The schema of that name, ``"project"`` or ``"node"``."""
+    content: dict[str, Any] = json.loads(
+        (SCHEMA_FOLDER / f"{name}.schema.json").read_text(encoding="utf-8")
+    )
+    return content
+
+
+def nest_conflicts(project: Project) -> tuple[Problem, ...]:
+    """The NEST nodes that would have to share a process with another one.
+
+    NEST has one kernel per process, so that this matters to back ends that put all nodes into
+    one. Nodes that use NEST are known by their container here.
+    """
+    nest = [n for n in project.nodes if n.container.partition(":")[0] == "neuros_nest"]
+    return tuple(
+        Problem(
+            display_name(node.file),
+            *place_of(node.file, f"{node.pointer}/container"),
+            f"{node.pointer}/container",
+            f"nodes '{nest[0].name}' and '{node.name}' both use NEST, which allows one node per "
+            "process",
+            "start them with --backend process",
+        )
+        for node in nest[1:]
+    )
+
+
+def _violations_of(element: Element, name: str) -> list[Problem]:
+    found = _validator(name).iter_errors(element.plain)
+    return [problem for error in found for problem in _sentences(error, element)]
+
+
+@cache
+def _validator(name: str) -> Any:
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
+    from jsonschema.validators import extend
+    from referencing import Registry, Resource
+
+    def pattern(_: Any, expected: str, instance: Any, __: Any) -> Iterator[ValidationError]:
+        # Python's '$' also matches before a final line feed, the one of JSON Schema does not.
+        end_exactly = re.sub(r"\$$", r"\\Z", expected)
+        if isinstance(instance, str) and not re.search(end_exactly, instance):
+            yield ValidationError(f"does not match {expected}")
+
+    schemas = {key: schema(key) for key in ("project", "node")}
+    registry = Registry().with_resources(
+        (content["$id"], Resource.from_contents(content)) for content in schemas.values()
+    )
+    return extend(Draft202012Validator, {"pattern": pattern})(schemas[name], registry=registry)
+
+
+def _sentences(error: Any, root: Element) -> Iterator[Problem]:
+    element = root.at(error.absolute_path)
+    if "propertyNames" in error.schema_path:
+        member = element.value[error.instance]
+        yield member.key_problem(
+            f"'{error.instance}' is not allowed as a name here", _hint(error.schema)
+        )
+    elif error.validator == "additionalProperties":
+        allowed = error.schema["properties"]
+        for key in [key for key in element.value if key not in allowed]:
+            hint = did_you_mean(key, set(allowed) - set(element.value))
+            yield element.value[key].key_problem(f"unknown key '{key}'", hint)
+    elif error.validator == "required":
+        for key in [key for key in error.validator_value if key not in element.value]:
+            yield element.problem(f"the key '{key}' is missing")
+    elif error.validator == "not":
+        key = error.absolute_path[-1]
+        yield element.key_problem(f"'{key}' has no meaning for this kind of sensor")
+    else:
+        text, hint = _sentence(error)
+        yield element.problem(text, hint)
+
+
+def _sentence(error: Any) -> tuple[str, str]:
+    """The problem with a value, and a hint."""
+    expected, found = error.validator_value, error.instance
+    if error.validator == "type":
+        kinds = [expected] if isinstance(expected, str) else expected
+        allowed = " or ".join(_KINDS[kind] for kind in kinds)
+        return f"must be {allowed}, but is {_kind_of(found)}", ""
+    if error.validator == "pattern":
+        title = error.schema.get("title", "text").lower()
+        return f"{_shown(found)} is not allowed as {title}", _hint(error.schema)
+    if error.validator == "enum":
+        hint = did_you_mean(found, expected) if isinstance(found, str) else ""
+        return f"must be {listed(expected)}, but is {_shown(found)}", hint
+    if error.validator == "oneOf":
+        return "needs exactly one of " + listed(option["required"][0] for option in expected), ""
+    numbers = {
+        "minimum": f"must be at least {expected}, but is {found}",
+        "exclusiveMinimum": f"must be more than {expected}, but is {found}",
+        "minLength": "must not be empty",
+        "minItems": "must not be empty",
+        "maxLength": f"is longer than {expected} characters",
+        "uniqueItems": "contains the same item twice",
+    }
+    return numbers.get(error.validator, error.message), ""
+
+
+def _hint(schema_part: dict[str, Any]) -> str:
+    return str(schema_part.get("$comment", ""))
+
+
+def _kind_of(value: Any) -> str:
+    for kind, types in (
+        ("boolean", bool), ("object", dict), ("array", list), ("string", str), ("integer", int)
+    ):  # fmt: skip
+        if isinstance(value, types):
+            return _KINDS[kind]
+    return "null" if value is None else "a number with a fraction"
+
+
+def _shown(value: Any) -> str:
+    return f"'{value}'" if isinstance(value, str) else json.dumps(value)

@@ -1,0 +1,87 @@
+"""The thread that talks to the supervisor while hooks run."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from neuros.control import Lines
+
+REPORT_S = 1.0
+
+
+class Controlled(Protocol):
+    """What the supervisor may ask of a process of nodes."""
+
+    def post(self, event: Callable[[], None]) -> None: ...
+    def ask_to_stop(self) -> None: ...
+    def drain(self) -> None: ...
+    def probe(self, number: int) -> None: ...
+    def report(self) -> None: ...
+    def explain(self) -> None: ...
+
+
+class ControlThread(threading.Thread):
+    """Reports once per second and passes on what the supervisor asks for.
+
+    A supervisor that has gone, and a signal, both mean: stop.
+    """
+
+    def __init__(self, lines: Lines, signalled: socket.socket, process: Controlled) -> None:
+        super().__init__(name="neuros-control", daemon=True)
+        self._lines = lines
+        self._signalled = signalled
+        self._process = process
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        """Until the supervisor hangs up or :meth:`end`."""
+        next_report_s = time.monotonic() + REPORT_S
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._lines, selectors.EVENT_READ)
+            selector.register(self._signalled, selectors.EVENT_READ)
+            while not self._ended.is_set():
+                for key, _ in selector.select(max(0.0, next_report_s - time.monotonic())):
+                    if key.fileobj is self._signalled:
+                        self._on_signal()
+                    elif not self._on_lines():
+                        return
+                if time.monotonic() >= next_report_s:
+                    next_report_s += REPORT_S
+                    self._process.report()
+
+    def end(self) -> None:
+        """Report no more."""
+        self._ended.set()
+
+    def _on_signal(self) -> None:
+        try:
+            self._signalled.recv(64)
+        except OSError:
+            return
+        self._process.ask_to_stop()
+
+    def _on_lines(self) -> bool:
+        messages = self._lines.receive()
+        if messages is None:
+            self._process.ask_to_stop()
+            return False
+        for message in messages:
+            self._obey(message)
+        return True
+
+    def _obey(self, message: Mapping[str, Any]) -> None:
+        process, kind = self._process, message["kind"]
+        if kind == "stop":
+            process.ask_to_stop()
+        elif kind == "drain":
+            process.post(process.drain)
+        elif kind == "probe":
+            number = int(message["number"])
+            process.post(lambda: process.probe(number))
+        elif kind == "explain":
+            process.explain()

@@ -1,0 +1,135 @@
+"""The ``node`` that every hook receives."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from neuros.errors import ModelError, NodeError
+from neuros.ports import Logger
+from neuros.project.model import Node, NodeFile
+
+_POLL_S = 0.05
+
+
+class Host(Protocol):
+    """What a handle needs of the runtime behind it."""
+
+    @property
+    def is_ending(self) -> bool: ...
+    def make_packet(self, type_name: str) -> Any: ...
+    def shutdown(self, reason: str, drain_s: float) -> None: ...
+    def own_simulated_time(self, read_s: Callable[[], float]) -> None: ...
+    def on_close(self, callback: Callable[[], None]) -> None: ...
+    def offer_from_thread(
+        self, packets: Mapping[str, Any], accepted: Callable[[], None]
+    ) -> Callable[[Callable[[], None]], None]: ...
+
+
+class NodeHandle:
+    """A node as its plugin sees it."""
+
+    def __init__(self, file: NodeFile, ros_node: Any, host: Host) -> None:
+        self._file = file
+        self._ros_node = ros_node
+        self._host = host
+        self._types = {port.name: port.type for port in file.node.outputs}
+        self._user_data: Any = None
+
+    @property
+    def name(self) -> str:
+        """The node's name in the project."""
+        return self._file.node.name
+
+    @property
+    def run_dir(self) -> Path:
+        """This node's own writable folder in the run folder."""
+        return self._file.folders.run / self.name
+
+    @property
+    def description(self) -> Node:
+        """The node as its file declares it."""
+        return self._file.node
+
+    def make_packet(self, output: str) -> Any:
+        """A new message of the type of an output, with default values.
+
+        Raises:
+            NodeError: if the node has no such output.
+        """
+        try:
+            type_name = self._types[output]
+        except KeyError:
+            known = ", ".join(self._types) or "none"
+            raise NodeError(
+                f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
+            ) from None
+        return self._host.make_packet(type_name)
+
+    def get_ros_node(self) -> Any:
+        """The real ``rclpy.node.Node``; what is created on it is served between hooks."""
+        return self._ros_node
+
+    def get_logger(self) -> Logger:
+        """The logger of the ROS node."""
+        logger: Logger = self._ros_node.get_logger()
+        return logger
+
+    def set_user_data(self, data: Any) -> None:
+        """Keep something for the next hook."""
+        self._user_data = data
+
+    def get_user_data(self) -> Any:
+        """What was kept last, ``None`` before."""
+        return self._user_data
+
+    def shutdown(self, reason: str = "", drain_s: float = 5.0) -> None:
+        """End the project: drained within ``drain_s`` seconds, with exit code 0."""
+        self._host.shutdown(str(reason), float(drain_s))
+
+    def resolve_path(self, path: str) -> Path:
+        """An existing file: absolute, or relative to plugin, node file or project folder.
+
+        Raises:
+            ModelError: if there is none, naming all places that were looked at.
+        """
+        node, folders = self._file.node, self._file.folders
+        if path.startswith("@"):
+            places = [folders.workspace / path[1:]]
+        else:
+            wanted = path.removeprefix("#")
+            bases = dict.fromkeys((node.plugin.parent, node.file.parent, folders.project))
+            places = [base / wanted for base in bases]
+        for place in places:
+            if place.exists():
+                return place
+        raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
+
+    def own_simulated_time(self, read_s: Callable[[], float]) -> None:
+        """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
+        self._host.own_simulated_time(read_s)
+
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call ``callback`` once when the node ends, after its finalise hooks."""
+        self._host.on_close(callback)
+
+    def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
+        """Send from another thread, as if a hook with those outputs had returned them.
+
+        Waits while a reliable connection of one of the outputs is blocked; returns False, without
+        having sent, once ``cancelled()`` is true or the node ends.
+        """
+        sent = threading.Event()
+        withdraw = self._host.offer_from_thread(packets, sent.set)
+        while not sent.wait(_POLL_S):
+            if self._host.is_ending:
+                return sent.is_set()
+            if cancelled():
+                withdrawn = threading.Event()
+                withdraw(withdrawn.set)
+                while not withdrawn.wait(_POLL_S) and not self._host.is_ending:
+                    pass
+                return sent.is_set()
+        return True

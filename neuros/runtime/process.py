@@ -1,0 +1,207 @@
+"""The program of every process and container: one or more nodes in one event loop."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuros.control import Lines, connect
+from neuros.errors import NeurosError, NodeError
+from neuros.ports import Middleware
+from neuros.project.model import NodeFile
+from neuros.runtime.control_thread import ControlThread
+from neuros.runtime.node import NodeRuntime
+from neuros.runtime.plugin import plugin_traceback
+from neuros.runtime.scope import Stage
+
+MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
+
+
+class NodeProcess:
+    """Runs nodes until the supervisor, a signal or a failure ends it.
+
+    Args:
+        files: the nodes that live here.
+        make_middleware: joins them to the world; it may take its time to import ROS.
+        duration_sim_s: simulated time after which the node that owns it ends the project.
+        own_logs: whether each node writes to a log file of its own (several nodes share the
+            process), rather than to the output that the process was started with.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[NodeFile],
+        make_middleware: MiddlewareFactory,
+        *,
+        duration_sim_s: float | None = None,
+        own_logs: bool = False,
+    ) -> None:
+        self._files = files
+        self._make_middleware = make_middleware
+        self._duration_sim_s = duration_sim_s
+        self._own_logs = own_logs
+        self._stage = Stage()
+        self._nodes: list[NodeRuntime] = []
+        self._middleware: Middleware | None = None
+        self._has_failed = False
+        self._stop_asked = threading.Event()
+        self._tell_lock = threading.Lock()
+        self._lines: Lines | None = None
+
+    def run(self) -> int:
+        """Run to the end; returns 0 if it was asked to end, 1 if a node failed."""
+        run_folder = self._files[0].folders.run
+        os.chdir(run_folder)
+        self._lines = connect(run_folder)
+        self._tell("hello", nodes=[file.node.name for file in self._files], pid=os.getpid())
+        with _signals() as signalled:
+            thread = ControlThread(self._lines, signalled, self)
+            thread.start()
+            self._live()
+            for node in self._nodes:
+                node.finalise()
+            self.report(is_final=True)
+            if self._middleware is not None:
+                self._middleware.close()
+            thread.end()
+        return 1 if self._has_failed else 0
+
+    # ------------------------------------------------------------------ called by the supervisor
+
+    def ask_to_stop(self) -> None:
+        """Start no further hook, then finalise and end. Any thread."""
+        self._stop_asked.set()
+        for node in self._nodes:
+            node.stop()
+        if self._middleware is not None:
+            self._middleware.loop.stop()
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Have an event handled by the loop. Any thread."""
+        if self._middleware is not None:
+            self._middleware.loop.post_from_thread(event)
+
+    def drain(self) -> None:
+        """Stop the hooks that send unasked. Loop thread only."""
+        for node in self._nodes:
+            node.drain()
+
+    def probe(self, number: int) -> None:
+        """Report the state of all nodes at one moment. Loop thread only."""
+        assert self._middleware is not None
+        is_idle = not self._middleware.loop.has_waiting_events
+        for node in self._nodes:
+            self._tell("report", **node.probe(), probe=number, is_idle=is_idle)
+
+    def report(self, *, is_final: bool = False) -> None:
+        """Report state and counters of all nodes. Any thread."""
+        for node in tuple(self._nodes):
+            self._tell("report", **node.report(), is_final=is_final)
+
+    def explain(self) -> None:
+        """Report why nothing moves. Any thread."""
+        for node in tuple(self._nodes):
+            self._tell("explanation", node=node.name, lines=node.explain())
+
+    # ------------------------------------------------------------------ inside
+
+    def _live(self) -> None:
+        try:
+            self._middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+            for file in self._files:
+                self._add(file)
+            for node in self._nodes:
+                if not (self._stop_asked.is_set() or self._has_failed):
+                    node.load()
+        except NeurosError as error:
+            name = self._nodes[-1].name if self._nodes else self._files[0].node.name
+            failing = next((node for node in self._nodes if node.engine is None), None)
+            self._fail(failing.name if failing else name, error)
+        if self._stop_asked.is_set() or self._has_failed:
+            return
+        self.report()
+        assert self._middleware is not None
+        for node in self._nodes:
+            self._middleware.loop.post(node.start)
+        self._middleware.loop.run()
+
+    def _add(self, file: NodeFile) -> None:
+        assert self._middleware is not None
+        self._nodes.append(
+            NodeRuntime(
+                file,
+                self._middleware,
+                self._stage,
+                tell=self._tell,
+                fail=self._fail,
+                log_file=_log_file(file) if self._own_logs else None,
+                duration_sim_s=self._duration_sim_s,
+            )
+        )
+
+    def _tell(self, kind: str, **fields: Any) -> None:
+        assert self._lines is not None
+        with self._tell_lock:
+            self._lines.send(kind, **fields)
+
+    def _fail(self, name: str, error: NeurosError) -> None:
+        self._has_failed = True
+        node = next((node for node in self._nodes if node.name == name), None)
+        if node is not None:
+            node.log_failure(error)
+        self._tell(
+            "failed",
+            node=name,
+            text=str(error),
+            hook=getattr(error, "hook", ""),
+            where=getattr(error, "where", ""),
+        )
+        self.ask_to_stop()
+
+    def _fail_outside_hooks(self, error: BaseException) -> None:
+        """A callback that a plugin registered with ROS has failed, or NeuROS itself."""
+        if len(self._nodes) == 1:
+            node = self._nodes[0]
+        else:
+            files = {str(n.file.node.plugin): n for n in self._nodes}
+            node = next(
+                (files[name] for name in _filenames(error) if name in files), self._nodes[0]
+            )
+        wrapped = NodeError(
+            "failed outside its hooks:\n" + plugin_traceback(error, node.file.node.plugin)
+        )
+        self._fail(node.name, wrapped)
+
+
+def _filenames(error: BaseException) -> Iterator[str]:
+    trace = error.__traceback__
+    while trace is not None:
+        yield trace.tb_frame.f_code.co_filename
+        trace = trace.tb_next
+
+
+def _log_file(file: NodeFile) -> Path:
+    return file.folders.run / file.node.name / "node.log"
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[socket.socket]:
+    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    reader.setblocking(False)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    try:
+        yield reader
+    finally:
+        signal.set_wakeup_fd(previous)
+        reader.close()
+        writer.close()

@@ -1,0 +1,271 @@
+"""The simulator that plugins hold: who steps the world, and when its packets leave."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from neuros.errors import ModelError
+from neuros.ports import NodeContext, Packet
+from neuros.simulators.mujoco.commands import Controls, control
+from neuros.simulators.mujoco.declarations import did_you_mean
+from neuros.simulators.mujoco.free_run import FreeRun
+from neuros.simulators.mujoco.gate import Gate
+from neuros.simulators.mujoco.viewer import open_viewer
+from neuros.simulators.mujoco.world import World
+
+_BOUT_S = 0.005
+_BOUT_STEPS = 20
+_PAUSE_LOOK_S = 0.1
+
+
+class MuJoCo:
+    """A MuJoCo world whose sensors and actuators the node file declares.
+
+    Either the plugin steps it (``step_synchronous``, ``step_to_next``, then ``read``), or it steps
+    itself (``run_asynchronous``) and sends its packets as if a hook had returned them.
+
+    A sensor of period T fires at T, 2T, ... exactly; stamps are simulated time. A given model and
+    sequence of commands gives bit-identical packets in every run.
+
+    Args:
+        node: the ``node`` of the hook.
+        model: path of an MJCF or URDF file (looked up as paths in node files are), MJCF as text,
+            or a ``mujoco.MjSpec`` (copied).
+        fine_rendering: cameras with shadows, reflections and multisampling, about 7 x slower.
+        clock, wait: wall clock in seconds, and a sleep; for tests.
+
+    Raises:
+        ModelError: everything that is wrong with the declarations and the model, by file and key.
+    """
+
+    def __init__(
+        self,
+        node: NodeContext,
+        model: Any,
+        *,
+        fine_rendering: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], object] | None = None,
+    ) -> None:
+        self._node, self._clock, self._wait = node, clock, wait
+        self._world = World(node, model, fine=fine_rendering)
+        self._gate = Gate()
+        self._unread: dict[str, Packet] = {}
+        self._run: FreeRun | None = None
+        self._viewer = open_viewer(
+            node, self.model, self.data, toggle=self._toggle_pause, closed=self.resume
+        )
+        self._is_over = False
+        node.own_simulated_time(lambda: self.sim_time)
+        node.on_close(self.close)
+
+    # ---- what it is -------------------------------------------------------------------------
+
+    @property
+    def model(self) -> Any:
+        """The ``mujoco.MjModel``; another one after :meth:`spawn_entity`."""
+        return self._world.model
+
+    @property
+    def data(self) -> Any:
+        """The ``mujoco.MjData``; another one after :meth:`spawn_entity`."""
+        return self._world.data
+
+    @property
+    def sim_time(self) -> float:
+        """Simulated seconds since the start, or the last reset; from any thread."""
+        return self._world.time_s
+
+    @property
+    def timestep(self) -> float:
+        """Simulated seconds per step."""
+        return self._world.time.timestep_s
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it steps itself (paused or not)."""
+        return self._run is not None and self._run.is_running
+
+    # ---- the plugin steps it ----------------------------------------------------------------
+
+    def step_synchronous(self, count: int = 1) -> None:
+        """Advance ``count`` timesteps; nothing is sent.
+
+        Raises ``ModelError``, before any step, if a sensor would fire while its last packet is
+        unread, or twice.
+        """
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ModelError(f"step_synchronous: count is a whole number from 1, not {count!r}")
+        self._refuse_while_running("step_synchronous")
+        self._wait_while_paused()
+        self._refuse_to_cross(self._world.steps + count)
+        self._advance_to(self._world.steps + count)
+
+    def step_to_next(self) -> None:
+        """Advance to the next firing of any sensor."""
+        target = self._world.schedule.next_firing(self._world.steps)
+        if target is None:
+            raise ModelError(f"{self._node.description.file}: no output has a sensor to step to")
+        self.step_synchronous(target - self._world.steps)
+
+    def read(self, output: str) -> Packet | None:
+        """The packet of the sensor behind ``output`` that has come due since the last read."""
+        self._refuse_while_running("read")
+        if output not in self._world.schedule:
+            hint = did_you_mean(output, self._world.schedule)
+            raise ModelError(f"no output '{output}' has a sensor{hint}")
+        return self._unread.pop(output, None)
+
+    # ---- it steps itself --------------------------------------------------------------------
+
+    def run_asynchronous(self, real_time_factor: float | None = 1.0) -> None:
+        """Step in a thread of its own, ``real_time_factor`` simulated seconds per wall second.
+
+        ``None``: as fast as possible. Packets that are due leave together; stepping waits while a
+        reliable connection of one of them is blocked.
+        """
+        self._refuse_while_running("run_asynchronous")
+        if real_time_factor is not None and not 0 < real_time_factor < float("inf"):
+            raise ModelError(f"real_time_factor is positive or None, not {real_time_factor!r}")
+        self._world.cameras.close()  # its OpenGL belongs to this thread, not to the new one
+        steps = _BOUT_STEPS
+        if real_time_factor is not None:
+            steps = max(1, round(_BOUT_S * real_time_factor / self.timestep))
+        self._run = FreeRun(
+            self._node,
+            self._gate,
+            lambda: self._bout(steps),
+            lambda: self.sim_time,
+            lambda: self._world.cameras.close(),
+            real_time_factor,
+            self._clock,
+            self._wait,
+        )
+        self._run.start()
+
+    def stop(self) -> None:
+        """End :meth:`run_asynchronous`; the plugin may step again."""
+        if self._run is not None:
+            self._run.stop()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Inside, no step runs: the place to touch ``model`` and ``data``. Nests."""
+        with self._gate.visit():
+            yield
+
+    def pause(self) -> None:
+        """Let no further step begin until :meth:`resume`."""
+        self._gate.close()
+
+    def resume(self) -> None:
+        """Go on; the time spent in the pause is not caught up."""
+        if self._run is not None:
+            self._run.pacer.restart()
+        self._gate.open()
+
+    # ---- acting on it -----------------------------------------------------------------------
+
+    def command(self, input_name: str, packet: Packet) -> None:
+        """Drive the actuators that the node file declares for an input, from the next step on."""
+        command = self._world.commands.get(input_name)
+        if command is None:
+            hint = did_you_mean(input_name, self._world.commands)
+            raise ModelError(f"no input '{input_name}' has an actuator{hint}")
+        self._set(lambda: command(packet))
+
+    def actuate(self, name: str, value: float) -> None:
+        """Drive one actuator of the model, whether declared or not, from the next step on."""
+        self._set(lambda: control(self.model, name, value))
+
+    def spawn_entity(self, path: str | Path, position: Sequence[float], name: str) -> None:
+        """Attach the model of a file to the world at ``position`` (x, y, z in metres).
+
+        Its elements are called ``name/...``. Everything that exists keeps its state; ``model`` and
+        ``data`` are new objects, and changes that were made to the old ``model`` are gone.
+        """
+        with self.paused():
+            self._world.spawn(str(path), position, name)
+            if self._viewer is not None:
+                self._viewer.show(self.model, self.data)
+
+    def reset(self) -> None:
+        """Back to time zero and the initial state; unread packets are dropped."""
+        with self.paused():
+            self._world.reset()
+            self._unread.clear()
+            if self._run is not None:
+                self._run.pacer.restart()
+
+    def close(self) -> None:
+        """Stop stepping, close windows, free OpenGL. The node calls it at its end."""
+        self._is_over = True
+        self.stop()
+        self._gate.wake()
+        self._world.cameras.close()
+        if self._viewer is not None:
+            self._viewer.close()
+
+    # ---- inside -----------------------------------------------------------------------------
+
+    def _set(self, controls: Callable[[], Controls]) -> None:
+        with self.paused():
+            for actuator, value in controls():
+                self.data.ctrl[actuator] = value
+
+    def _bout(self, steps: int) -> Mapping[str, Packet]:
+        """Up to ``steps`` steps, ending at a firing; the packets that are due then."""
+        if not self._unread:  # packets that the plugin has left behind leave first
+            world = self._world
+            firing = world.schedule.next_firing(world.steps)
+            target = world.steps + steps
+            self._advance_to(target if firing is None else min(firing, target))
+        due, self._unread = self._unread, {}
+        return due
+
+    def _advance_to(self, target: int) -> None:
+        world = self._world
+        while world.steps < target:
+            firing = world.schedule.next_firing(world.steps)
+            stop = target if firing is None else min(firing, target)
+            world.step(stop - world.steps)
+            due = world.schedule.due(world.steps)
+            if due:
+                self._unread.update(world.sense(due))
+        if self._viewer is not None:
+            self._viewer.sync()
+
+    def _refuse_to_cross(self, target: int) -> None:
+        world = self._world
+        crossing = world.schedule.find_crossing(self._unread, world.steps, target)
+        if crossing is not None:
+            output, first, second = crossing
+            when = world.time.seconds
+            raise ModelError(
+                f"{self._node.description.file}: sensor '{output}' would fire again at "
+                f"{when(second):g} s while its packet of {when(first):g} s is unread: call "
+                f"read('{output}') after each firing, every {second - first} steps"
+            )
+
+    def _refuse_while_running(self, what: str) -> None:
+        if self.is_running:
+            raise ModelError(f"{what} is for a simulation that the plugin steps: stop() it first")
+
+    def _wait_while_paused(self) -> None:
+        """The user resumes in the viewer; nobody else could while the plugin waits here."""
+        if self._gate.is_closed and (self._viewer is None or not self._viewer.is_open):
+            raise ModelError("the simulation is paused: resume() it before it is stepped")
+        while not self._is_over and self._gate.is_closed:
+            if self._viewer is not None:
+                self._viewer.sync()  # notices that the window has been closed
+            self._gate.wait_open(_PAUSE_LOOK_S)
+
+    def _toggle_pause(self) -> None:
+        if self._gate.is_closed:
+            self.resume()
+        else:
+            self.pause()

@@ -1,0 +1,134 @@
+"""A compiled model, its state, and the sensors and commands that are bound to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import mujoco
+
+from neuros.errors import ModelError
+from neuros.ports import NodeContext, Packet
+from neuros.simulators.mujoco import build
+from neuros.simulators.mujoco.cameras import Cameras
+from neuros.simulators.mujoco.commands import bind_commands
+from neuros.simulators.mujoco.declarations import Problems, read_commands, read_sensors
+from neuros.simulators.mujoco.sensors import Binding, Fill, bind
+from neuros.simulators.mujoco.timebase import Schedule, Timebase
+
+_WARNINGS = mujoco.mjtWarning
+_FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
+
+
+class World:
+    """Physics in whole steps, without any notion of who steps it and when.
+
+    A sensor is read by ``mj_forward`` at the state of its firing time, so that what it measures
+    and its stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old).
+    That leaves the physics as it is: with and without sensors it is the same, bit for bit.
+
+    Raises ``ModelError`` with every problem of the declarations and the model at once.
+    """
+
+    def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
+        self._node, self._fine = node, fine
+        problems = Problems(node.description.file)
+        self._sensors = read_sensors(node.description, problems)
+        self._commands = read_commands(node.description, problems)
+        try:
+            self._spec, self.where = build.load_spec(node, model)
+            build.prepare_rendering(self._spec, self._sensors, fine=fine)
+            self.model = build.compile_spec(self._spec, self.where)
+        except ModelError as error:
+            problems.add_text(str(error))
+            problems.raise_any()
+        self.data = mujoco.MjData(self.model)
+        self.time = Timebase(self.model.opt.timestep)
+        self.schedule = self._make_schedule(problems)
+        self._bind(problems)
+        problems.raise_any()
+        self.steps = 0
+        self._seen_warnings: set[int] = set()
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since the start, or since the last reset."""
+        return self.time.seconds(self.steps)
+
+    def step(self, count: int) -> None:
+        """Advance the physics; raises ``ModelError`` if it has become unstable."""
+        mujoco.mj_step(self.model, self.data, nstep=count)
+        self.steps += count
+        if self.data.warning.number.any():
+            self._look_at_warnings(count)
+
+    def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
+        """The packets of these sensors for the present state."""
+        # mj_forward is a new start for the solver; the next step must not notice it.
+        solution = self.data.qacc_warmstart.copy()
+        mujoco.mj_forward(self.model, self.data)
+        self.data.qacc_warmstart[:] = solution
+        time_ns = self.time.nanoseconds(self.steps)
+        packets = {}
+        for output in outputs:
+            packet = packets[output] = self._node.make_packet(output)
+            self._fills[output](packet, self.data, time_ns)
+        return packets
+
+    def reset(self) -> None:
+        """Back to time zero and the model's initial state; spawned entities stay."""
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+        self.steps = 0
+
+    def spawn(self, path: str, position: Sequence[float], name: str) -> None:
+        """Attach the model of a file to the world; everything else keeps its state."""
+        if len(position) != 3:
+            raise ModelError(f"entity '{name}': a position is x, y, z in metres, not {position!r}")
+        if any(body.name.startswith(f"{name}/") for body in self._spec.bodies) or not name:
+            raise ModelError(f"an entity needs a name of its own: '{name}' is taken")
+        child, where = build.load_spec(self._node, path)
+        # First on a copy: a spec cannot go back once something that does not fit is attached.
+        trial = self._spec.copy()
+        build.attach(trial, child.copy(), position, name)
+        build.compile_spec(trial, where)
+        build.attach(self._spec, child, position, name)
+        self.model, self.data = self._spec.recompile(self.model, self.data)
+        self.cameras.close()
+        self._bind(Problems(self._node.description.file))
+        mujoco.mj_forward(self.model, self.data)
+
+    def _make_schedule(self, problems: Problems) -> Schedule:
+        periods = {}
+        for sensor in self._sensors:
+            try:
+                periods[sensor.output] = self.time.period_steps(sensor.rate_hz)
+            except ValueError as error:
+                problems.add(f"{sensor.pointer}/rate", str(error))
+        return Schedule(periods)
+
+    def _bind(self, problems: Problems) -> None:
+        self.cameras = Cameras(self.model, fine=self._fine)
+        self._fills: dict[str, Fill] = {}
+        for sensor in self._sensors:
+            fill = bind(Binding(sensor, self.model, self.cameras, problems))
+            if fill:
+                self._fills[sensor.output] = fill
+        self.commands = bind_commands(self.model, self._commands, problems)
+
+    def _look_at_warnings(self, count: int) -> None:
+        for warning, number in enumerate(self.data.warning.number.tolist()):
+            if not number:
+                continue
+            info = int(self.data.warning[warning].lastinfo)
+            text = mujoco.mju_warningText(warning, info)
+            if warning in [fatal.value for fatal in _FATAL]:
+                since = self.time.seconds(self.steps - count)
+                raise ModelError(
+                    f"{self.where}: unstable between {since:g} s and {self.time_s:g} s of "
+                    f"simulated time: {text} A smaller timestep, softer contacts or gains may help."
+                )
+            if warning not in self._seen_warnings:
+                self._seen_warnings.add(warning)
+                self._node.get_logger().warning(f"{self.where}: MuJoCo: {text}")

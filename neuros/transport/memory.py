@@ -1,0 +1,114 @@
+"""Packets within one process: handed over in memory, in the order in which they were sent.
+
+What rclcpp calls intra-process communication. It needs no ROS itself: how a packet is copied is
+given from outside, which is also what makes it the deterministic transport of the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from neuros.ports import Inbox
+from neuros.project.model import Connection, NodeFile, Port
+
+
+class Outside(Protocol):
+    """What lies beyond the process: external topics, and listeners to the data topics."""
+
+    def open(self, inbox: Inbox) -> None: ...
+    def send_external(self, port: Port, packet: Any) -> None: ...
+    def show(self, connections: Sequence[Connection], packet: Any) -> None: ...
+    def make_packet(self, type_name: str) -> Any: ...
+    def close(self) -> None: ...
+
+
+class MemoryHub:
+    """Joins the nodes of one process.
+
+    ``post`` queues an event; ``decode(encode(packet))`` must share nothing with ``packet``.
+    """
+
+    def __init__(
+        self,
+        post: Callable[[Callable[[], None]], None],
+        encode: Callable[[Any], Any],
+        decode: Callable[[Any], Any],
+    ) -> None:
+        self.post = post
+        self.encode = encode
+        self.decode = decode
+        self.inboxes: dict[str, Inbox] = {}
+        self._waiting: list[Connection] = []
+
+    def join(self, name: str, inbox: Inbox, connections: Sequence[Connection]) -> None:
+        """Add a node; whoever waited for it is told."""
+        self.inboxes[name] = inbox
+        self._waiting += [c for c in connections if c.source_node == name]
+        for connection in tuple(self._waiting):
+            if connection.destination_node in self.inboxes:
+                self._waiting.remove(connection)
+                self._register(connection)
+
+    def _register(self, connection: Connection) -> None:
+        sender = self.inboxes[connection.source_node]
+        self.post(lambda: sender.on_registered(connection))
+
+
+class MemoryTransport:
+    """Carries the packets of one node to the others in the same process."""
+
+    def __init__(self, file: NodeFile, hub: MemoryHub, outside: Outside) -> None:
+        self._name = file.node.name
+        self._connections = file.connections
+        self._hub = hub
+        self._outside = outside
+
+    def open(self, inbox: Inbox) -> None:
+        """Join the others."""
+        self._outside.open(inbox)
+        self._hub.join(self._name, inbox, self._connections)
+
+    def send(self, connections: Sequence[Connection], packet: Any) -> None:
+        """Hand a packet over; each receiver gets its own copy."""
+        hub = self._hub
+        parcel = hub.encode(packet)
+        for connection in connections:
+            hub.post(_Delivery(hub, connection, parcel))
+        self._outside.show(connections, packet)
+
+    def send_external(self, port: Port, packet: Any) -> None:
+        """Publish on the external topic of an output."""
+        self._outside.send_external(port, packet)
+
+    def acknowledge(self, connection: Connection, position: int) -> None:
+        """Tell the sender which position every taker has reached."""
+        sender = self._hub.inboxes[connection.source_node]
+        self._hub.post(lambda: sender.on_acknowledgement(connection, position))
+
+    def waiting_for(self) -> Sequence[Connection]:
+        """Connections whose receiver has not joined yet."""
+        return [c for c in self._connections if c.destination_node not in self._hub.inboxes]
+
+    def make_packet(self, type_name: str) -> Any:
+        """A new message with default values."""
+        return self._outside.make_packet(type_name)
+
+    def close(self) -> None:
+        """Give up what lies outside."""
+        self._outside.close()
+
+
+class _Delivery:
+    """A packet on its way."""
+
+    __slots__ = ("_connection", "_hub", "_parcel")
+
+    def __init__(self, hub: MemoryHub, connection: Connection, parcel: Any) -> None:
+        self._hub = hub
+        self._connection = connection
+        self._parcel = parcel
+
+    def __call__(self) -> None:
+        hub, connection = self._hub, self._connection
+        hub.inboxes[connection.destination_node].on_packet(connection, hub.decode(self._parcel))

@@ -1,0 +1,45 @@
+"""ROS message classes: found by their type name, created, and carried over byte by byte."""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from typing import Any
+
+from rclpy.serialization import deserialize_message, serialize_message
+
+from neuros.errors import EnvironmentFault
+
+
+@cache
+def message_class(type_name: str) -> type:
+    """The class of a message type in ROS notation, ``"std_msgs/msg/String"``.
+
+    Raises:
+        EnvironmentFault: if its package is not installed or has no such message.
+    """
+    package, _, name = type_name.replace("/", ".").rpartition(".")
+    try:
+        found = getattr(importlib.import_module(package), name)
+    except (ImportError, AttributeError) as error:
+        raise EnvironmentFault(
+            f"message type {type_name} cannot be imported here ({error}): is its package"
+            " installed in this node's container?"
+        ) from error
+    assert isinstance(found, type)
+    return found
+
+
+def encode(packet: Any) -> tuple[type, bytes]:
+    """What travels of a packet: its class, and its bytes as DDS would carry them."""
+    return type(packet), serialize_message(packet)
+
+
+def decode(parcel: tuple[type, bytes]) -> Any:
+    """The packet in a parcel; it shares nothing with the one that was sent.
+
+    Within one process, too, packets go through ROS's own serialisation, so that every back end
+    rounds and checks fields alike (a Python float in a ``float32`` field, for instance).
+    """
+    kind, data = parcel
+    return deserialize_message(data, kind)

@@ -1,0 +1,136 @@
+"""How the two ends of a connection find each other before the first packet.
+
+DDS matches a writer and a reader on each side separately and at different times, and what is sent
+before both have matched may vanish without a trace. So each end looks at its own endpoints: the
+receiver announces itself on ``/reg`` once its data reader has matched the sender's writer and its
+acknowledgement writer the sender's reader; the sender, once the same holds the other way round
+and it has heard the announcement, counts the connection as registered and confirms.
+
+A number of matches says nothing about *who* matched (a recorder and ``ros2 topic echo`` do, too).
+An end is taken as found when the ROS graph lists an endpoint of that very node, and all compatible
+endpoints that the graph lists are matched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from rclpy.node import Node as RosNode
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_msgs.msg import String
+
+from neuros.project.model import Connection
+
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""QoS of ``/reg`` and ``/ack``: the last message also reaches who comes later."""
+
+_READY = "ready"
+_CONFIRMED = "confirmed"
+
+
+class Registration:
+    """One connection, seen from one of its ends.
+
+    ``on_registered`` is called once, in the loop's thread, when this end is sure of the other.
+    """
+
+    def __init__(
+        self,
+        ros_node: RosNode,
+        connection: Connection,
+        *,
+        publishers: list[Publisher],
+        subscriptions: list[Subscription],
+        is_sender: bool,
+        on_registered: Callable[[], None],
+    ) -> None:
+        self.connection = connection
+        self.is_done = False
+        self._ros_node = ros_node
+        self._publishers = publishers
+        self._subscriptions = subscriptions
+        self._is_sender = is_sender
+        self._peer = connection.destination_node if is_sender else connection.source_node
+        self._on_registered = on_registered
+        self._peer_is_ready = False
+        topic = f"{connection.topic}/reg"
+        self._voice = ros_node.create_publisher(String, topic, LATCHED)
+        self._ear = ros_node.create_subscription(String, topic, self._hear, 10)
+
+    def advance(self) -> bool:
+        """Look again, announce or confirm where it is time; returns whether all is done."""
+        if self.is_done or not self._has_found_peer():
+            return self.is_done
+        if not self._is_sender:
+            self._voice.publish(String(data=_READY))
+        elif self._peer_is_ready:
+            self._voice.publish(String(data=_CONFIRMED))
+            self._finish()
+        return self.is_done
+
+    def close(self) -> None:
+        """Give up the endpoints."""
+        self._ros_node.destroy_publisher(self._voice)
+        self._ros_node.destroy_subscription(self._ear)
+
+    def _hear(self, message: String) -> None:
+        if self._is_sender and message.data == _READY:
+            self._peer_is_ready = True
+            if self.is_done:  # the confirmation may have been sent before the ear was there
+                self._voice.publish(String(data=_CONFIRMED))
+            else:
+                self.advance()
+        elif not self._is_sender and message.data == _CONFIRMED and not self.is_done:
+            self._finish()
+
+    def _finish(self) -> None:
+        self.is_done = True
+        self._on_registered()
+
+    def _has_found_peer(self) -> bool:
+        return all(
+            self._includes_peer(
+                self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name),
+                publisher.get_subscription_count(),
+                lambda other, own=publisher.qos_profile: _match(own, other),
+            )
+            for publisher in self._publishers
+        ) and all(
+            self._includes_peer(
+                self._ros_node.get_publishers_info_by_topic(subscription.topic_name),
+                subscription.get_publisher_count(),
+                lambda other, own=subscription.qos_profile: _match(other, own),
+            )
+            for subscription in self._subscriptions
+        )
+
+    def _includes_peer(
+        self,
+        endpoints: Sequence[TopicEndpointInfo],
+        matched: int,
+        is_compatible: Callable[[QoSProfile], bool],
+    ) -> bool:
+        compatible = [e for e in endpoints if is_compatible(e.qos_profile)]
+        return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)
+
+
+def _match(publisher: QoSProfile, subscription: QoSProfile) -> bool:
+    """Whether DDS matches these two.
+
+    ``rclpy.qos.qos_check_compatible`` takes the "infinite" deadline that the graph reports for one
+    that was asked for, and so refuses all that the graph lists.
+    """
+    return (
+        subscription.reliability != QoSReliabilityPolicy.RELIABLE
+        or publisher.reliability == QoSReliabilityPolicy.RELIABLE
+    ) and (
+        subscription.durability != QoSDurabilityPolicy.TRANSIENT_LOCAL
+        or publisher.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
+    )

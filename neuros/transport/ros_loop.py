@@ -1,0 +1,167 @@
+"""The thread in which all nodes of a process run: one queue for ROS's events and the engine's.
+
+rclpy's ``SingleThreadedExecutor`` builds a new wait set for every callback; its
+``EventsExecutor`` keeps one queue in C++ and takes a third of the time. Two of its habits shape
+this module: without a finite timeout it spins hot, and past its deadline it goes on while events
+keep coming. So it is always given a deadline, and is stopped from inside when a timer is due.
+
+Events of the engines wait in a deque of their own, since passing each of them through C++ would
+cost more than the engine itself. One task in the executor's queue (the *pump*) stands for them, so
+that both queues take turns. A loop-back is only handled first thing in a turn: then everything
+that ROS had waiting when it was posted has been seen.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node as RosNode
+
+Event = Callable[[], None]
+
+_TURN_NS = 100_000
+_LONG_S = 3600.0
+
+
+class _Waker:
+    """Looks like a future to the executor and keeps what stops it: spinning ends on demand."""
+
+    def __init__(self) -> None:
+        self.wake: Callable[[Any], None] = lambda _: None
+
+    def add_done_callback(self, callback: Callable[[Any], None]) -> None:
+        self.wake = callback
+
+    def remove_done_callback(self, callback: Callable[[Any], None]) -> None:
+        """Keep it: it may be called from another thread between two spins, and then counts."""
+
+
+class RosLoop:
+    """Runs events of ROS, engines and timers, one at a time, oldest first.
+
+    ``on_failure`` gets whatever an event raises, in the loop's thread.
+    """
+
+    def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
+        self._executor = EventsExecutor(context=context)
+        self._on_failure = on_failure
+        self._waker = _Waker()
+        self._events: deque[tuple[Event, bool]] = deque()
+        self._has_posted_pump = False
+        self._timers: list[tuple[Callable[[], int | None], Event]] = []
+        self._planned_ns: int | None = None
+        self._is_stopping = False
+
+    def add_node(self, node: RosNode) -> None:
+        """Serve what exists, and what will be created, on a ROS node."""
+        self._executor.add_node(node)
+
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
+        """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
+        self._timers.append((next_due_ns, on_due))
+
+    @property
+    def has_waiting_events(self) -> bool:
+        """Whether events of engines wait."""
+        return bool(self._events)
+
+    def post(self, event: Event) -> None:
+        """Handle ``event`` after all that already wait."""
+        self._events.append((event, False))
+        if not self._has_posted_pump:
+            self._post_pump()
+
+    def post_loop_back(self, event: Event) -> None:
+        """Handle ``event`` after all that already wait, those of ROS included."""
+        self._events.append((event, True))
+        if not self._has_posted_pump:
+            self._post_pump()
+
+    def post_from_thread(self, event: Event) -> None:
+        """Like :meth:`post`, from any thread."""
+        self._executor.create_task(self.guard, event)
+
+    def guard(self, event: Callable[..., None], *arguments: Any) -> None:
+        """Run what ROS calls: a failure must not unwind through the executor's C++."""
+        try:
+            event(*arguments)
+        except BaseException as error:
+            self._on_failure(error)
+        if self._timers:
+            self._check_timers()
+
+    def run(self) -> None:
+        """Run until :meth:`stop`."""
+        while not self._is_stopping:
+            self._planned_ns = self._next_due_ns()
+            if self._planned_ns is None:
+                wait_s = _LONG_S
+            else:
+                wait_s = (self._planned_ns - time.monotonic_ns()) / 1e9
+            if wait_s > 0:
+                self._executor.spin_until_future_complete(self._waker, wait_s)
+            self._run_due_timers()
+
+    def run_for(self, seconds: float) -> None:
+        """Serve events for a while, for instance to let the last ones out."""
+        self._executor.spin_until_future_complete(self._waker, max(seconds, 1e-6))
+
+    def stop(self) -> None:
+        """End :meth:`run` after the current event. Any thread."""
+        self._is_stopping = True
+        self._waker.wake(None)
+
+    def close(self) -> None:
+        """Give up the executor."""
+        self._executor.shutdown(0)
+
+    def _post_pump(self) -> None:
+        self._has_posted_pump = True
+        self._executor.create_task(self._pump)
+
+    def _pump(self) -> None:
+        self._has_posted_pump = False
+        events = self._events
+        end_ns = time.monotonic_ns() + _TURN_NS
+        is_first = True
+        while events and not self._is_stopping:
+            event, is_loop_back = events[0]
+            if is_loop_back and not is_first:
+                break
+            is_first = False
+            events.popleft()
+            try:
+                event()
+            except BaseException as error:
+                self._on_failure(error)
+            if time.monotonic_ns() > end_ns:
+                break
+        if events and not self._has_posted_pump:
+            self._post_pump()
+        if self._timers:
+            self._check_timers()
+
+    def _check_timers(self) -> None:
+        """Leave the executor if a timer is due, or due at another time than was planned for."""
+        next_ns = self._next_due_ns()
+        if next_ns != self._planned_ns or (next_ns and next_ns <= time.monotonic_ns()):
+            self._waker.wake(None)
+
+    def _next_due_ns(self) -> int | None:
+        dues = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
+        return min(dues, default=None)
+
+    def _run_due_timers(self) -> None:
+        now_ns = time.monotonic_ns()
+        for next_due_ns, on_due in self._timers:
+            due_ns = next_due_ns()
+            if due_ns is not None and due_ns <= now_ns:
+                try:
+                    on_due()
+                except BaseException as error:
+                    self._on_failure(error)

@@ -1,0 +1,105 @@
+"""Everything of ROS that the nodes of one process share: context, loop, and how they are joined."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.node import Node as RosNode
+from rclpy.signals import SignalHandlerOptions
+
+from neuros.ports import Transport
+from neuros.project.model import NodeFile
+from neuros.transport.memory import MemoryHub, MemoryTransport
+from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.outside import RosOutside
+from neuros.transport.ros import RosTransport
+from neuros.transport.ros_loop import RosLoop
+
+_LINGER_S = 0.05
+
+
+class RosProcess:
+    """The middleware of a process with one node, or (``in_memory``) with all nodes of a project."""
+
+    def __init__(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        in_memory: bool,
+        debug: bool = False,
+    ) -> None:
+        self._context = rclpy.Context()
+        # rcl would write each record to a second log file, which costs as much as a packet.
+        arguments = ["--ros-args", "--disable-external-lib-logs"]
+        for file in files if debug else ():
+            arguments += ["--log-level", f"{file.node.name}:=debug"]
+        rclpy.init(
+            args=arguments,
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._loop = RosLoop(self._context, on_failure)
+        self._hub = MemoryHub(self._loop.post, encode, decode) if in_memory else None
+        self._ros_nodes: dict[str, RosNode] = {}
+        self._own_entities: dict[str, set[int]] = {}
+        self._transports: list[Transport] = []
+
+    @property
+    def loop(self) -> RosLoop:
+        """The event loop of the process."""
+        return self._loop
+
+    def transport(self, file: NodeFile) -> Transport:
+        """The transport of one node; creates its ROS node."""
+        ros_node = RosNode(file.node.name, context=self._context)
+        self._ros_nodes[file.node.name] = ros_node
+        self._loop.add_node(ros_node)
+        transport: Transport
+        if self._hub is None:
+            transport = RosTransport(file, ros_node, self._loop)
+        else:
+            outside = RosOutside(file, ros_node, self._loop)
+            transport = MemoryTransport(file, self._hub, outside)
+        self._transports.append(transport)
+        return transport
+
+    def ros_node(self, file: NodeFile) -> RosNode:
+        """The ROS node of a node that has a transport."""
+        return self._ros_nodes[file.node.name]
+
+    def mark_own_entities(self, file: NodeFile) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it."""
+        self._own_entities[file.node.name] = _entities(self.ros_node(file))
+
+    def has_foreign_entities(self, file: NodeFile) -> bool:
+        """Whether a plugin has created something on its ROS node that may call back."""
+        own = self._own_entities.get(file.node.name, set())
+        return not _entities(self.ros_node(file)) <= own
+
+    def copy(self, packet: Any) -> Any:
+        """A packet that shares nothing with this one."""
+        return decode(encode(packet))
+
+    def message_class(self, type_name: str) -> type:
+        """The class of a message type in ROS notation."""
+        return message_class(type_name)
+
+    def close(self) -> None:
+        """Let what was sent last leave, then give up everything."""
+        for transport in self._transports:
+            transport.close()
+        self._loop.run_for(_LINGER_S)
+        self._loop.close()
+        for ros_node in self._ros_nodes.values():
+            ros_node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+def _entities(ros_node: RosNode) -> set[int]:
+    groups = (ros_node.subscriptions, ros_node.timers, ros_node.services, ros_node.clients)
+    return {id(entity) for group in groups for entity in group} | {
+        id(waitable) for waitable in ros_node.waitables
+    }

@@ -1,0 +1,243 @@
+"""What killed nodes leave in shared memory goes, and what lives is never touched."""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import queue
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from neuros.launch.domain import DomainLock, choose_domain
+from neuros.launch.guardian import Guardian
+from neuros.launch.run_processes import RUN_ID
+from neuros.launch.shared_memory import sweep
+
+SHM = Path("/dev/shm")
+PORT = ("fastrtps_port7411", "fastrtps_port7411_el", "sem.fastrtps_port7411_mutex")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in PORT:
+        (tmp_path / name).write_bytes(b"x" * 64)
+    return tmp_path
+
+
+def _names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def _sweep(folder: Path, started_s: float = 0.0) -> tuple[str, ...]:
+    return sweep(started_s, folder=folder, look_again_s=0.0)
+
+
+def test_a_group_with_a_free_lock_is_removed_as_a_whole(folder: Path) -> None:
+    assert sorted(_sweep(folder)) == sorted(PORT)
+    assert not _names(folder)
+
+
+def test_a_group_whose_owner_holds_the_lock_stays(folder: Path) -> None:
+    with open(folder / PORT[1]) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert _sweep(folder) == ()
+    assert _names(folder) == set(PORT)
+
+
+def test_so_does_one_whose_readers_share_a_lock(folder: Path) -> None:
+    (folder / PORT[1]).rename(folder / "fastrtps_port7411_sl")
+    with open(folder / "fastrtps_port7411_sl") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        assert _sweep(folder) == ()
+
+
+def test_an_owner_that_is_about_to_lock_is_not_disturbed(folder: Path) -> None:
+    with open(folder / PORT[1]):
+        assert _sweep(folder) == ()
+
+
+def test_without_a_lock_file_it_counts_whether_somebody_maps_the_memory(folder: Path) -> None:
+    (folder / PORT[1]).unlink()
+    with open(folder / PORT[0], "r+b") as file:
+        memory = mmap.mmap(file.fileno(), 0)
+    assert _sweep(folder) == ()
+    memory.close()
+    assert set(_sweep(folder)) == {PORT[0], PORT[2]}
+
+
+def test_what_was_there_before_the_run_stays(folder: Path) -> None:
+    long_ago = time.time() - 3600
+    for path in folder.iterdir():
+        os.utime(path, (long_ago, long_ago))
+    assert _sweep(folder, time.time()) == ()
+
+
+def test_what_came_right_after_the_start_counts_as_of_the_run(tmp_path: Path) -> None:
+    started = time.time()
+    (tmp_path / PORT[0]).touch()
+    assert _sweep(tmp_path, started) == (PORT[0],)
+
+
+def test_tracing_files_go_when_nobody_maps_them_however_old(tmp_path: Path) -> None:
+    waits = tmp_path / "lttng-ust-wait-8-0"
+    waits.write_bytes(b"x" * 64)
+    os.utime(waits, (0, 0))
+    with open(waits, "r+b") as file:
+        memory = mmap.mmap(file.fileno(), 0)
+    assert _sweep(tmp_path, time.time()) == ()
+    memory.close()
+    assert _sweep(tmp_path, time.time()) == (waits.name,)
+
+
+def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
+    for name in ("sem.mine", "fastrtps", "my_fastrtps_1", "lttng", "psm_1234"):
+        (tmp_path / name).touch()
+    assert _sweep(tmp_path) == ()
+
+
+def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
+    assert _sweep(tmp_path / "nowhere") == ()
+
+
+# ------------------------------------------------------------------------- real ROS nodes
+
+NODE = """
+import sys, rclpy
+from std_msgs.msg import String
+rclpy.init(domain_id=int(sys.argv[2]))
+node = rclpy.create_node(sys.argv[1])
+if sys.argv[1].startswith("talker"):
+    publisher = node.create_publisher(String, "talk", 10)
+    node.create_timer(0.05, lambda: publisher.publish(String(data=sys.argv[1])))
+    print("ready", flush=True)
+else:
+    node.create_subscription(String, "talk", lambda packet: print(packet.data, flush=True), 10)
+while True:
+    rclpy.spin_once(node, timeout_sec=0.1)
+"""
+
+
+class RosNode:
+    """A process with a real ROS node: a talker, or a listener that prints what it hears."""
+
+    def __init__(self, name: str, domain: int, run_id: str = "") -> None:
+        environment = {**os.environ, **({RUN_ID: run_id} if run_id else {})}
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", NODE, name, str(domain)],
+            stdout=subprocess.PIPE,
+            env=environment,
+            text=True,
+        )
+        self._heard: queue.Queue[str] = queue.Queue()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as output:
+            for line in output:
+                self._heard.put(line.strip())
+
+    def hears(self, name: str, times: int = 5, deadline_s: float = 20.0) -> None:
+        """Wait until it has heard ``name`` so many times from now on."""
+        while not self._heard.empty():
+            self._heard.get()
+        end = time.monotonic() + deadline_s
+        while times:
+            times -= self._heard.get(timeout=end - time.monotonic()) == name
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
+        self._reader.join(10)
+
+
+def _in_use(pid: int) -> set[str]:
+    """Names in ``/dev/shm`` that a process maps or has open."""
+    names = set()
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        if f"{SHM}/" in line:
+            names.add(line.rpartition("/")[2])
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        target = os.readlink(descriptor)
+        if target.startswith(f"{SHM}/"):
+            names.add(target.rpartition("/")[2])
+    return names
+
+
+@pytest.fixture
+def domain() -> Iterator[DomainLock]:
+    with choose_domain(None, {}, False) as lock:
+        yield lock
+
+
+@pytest.fixture
+def nodes() -> Iterator[list[RosNode]]:
+    nodes: list[RosNode] = []
+    yield nodes
+    for node in nodes:
+        node.kill()
+    sweep(_STARTED_S)
+
+
+_STARTED_S = time.time()
+
+
+def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
+    domain: DomainLock, nodes: list[RosNode]
+) -> None:
+    run_id = secrets.token_hex(8)
+    guardian = Guardian.start(run_id)
+    try:
+        # The run is there first, so that its neighbours know, and map, its memory.
+        nodes.append(RosNode("talker_of_the_run", domain.id, run_id))
+        listener = RosNode("listener", domain.id)
+        nodes.append(listener)
+        listener.hears("talker_of_the_run")
+        nodes.append(RosNode("talker", domain.id))
+        listener.hears("talker")
+        run, *others = [node.process.pid for node in nodes]
+        of_the_run = {name for name in _in_use(run) if (SHM / f"{name}_el").exists()}
+        alive = set().union(*(_in_use(pid) for pid in others))
+        owned = {name for pid in others for name in _in_use(pid) if name.endswith("_el")}
+        os.kill(run, signal.SIGKILL)
+    finally:
+        guardian.finish()
+    left = _names(SHM)
+    dead = {name for name in of_the_run if f"{name}_el" not in owned}
+    assert dead
+    assert dead.isdisjoint(left)
+    assert {f"{name}_el" for name in dead}.isdisjoint(left)
+    assert alive - dead <= left
+    listener.hears("talker")
+
+    # A new node takes the number, and so the port, of the killed one.
+    nodes.append(RosNode("talker_again", domain.id))
+    listener.hears("talker_again")
+
+
+def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
+    domain: DomainLock, nodes: list[RosNode]
+) -> None:
+    run_id = secrets.token_hex(8)
+    guardian = Guardian.start(run_id)
+    try:
+        nodes.append(RosNode("listener", domain.id, run_id))
+        nodes.append(RosNode("talker", domain.id, run_id))
+        nodes[0].hears("talker")
+        used = set().union(*(_in_use(node.process.pid) for node in nodes))
+        assert any(name.startswith("fastrtps_port") for name in used)
+    finally:
+        guardian.finish()
+    stays = {name for name in used if name.startswith("lttng")}  # others may be using these
+    bases = {name.removesuffix("_el") for name in used - stays}
+    assert not {name for name in _names(SHM) for base in bases if base in name}

@@ -1,0 +1,1 @@
+"""The plugin of the broken projects; it is never loaded."""
