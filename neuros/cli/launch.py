@@ -51,7 +51,9 @@ def launch(options: argparse.Namespace) -> int:
         is_partial = len(names) < len(project.nodes)
         with ExitStack() as stack:
             domain = stack.enter_context(
-                choose_domain(options.domain_id, os.environ, _needs_known_domain(project, is_partial))
+                choose_domain(
+                    options.domain_id, os.environ, _needs_known_domain(project, is_partial)
+                )
             )
             if options.dry_run:
                 return _dry_run(project, names, backend, duration, domain, options)
@@ -303,8 +305,7 @@ def _signals_noted() -> Iterator[list[int]]:
     noted: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     previous = {
-        number: signal.signal(number, lambda number, _: noted.append(number))
-        for number in numbers
+        number: signal.signal(number, lambda number, _: noted.append(number)) for number in numbers
     }
     try:
         yield noted

@@ -194,8 +194,7 @@ def _validate(options: argparse.Namespace) -> int:
 
     project = load(options)
     print(
-        f"{project.file}: valid: {len(project.nodes)} nodes,"
-        f" {len(project.connections)} connections"
+        f"{project.file}: valid: {len(project.nodes)} nodes, {len(project.connections)} connections"
     )
     return 0
 

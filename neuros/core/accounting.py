@@ -10,8 +10,10 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
-from neuros.core.hook import Hook
+if TYPE_CHECKING:
+    from neuros.core.hook import Hook
 
 
 class State(str, Enum):
@@ -31,6 +33,13 @@ class Rest:
 
     state: State
     cause: str = ""
+
+    def __post_init__(self) -> None:
+        # Time is booked at every event, so the hash is not computed anew each time.
+        object.__setattr__(self, "_hash", hash((self.state, self.cause)))
+
+    def __hash__(self) -> int:
+        return self._hash  # type: ignore[attr-defined,no-any-return]
 
 
 REGISTERING = Rest(State.REGISTERING)
@@ -60,12 +69,11 @@ def cause_of_rest(hooks: Iterable[Hook]) -> Rest:
     for hook in hooks:
         if not (hook.is_enabled and hook.is_due):
             continue
-        if hook.is_ready():
-            return SCHEDULING
         if hook.is_missing_input():
             if waiting is None:
-                slot = next(slot for slot in hook.slots if slot.missing)
-                waiting = Rest(State.WAITING, slot.name)
+                waiting = next(slot.rest for slot in hook.slots if slot.missing)
+        elif hook.is_ready():
+            return SCHEDULING
         elif blocked is None:
-            blocked = Rest(State.BLOCKED, str(hook.blocking_outlets()[0].connection))
+            blocked = hook.blocking_outlets()[0].rest
     return blocked or waiting or IDLE

@@ -112,6 +112,7 @@ class Engine:
         self._is_passing = False
         self.executing: Hook | None = None
         self.accounts = Accounts()
+        self._cause = REGISTERING
         self.created_ns = self.rest_since_ns = clock()
 
     # ------------------------------------------------------------------ events
@@ -260,7 +261,7 @@ class Engine:
         """Book the time since the last event; returns the time now."""
         now_ns = self._clock()
         if self.executing is None:  # else it is the hook's, and booked when that ends
-            self.accounts.spend(self.rest(), now_ns - self.rest_since_ns)
+            self.accounts.spend(self._cause, now_ns - self.rest_since_ns)
             self.rest_since_ns = now_ns
         return now_ns
 
@@ -278,7 +279,8 @@ class Engine:
                     self._run(hook)
         finally:
             self._is_passing = False
-        if not self._has_posted_loop_back and self.has_ready_hook:
+        self._cause = cause_of_rest(self._order)
+        if self._cause is SCHEDULING and not (self._has_posted_loop_back or self.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
 
@@ -325,27 +327,22 @@ class Engine:
         if position <= inlet.acknowledged:
             return
         inlet.acknowledged = position
-        connection = inlet.key
-        assert isinstance(connection, Connection)
-        outlet = self.outlets.get(connection)
-        if outlet is None:
-            self._effects.acknowledge(connection, position)
+        connection: Any = inlet.key  # external topics are not acknowledged
+        if connection.source_node == self.node.name:
+            self.outlets[connection].credit(position, self._clock())
         else:
-            outlet.credit(position, self._clock())
+            self._effects.acknowledge(connection, position)
 
     def _send(self, output: Output, packet: Any) -> None:
         if output.port.external_topic is not None:
             self._effects.send_external(output.port, packet)
             return
-        elsewhere = []
         for outlet in output.outlets:
             outlet.spend()
-            if outlet.connection.destination_node == self.node.name:
-                self._send_to_itself(outlet.connection, packet)
-            else:
-                elsewhere.append(outlet.connection)
-        if elsewhere:
-            self._effects.send(elsewhere, packet)
+        for connection in output.to_itself:
+            self._send_to_itself(connection, packet)
+        if output.elsewhere:
+            self._effects.send(output.elsewhere, packet)
 
     def _send_to_itself(self, connection: Connection, packet: Any) -> None:
         own = self._effects.copy(packet)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from neuros.core.accounting import Rest, State
 from neuros.errors import ProtocolError
 
 if TYPE_CHECKING:
@@ -37,12 +38,14 @@ class Outlet:
         "is_blocked",
         "is_registered",
         "is_reliable",
+        "rest",
         "sent",
         "window",
     )
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
+        self.rest = Rest(State.BLOCKED, str(connection))
         self.window = connection.window
         self.is_reliable = connection.is_reliable
         self.is_registered = False

@@ -18,12 +18,14 @@ class Output:
     ``packet_type`` is the message class that a hook must return for it, ``None`` if any will do.
     """
 
-    __slots__ = ("connections", "outlets", "packet_type", "port")
+    __slots__ = ("elsewhere", "outlets", "packet_type", "port", "to_itself")
 
     def __init__(self, port: Port, outlets: Sequence[Outlet], packet_type: type | None) -> None:
         self.port = port
         self.outlets = tuple(outlets)
-        self.connections = tuple(outlet.connection for outlet in outlets)
+        connections = [outlet.connection for outlet in outlets]
+        self.to_itself = tuple(c for c in connections if c.destination_node == c.source_node)
+        self.elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
         self.packet_type = packet_type
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from neuros.core.accounting import Rest, State
 from neuros.errors import ProtocolError
 from neuros.hooks import InputSpec
 from neuros.project.model import Connection
@@ -182,10 +183,11 @@ class InputSlot:
     ``missing`` is the number of packets that the slot still needs before its hook may start.
     """
 
-    __slots__ = ("_filled", "is_all", "is_optional", "mailboxes", "missing", "name")
+    __slots__ = ("_filled", "is_all", "is_optional", "mailboxes", "missing", "name", "rest")
 
     def __init__(self, spec: InputSpec, inlets: list[Inlet]) -> None:
         self.name = spec.name
+        self.rest = Rest(State.WAITING, spec.name)
         self.is_all = spec.is_all
         self.is_optional = spec.is_optional
         self.mailboxes = [Mailbox(inlet, self) for inlet in inlets]

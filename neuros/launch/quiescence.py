@@ -30,8 +30,7 @@ def counters(probes: Probes) -> tuple[Any, ...]:
                 for key, c in sorted(probe["ledger"]["incoming"].items())
             ),
             tuple(
-                (key, hook["executions"])
-                for key, hook in sorted(probe["ledger"]["hooks"].items())
+                (key, hook["executions"]) for key, hook in sorted(probe["ledger"]["hooks"].items())
             ),
         )
         for name, probe in sorted(probes.items())

@@ -86,6 +86,7 @@ def _duplicate_connections(draft: Draft) -> Iterator[Problem]:
 
 def _connection_ends(draft: Draft) -> Iterator[Problem]:
     nodes = _ports_by_node(draft)
+    all_known = draft.is_complete and all(node.string("name") for node in draft.nodes)
     for connection in draft.connections:
         found: list[Element] = []
         sides: tuple[tuple[str, str, Side], ...] = (
@@ -97,7 +98,7 @@ def _connection_ends(draft: Draft) -> Iterator[Problem]:
             if node is None:
                 continue
             if node not in nodes:
-                if draft.is_complete and node:
+                if all_known and node:
                     hint = did_you_mean(node, nodes)
                     yield connection.value[node_key].problem(f"there is no node '{node}'", hint)
                 continue

@@ -40,7 +40,9 @@ class Draft:
 def read_draft(file: Path, roots: Roots) -> Draft:
     """Read a project file and its node files. Raises :class:`SourceError` for the first only."""
     root, duplicates = read_file(file)
-    draft = Draft(root, roots, problems=duplicates)
+    nodes = root.member("nodes")
+    is_list = nodes is not None and isinstance(nodes.value, list)
+    draft = Draft(root, roots, is_complete=is_list, problems=duplicates)
     for entry in root.items("nodes"):
         _expand(draft, entry, (file,))
         draft.entries += [entry] * (len(draft.nodes) - len(draft.entries))

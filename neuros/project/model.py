@@ -109,6 +109,10 @@ class Connection:
             f"/{self.destination_node}/{self.destination_input}"
         )
 
+    def __hash__(self) -> int:
+        # Looked up for every packet; the place in the project tells most connections apart.
+        return hash(self.index)
+
     def __str__(self) -> str:
         return (
             f"{self.source_node}.{self.source_output}"

@@ -82,5 +82,6 @@ def _resolved(path: Path) -> Path | None:
     """The path without symbolic links, ``None`` if it does not exist."""
     try:
         return path.resolve(strict=True)
-    except (OSError, RuntimeError):  # Python up to 3.12 reports a loop of links as RuntimeError
+    except (OSError, RuntimeError, ValueError):
+        # RuntimeError: a loop of links, up to Python 3.12. ValueError: no text for a path.
         return None

@@ -82,8 +82,7 @@ class NodeRuntime:
         self._middleware.mark_own_entities(self.file)
         self._specs = load_plugin(self.file.node.plugin, self.name)
         types = {
-            port.name: self._middleware.message_class(port.type)
-            for port in self.file.node.outputs
+            port.name: self._middleware.message_class(port.type) for port in self.file.node.outputs
         }
         self.engine = Engine(
             self.file.node,

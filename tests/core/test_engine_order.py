@@ -17,7 +17,7 @@ def test_least_recently_executed_comes_first():
     bench = Bench(
         function("f", "x"), function("g", "y"), function("h", ["x", "y"]),
         connections=[wire(A), wire("b.o -> node.y")],
-    )  # fmt: skip
+    )
     assert bench.packet(A) == ["f"]
     assert bench.packet("b.o -> node.y") == ["g", "h"]
     bench.packet(A)
@@ -76,7 +76,7 @@ def test_incoming_packets_are_seen_between_two_rounds_of_a_main_loop():
     """A loop-back is handled after every event that waits already; here a packet."""
     bench = Bench(function("loop"), function("f", "x"), connections=[wire(A)])
     assert bench.ran == ["loop"]
-    assert bench.packet(A) == ["f", "loop"] or bench.ran == ["loop", "loop", "f"]
+    assert bench.packet(A) == ["f", "loop"]
     assert bench.waiting == ["loop-back"]
 
 
@@ -100,14 +100,14 @@ def test_ticks_and_hooks_with_required_inputs_are_no_main_loops():
     bench = Bench(
         tick("t", 1.0), function("f", "x"), function("g", ["x", Optional("y")]),
         connections=[wire(A)],
-    )  # fmt: skip
+    )
     assert bench.engine.free_running_hooks() == []
 
 
 def test_hooks_never_nest_even_if_one_of_them_has_events_handled():
     """A plugin may spin its ROS node inside a hook; a node is single-threaded all the same."""
     bench = Bench(function("f", "x"), function("g", "y"), connections=[wire(A), wire(
-        "b.o -> node.y")])  # fmt: skip
+        "b.o -> node.y")])
     bench.during_call = lambda: bench.engine.on_packet(bench.by_name["b.o -> node.y"], 2)
     bench.packet(A, 1)
     bench.during_call = None
@@ -165,7 +165,7 @@ def test_two_hooks_with_the_same_input_both_get_every_packet():
     bench = Bench(
         function("f", "x"), function("g", ["x", "go"]),
         connections=[wire(A, 0, 5), wire("c.o -> node.go", 0, 5)],
-    )  # fmt: skip
+    )
     for number in range(3):
         bench.packet(A, number)
     for _ in range(3):
@@ -186,7 +186,7 @@ def test_one_hook_may_take_the_same_input_plainly_and_another_all_of_it():
         function("f", "x"), function("g", All("x")), connections=[wire(A), wire(B)]
     )
     assert bench.packet(A, 1) == ["f"]
-    assert bench.packet(B, 2) == ["g", "f"] or bench.ran == ["f", "f", "g"]
+    assert bench.packet(B, 2) == ["g", "f"]
     assert ("g", ([1, 2],)) in bench.calls
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
-from engine_bench import Bench, finalise, function, initialise, tick, wire
+from pathlib import Path
 
+import pytest
+from engine_bench import Bench, Clock, finalise, function, initialise, tick, wire
+
+from neuros.core.engine import Engine
 from neuros.errors import HookError
 from neuros.hooks import All, Optional
+from neuros.project.model import Node, Port
 
 A, B = "a.o -> node.x", "b.o -> node.x"
 
@@ -213,8 +217,7 @@ def test_packets_that_arrive_before_the_start_are_kept():
 def test_initialise_hooks_run_once_and_before_all_others():
     bench = Bench(function("f"), initialise("init"))
     bench.settle(3)
-    assert bench.ran == ["init", "f", "f", "f"] or bench.ran == ["init", "f", "f"]
-    assert bench.ran.count("init") == 1
+    assert bench.ran == ["init", "f", "f", "f"]
 
 
 def test_nothing_else_runs_before_every_initialise_hook_has_run():
@@ -278,13 +281,6 @@ def test_finalise_hooks_are_not_the_engines_business():
 
 @pytest.mark.parametrize("side", ["input", "output"])
 def test_a_port_that_the_node_does_not_declare_is_an_error_that_says_what_there_is(side):
-    from pathlib import Path
-
-    from engine_bench import Clock
-
-    from neuros.core.engine import Engine
-    from neuros.project.model import Node, Port
-
     port = Port("known", "std_msgs/msg/String")
     node = Node("node", "c", Path("p.py"), inputs=(port,), outputs=(port,))
     spec = function("f", **{f"{side}s": "unknown"})

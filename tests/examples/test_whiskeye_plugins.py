@@ -1,4 +1,4 @@
-"""What WhiskEye's plugins do by themselves: integrating by stamp, plotting, and the files written."""
+"""What WhiskEye's plugins do by themselves: integrate by stamp, plot, write files."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def test_without_any_free_domain_the_user_is_told_what_to_do(tmp_path: Path) -> 
         for domain in AUTOMATIC:
             held.append(open(tmp_path / f"neuros-domain-{domain}.lock", "w"))  # noqa: SIM115
             fcntl.flock(held[-1], fcntl.LOCK_EX)
-        with pytest.raises(EnvironmentFault, match="all ROS domains from 1 to 101.*-d"):
+        with pytest.raises(EnvironmentFault, match=r"all ROS domains from 1 to 101.*-d"):
             _first_free(tmp_path)
     finally:
         for file in held:

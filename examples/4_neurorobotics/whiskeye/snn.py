@@ -22,10 +22,12 @@ class GyroIntegrator:
         self._done_ns = 0  # the network's clock: it was settled for the start of simulated time
 
     def integrate(self, stamp_ns, rate_rad_s):
-        """Heading in radians at ``stamp_ns``, decoded over the last 20 ms before."""
+        """Heading in radians at ``stamp_ns``, decoded over about the last 20 ms before."""
         while (remaining_ns := stamp_ns - self._done_ns) >= self._quantum_ns:
-            # What is left of a quantum stays for the next packet.
-            step_ns = min(WINDOW_NS, remaining_ns - remaining_ns % self._quantum_ns)
+            # Less than a quantum stays for the next packet; less than a window joins the last one.
+            step_ns = WINDOW_NS
+            if remaining_ns < 2 * WINDOW_NS:
+                step_ns = remaining_ns - remaining_ns % self._quantum_ns
             self._network.step(rate_rad_s + self._bias_rad_s, step_ns * 1e-9)
             self._done_ns += step_ns
         return self._network.heading_rad

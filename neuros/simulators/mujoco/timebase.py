@@ -17,7 +17,7 @@ _PERIOD_TOLERANCE = Fraction(1, 1_000_000)
 class Timebase:
     """Converts steps to time for one timestep, in seconds.
 
-    Decimal fractions are taken as written (``0.002`` is 1/500); a rounded ``0.0041666667`` is
+    Whole nanoseconds are taken as written (``0.002`` is 1/500); a rounded ``0.0041666667`` is
     taken as the 1/240 that it stands for.
     """
 
@@ -95,5 +95,7 @@ class Schedule:
 
 def _as_fraction(timestep_s: float) -> Fraction:
     exact = Fraction(repr(float(timestep_s)))
+    if (exact * 1_000_000_000).denominator == 1:
+        return exact
     near = exact.limit_denominator(_LARGEST_DENOMINATOR)
     return near if abs(near - exact) <= exact * _TIMESTEP_TOLERANCE else exact

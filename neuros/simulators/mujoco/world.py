@@ -19,6 +19,15 @@ from neuros.simulators.mujoco.timebase import Schedule, Timebase
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
 
+_KEPT_BY_HAND = (
+    "qacc_warmstart",
+    "qfrc_applied",
+    "xfrc_applied",
+    "mocap_pos",
+    "mocap_quat",
+    "eq_active",
+)
+
 
 class World:
     """Physics in whole steps, without any notion of who steps it and when.
@@ -94,10 +103,16 @@ class World:
         build.attach(trial, child.copy(), position, name)
         build.compile_spec(trial, where)
         build.attach(self._spec, child, position, name)
-        self.model, self.data = self._spec.recompile(self.model, self.data)
         self.cameras.close()
+        before = self.data
+        self.model, self.data = self._spec.recompile(self.model, before)
         self._bind(Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
+        # recompile keeps positions, velocities, activations, controls and time. What is new comes
+        # last in the world, so all that was there is still in its place.
+        for field in _KEPT_BY_HAND:
+            old = getattr(before, field)
+            getattr(self.data, field)[: len(old)] = old
 
     def _make_schedule(self, problems: Problems) -> Schedule:
         periods = {}
