@@ -189,6 +189,7 @@ class Engine:
         for hook in self._order:
             if hook.spec.sends_unasked:
                 hook.is_enabled = False
+        self._cause = self.rest()
 
     @property
     def next_due_ns(self) -> int | None:
@@ -419,7 +420,10 @@ class Engine:
                 )
         source = self._sources[names] = Source(names, self.outputs)
         source.is_enabled = self.is_running and not self.is_draining
-        self._order[source] = None
+        # It has never been executed, and so goes before all that have.
+        self._order = dict.fromkeys(
+            sorted([*self._order, source], key=lambda hook: hook.executions > 0)
+        )
         self.all_hooks.append(source)
         return source
 

@@ -106,7 +106,7 @@ class Environment:
         if not os.access(self._root, os.W_OK):
             remedy = f"sudo chown -R $(id -un) {self._root}"
             raise EnvironmentFault(f"{self._root} cannot be written: {remedy}")
-        version = self._version()
+        version = self.python_version()
         is_new = version is None
         self._leave_out_nest(version or self._make())
         if is_new or not self.is_installed:
@@ -121,13 +121,17 @@ class Environment:
         if faults:
             raise EnvironmentFault(explain_missing_library("; ".join(faults)))
         if not self.is_installed:
-            self._stamp.write_text(json.dumps(self._stamp_for(sorted(self.extras))), "utf-8")
+            self.write_stamp()
+
+    def write_stamp(self) -> None:
+        """Note for the next time what is installed."""
+        self._stamp.write_text(json.dumps(self._stamp_for(sorted(self.extras))), "utf-8")
 
     def _stamp_for(self, extras: list[str]) -> dict[str, object]:
         pyproject = (self._root / "pyproject.toml").read_bytes()
         return {"pyproject": hashlib.sha256(pyproject).hexdigest(), "extras": extras}
 
-    def _version(self) -> tuple[int, int] | None:
+    def python_version(self) -> tuple[int, int] | None:
         """The version of its Python, or ``None`` where ``.venv`` is absent or cannot be used."""
         try:
             # A virtual environment that was moved or copied calls the programs of the old one.

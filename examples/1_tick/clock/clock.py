@@ -1,4 +1,4 @@
-"""Says what time it is, once per second."""
+"""Tells the time, once per second."""
 
 from datetime import datetime
 

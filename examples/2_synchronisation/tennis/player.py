@@ -1,28 +1,31 @@
-"""One tennis player: hits back what comes, until the rally is long enough."""
+"""A tennis player: hits back every ball that comes.
+
+The player with a RALLY in its environment serves, and catches the ball after that many strokes.
+"""
 
 import os
 
 from neuros.hooks import Optional, neuros_function, neuros_initialise
 
-RALLY = int(os.environ["RALLY"])
+RALLY = int(os.environ.get("RALLY", "0"))
 
 
+# Both players have this hook, and only one of them serves: hence Optional.
 @neuros_initialise(outputs=Optional("ball_out"))
 def serve(node):
-    if os.environ["SERVES"] != "yes":
-        return None
-    ball = node.make_packet("ball_out")
-    ball.data = 1
-    node.get_ros_node().get_logger().info("I serve")
-    return ball
+    return stroke(node, 1) if RALLY else None
 
 
 @neuros_function(inputs="ball_in", outputs=Optional("ball_out"))
 def hit(node, ball):
-    node.get_ros_node().get_logger().info(f"stroke {ball.data}")
-    if ball.data >= RALLY:
+    if RALLY and ball.data >= RALLY:
         node.shutdown(f"a rally of {ball.data} strokes")
         return None
-    answer = node.make_packet("ball_out")
-    answer.data = ball.data + 1
-    return answer
+    return stroke(node, ball.data + 1)
+
+
+def stroke(node, number):
+    node.get_logger().info(f"stroke {number}")
+    ball = node.make_packet("ball_out")
+    ball.data = number
+    return ball

@@ -61,7 +61,7 @@ class HeadingPlot:
 
     def save(self, path: Path, caption: str = "") -> None:
         """Write the figure as it was last drawn, with a caption."""
-        self._error_axes.set_title(caption, fontsize="small", loc="left")
+        self._error_axes.set_title(caption, fontsize="x-small", loc="left")
         self._figure.savefig(path)
 
     def close(self) -> None:

@@ -18,6 +18,7 @@ _MAX_GEOMS = 20_000
 class _Resources:
     """What OpenGL holds for one model: belongs to the thread that made it."""
 
+    model: Any
     gl: Any
     context: Any
     scene: Any
@@ -37,8 +38,14 @@ class Cameras:
         self._fine = fine
         self._resources: _Resources | None = None
 
+    def use(self, model: Any) -> None:
+        """Render another model from the next image on; any thread that has its turn."""
+        self._model = model
+
     def render(self, data: Any, camera: int, width: int, height: int) -> npt.NDArray[np.uint8]:
         """What a camera sees: RGB, shape (height, width, 3), the top row first."""
+        if self._resources is not None and self._resources.model is not self._model:
+            self.close()
         if self._resources is None:
             self._resources = self._open()
         held = self._resources
@@ -70,4 +77,4 @@ class Cameras:
         scene = mujoco.MjvScene(self._model, maxgeom=_MAX_GEOMS)
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._fine
         scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._fine
-        return _Resources(gl, context, scene)
+        return _Resources(self._model, gl, context, scene)

@@ -39,7 +39,7 @@ class Place:
     def angular_velocity(self, data: Any) -> Vector:
         """In the frame of the place, rad/s: a gyroscope."""
         mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
-        return self._spatial[:3].copy()
+        return np.array(self._spatial[:3])
 
     def acceleration(self, data: Any) -> Vector:
         """In the frame of the place, m/s^2, gravity included: an accelerometer."""
@@ -47,7 +47,7 @@ class Place:
         if not getattr(data, "flg_rnepost", False):
             mujoco.mj_rnePostConstraint(self._model, data)
         mujoco.mj_objectAcceleration(self._model, data, self.object, self.index, self._spatial, 1)
-        return self._spatial[3:].copy()
+        return np.array(self._spatial[3:])
 
 
 @dataclass(frozen=True)

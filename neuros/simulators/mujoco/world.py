@@ -40,7 +40,7 @@ class World:
     """
 
     def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
-        self._node, self._fine = node, fine
+        self._node = node
         problems = Problems(node.description.file)
         self._sensors = read_sensors(node.description, problems)
         self._commands = read_commands(node.description, problems)
@@ -52,6 +52,7 @@ class World:
             problems.add_text(str(error))
             problems.raise_any()
         self.data = mujoco.MjData(self.model)
+        self.cameras = Cameras(self.model, fine=fine)
         self.time = Timebase(self.model.opt.timestep)
         self.schedule = self._make_schedule(problems)
         self._bind(problems)
@@ -103,9 +104,9 @@ class World:
         build.attach(trial, child.copy(), position, name)
         build.compile_spec(trial, where)
         build.attach(self._spec, child, position, name)
-        self.cameras.close()
         before = self.data
         self.model, self.data = self._spec.recompile(self.model, before)
+        self.cameras.use(self.model)
         self._bind(Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
         # recompile keeps positions, velocities, activations, controls and time. What is new comes
@@ -124,7 +125,6 @@ class World:
         return Schedule(periods)
 
     def _bind(self, problems: Problems) -> None:
-        self.cameras = Cameras(self.model, fine=self._fine)
         self._fills: dict[str, Fill] = {}
         for sensor in self._sensors:
             fill = bind(Binding(sensor, self.model, self.cameras, problems))
