@@ -45,15 +45,16 @@ def _reasons(hook: Hook, now_ns: int) -> Iterator[str]:
     if hook.is_ready():
         yield f"is about to run hook '{hook.name}'"
         return
+    if isinstance(hook, Source) and not hook.is_due:
+        outputs = ", ".join(f"`{output.port.name}`" for output in hook.outputs)
+        yield f"waits for its simulator to send {outputs}"
+        return
     for slot in hook.slots:
         if slot.missing:
             yield f"waits for `{slot.name}` from {_senders(slot)}"
     for outlet in hook.blocking_outlets():
         yield f"is blocked on `{outlet.connection}` ({_account_of(outlet, now_ns)})"
-    if isinstance(hook, Source):
-        if not hook.is_due:
-            yield f"waits for its simulator to {hook.name}"
-    elif not hook.is_due:
+    if not hook.is_due:
         wait_ns = hook.due_ns - now_ns
         yield f"waits for the next tick of '{hook.name}' in {_seconds(wait_ns)}"
 

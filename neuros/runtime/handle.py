@@ -23,6 +23,7 @@ class Host(Protocol):
     def shutdown(self, reason: str, drain_s: float) -> None: ...
     def own_simulated_time(self, read_s: Callable[[], float]) -> None: ...
     def on_close(self, callback: Callable[[], None]) -> None: ...
+    def fail_from_thread(self, error: BaseException) -> None: ...
     def offer_from_thread(
         self, packets: Mapping[str, Any], accepted: Callable[[], None]
     ) -> Callable[[Callable[[], None]], None]: ...
@@ -114,6 +115,10 @@ class NodeHandle:
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
         self._host.on_close(callback)
+
+    def fail(self, error: BaseException) -> None:
+        """End the node as failed, from any thread: for errors that no hook can raise."""
+        self._host.fail_from_thread(error)
 
     def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
         """Send from another thread, as if a hook with those outputs had returned them.

@@ -11,7 +11,7 @@ from neuros.core.engine import Engine
 from neuros.core.explain import explain
 from neuros.core.hook import Hook
 from neuros.core.ledger import snapshot
-from neuros.errors import HookError, NeurosError
+from neuros.errors import HookError, NeurosError, NodeError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Logger, Middleware
 from neuros.project.model import Connection, NodeFile, Port
@@ -210,6 +210,13 @@ class NodeRuntime:
         """Call back when the node ends."""
         self._closers.append(callback)
 
+    def fail_from_thread(self, error: BaseException) -> None:
+        """End the project with an error that happened outside the hooks."""
+        wrapped = error if isinstance(error, NeurosError) else NodeError(describe(error))
+        if wrapped is not error:
+            wrapped.__cause__ = error
+        self._middleware.loop.post_from_thread(lambda: self._fail(self.name, wrapped))
+
     def offer_from_thread(
         self, packets: Mapping[str, Any], accepted: Callable[[], None]
     ) -> Callable[[Callable[[], None]], None]:
@@ -293,7 +300,7 @@ class NodeRuntime:
         """Write an error to the node's log, with the plugin's traceback if it is the plugin's."""
         self._stage.enter(self._scope)
         cause = error.__cause__
-        if isinstance(error, HookError) and cause is not None:
+        if isinstance(error, NodeError) and cause is not None:
             self.logger.error(f"{error}\n{plugin_traceback(cause, self.file.node.plugin)}")
         else:
             self.logger.error(str(error))

@@ -1,0 +1,254 @@
+"""The house has floors: a room imports only from the floors below its own.
+
+The table is that of the architecture; ``neuros.launch.supervisor`` is a room of its own, above the
+back ends that it starts through their port.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted((ROOT / "neuros").rglob("*.py"))
+
+
+@dataclass(frozen=True)
+class Room:
+    """A part of ``neuros``: the modules it consists of, and its floor."""
+
+    floor: int
+    modules: tuple[str, ...]
+
+    def holds(self, module: str) -> bool:
+        return any(is_within(module, name) for name in self.modules)
+
+    def __str__(self) -> str:
+        return self.modules[0]
+
+
+def is_within(module: str, package: str) -> bool:
+    """Whether a dotted name is that package or lies in it."""
+    return module == package or module.startswith(package + ".")
+
+
+# The first room that holds a module is its room.
+ROOMS = (
+    Room(0, ("errors",)),
+    Room(1, ("hooks",)),
+    Room(1, ("project",)),
+    Room(2, ("core",)),
+    Room(3, ("ports", "control")),
+    Room(5, ("launch.supervisor", "launch.quiescence", "launch.watch")),
+    Room(4, ("launch",)),
+    Room(4, ("transport",)),
+    Room(4, ("simulators",)),
+    Room(4, ("observe",)),
+    Room(5, ("runtime",)),
+    Room(6, ("cli",)),
+    Room(6, ("testing",)),
+    Room(1, ("installation",)),
+)
+# The package itself holds public names; every room may ask it for the version.
+PUBLIC_NAMES = Room(2, ("",))
+PORTS = 3
+
+MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
+MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
+# What is not named here has none; a part of a room may have less than the room.
+THIRD_PARTY: dict[str, set[str]] = {
+    "project.validate": {"jsonschema", "referencing"},
+    "transport": {"rclpy", "rpyutils"} | MESSAGES,
+    "transport.memory": set(),
+    "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
+    "launch.docker": {"docker"},
+    "observe": {"rosbags", "psutil", "matplotlib", "tabulate"},
+    "testing": {"pytest", "hypothesis"},
+}
+# The core is pure: no threads, no wall clock, no files.
+NOT_IN_THE_CORE = {"threading", "multiprocessing", "asyncio", "time", "socket", "os", "subprocess"}
+
+
+def room_of(module: str) -> Room | None:
+    """The room of ``neuros.<module>``; the package itself is ``""``."""
+    if not module:
+        return PUBLIC_NAMES
+    return next((room for room in ROOMS if room.holds(module)), None)
+
+
+def third_party_of(module: str) -> set[str]:
+    """The packages that ``neuros.<module>`` may import, from the longest entry that fits."""
+    entries = [entry for entry in THIRD_PARTY if is_within(module, entry)]
+    return THIRD_PARTY[max(entries, key=len)] if entries else set()
+
+
+def imports_of(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
+    """Every ``(line, module)`` that is imported anywhere in a file of ``package``, late ones too.
+
+    ``from a import b`` yields ``a.b``: ``b`` may be a module.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            source = base if node.level else str(node.module)
+            yield from ((node.lineno, f"{source}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            names = [name.value for name in node.args[:1] if isinstance(name, ast.Constant)]
+            yield from ((node.lineno, str(name)) for name in names)
+
+
+def complaint(importer: str, imported: str) -> str | None:
+    """Why ``neuros.<importer>`` must not import the absolute name ``imported``."""
+    room, (top, _, inner) = room_of(importer), imported.partition(".")
+    assert room is not None, f"neuros.{importer} belongs to no room: add it to ROOMS"
+    if top != "neuros":
+        if room.holds("core") and top in NOT_IN_THE_CORE:
+            return f"core knows no {top}"
+        is_allowed = top in sys.stdlib_module_names or top in third_party_of(importer)
+        return None if is_allowed else f"the third-party package {top} is not for it"
+    other = room_of(inner)
+    if other is None or other in (room, PUBLIC_NAMES):
+        return None
+    if room.holds("installation"):
+        return None if other.holds("errors") else "the installation knows nothing but errors"
+    if other.floor >= room.floor:
+        return f"{other} is on floor {other.floor}, not below {room.floor}"
+    if room.floor == 5 and other.floor > PORTS:
+        return f"{room} sees ports only, and {other} is an adapter"
+    return None
+
+
+def broken_rules(file: str, module: str, source: str) -> list[str]:
+    """One line per import in ``source`` that breaks the table."""
+    package = module if file.endswith("__init__.py") else module.rpartition(".")[0]
+    found = []
+    for line, imported in imports_of(ast.parse(source), package):
+        reason = complaint(module.removeprefix("neuros").removeprefix("."), imported)
+        if reason:
+            found.append(f"{file}:{line}: imports {imported}: {reason}")
+    return found
+
+
+def module_of(path: Path) -> str:
+    """The dotted name of a source file."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
+    name = str(path.relative_to(ROOT))
+    assert broken_rules(name, module_of(path), path.read_text("utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint_about"),
+    [
+        ("neuros.core.engine", "import rclpy", "third-party package rclpy"),
+        ("neuros.core.engine", "import time", "knows no time"),
+        ("neuros.core.engine", "from neuros import transport", "transport is on floor 4"),
+        ("neuros.core.engine", "from ..ports import Clock", "ports is on floor 3"),
+        ("neuros.hooks", "def f():\n    import neuros.project.model", "project is on floor 1"),
+        ("neuros.project.load", "import jsonschema", "third-party package jsonschema"),
+        ("neuros.transport.ros", "from neuros.launch import process", "launch is on floor 4"),
+        ("neuros.transport.memory", "import rclpy", "third-party package rclpy"),
+        ("neuros.runtime.node", "from neuros.transport.ros import x", "sees ports only"),
+        ("neuros.launch.supervisor", "from neuros.launch.process import x", "sees ports only"),
+        ("neuros.launch.process", "from neuros.launch.supervisor import x", "on floor 5"),
+        ("neuros.simulators.mujoco.sensors", "import nest", "third-party package nest"),
+        ("neuros.installation.machine", "from neuros.hooks import All", "nothing but errors"),
+        ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on floor 6"),
+    ],
+)
+def test_an_import_that_breaks_the_table_is_named_with_its_line(
+    module: str, source: str, complaint_about: str
+) -> None:
+    last = len(source.splitlines())
+    (found,) = broken_rules("somewhere.py", module, source)
+    assert found.startswith(f"somewhere.py:{last}: imports ")
+    assert complaint_about in found
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("neuros.core.engine", "from neuros.core import flow\nfrom .inputs import Mailbox"),
+        ("neuros.core.engine", "from neuros import errors, hooks\nimport heapq"),
+        ("neuros.project.validate", "import jsonschema\nfrom neuros.project.model import Node"),
+        ("neuros.cli.launch", "from neuros.transport.ros import x\nfrom neuros import __version__"),
+        ("neuros.installation.machine", "from neuros.errors import EnvironmentFault"),
+    ],
+)
+def test_an_import_from_below_is_allowed(module: str, source: str) -> None:
+    assert broken_rules("somewhere.py", module, source) == []
+
+
+def run_python(*arguments: str) -> None:
+    """Run a Python of its own in the source tree, and show what it wrote where it fails."""
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_core_imports_where_the_outside_world_does_not_exist() -> None:
+    core = [module_of(path) for path in FILES if "core" in path.relative_to(ROOT).parts]
+    run_python(
+        "-c",
+        "import sys\n"
+        "for name in ('rclpy', 'docker', 'mujoco', 'psutil', 'numpy', 'nest', 'jsonschema'):\n"
+        "    sys.modules[name] = None\n"
+        "sys.path.insert(0, '.')\n"
+        f"import {', '.join(['neuros.core', *core])}",
+    )
+
+
+def test_the_installation_imports_on_a_bare_python() -> None:
+    isolated_without_packages = "-IS"
+    run_python(
+        isolated_without_packages,
+        "-c",
+        "import sys; sys.path.insert(0, '.'); import neuros.installation",
+    )
+
+
+def test_importing_neuros_imports_no_adapter() -> None:
+    run_python(
+        "-c",
+        "import sys; sys.path.insert(0, '.'); import neuros, neuros.hooks\n"
+        "heavy = {'rclpy', 'mujoco', 'numpy', 'nest', 'jsonschema', 'matplotlib', 'docker'}\n"
+        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}",
+    )
+
+
+def ends_or_evaluates(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Calls that a library must not make: it would end the process, or run text as code."""
+    banned = {"eval", "exec", "exit", "quit", "sys.exit"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in banned:
+            yield node.lineno, ast.unparse(node.func)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_runs_text_as_code_and_only_the_console_script_ends_the_process(
+    path: Path,
+) -> None:
+    tree = ast.parse(path.read_text("utf-8"))
+    tree.body = [node for node in tree.body if not _is_script_part(node)]
+    assert list(ends_or_evaluates(tree)) == []
+
+
+def _is_script_part(node: ast.stmt) -> bool:
+    """Whether this only runs as a command: ``if __name__ == "__main__"``, ``console_script``."""
+    if isinstance(node, ast.If):
+        return ast.unparse(node.test) == "__name__ == '__main__'"
+    return isinstance(node, ast.FunctionDef) and node.name == "console_script"

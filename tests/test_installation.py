@@ -1,0 +1,278 @@
+"""``install.py`` and ``launch.py`` on machines that lack something.
+
+A whole installation takes a minute and a network; what is tested here are its decisions, with real
+virtual environments where one without packages is enough.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from neuros.errors import EnvironmentFault
+from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
+from neuros.installation.machine import Machine, clean_environment, explain_missing_library
+from neuros.installation.packages import explain_pip_failure
+from neuros.installation.progress import Progress
+
+ROOT = Path(__file__).resolve().parents[1]
+SUPPORTED = Machine((3, 12), "CPython", "Linux", "x86_64", (2, 36))
+PYPROJECT = '[project]\nname = "neuros"\n[project.optional-dependencies]\nnest = ["nest"]\n'
+
+
+def fault_of(machine: Machine) -> str:
+    with pytest.raises(EnvironmentFault) as caught:
+        machine.require_support()
+    return str(caught.value)
+
+
+class TestMachine:
+    @pytest.mark.parametrize("minor", [10, 11, 12, 13, 14])
+    def test_every_python_with_packages_is_supported(self, minor: int) -> None:
+        replace(SUPPORTED, python=(3, minor)).require_support()
+
+    @pytest.mark.parametrize("python", [(3, 9), (3, 15)])
+    def test_another_python_is_told_which_one_to_use(self, python: tuple[int, int]) -> None:
+        fault = fault_of(replace(SUPPORTED, python=python))
+        assert f"3.10 to 3.14, and this is CPython 3.{python[1]}" in fault
+        assert "run python3." in fault
+
+    def test_another_implementation_is_told_which_one_to_use(self) -> None:
+        assert "this is PyPy 3.12" in fault_of(replace(SUPPORTED, implementation="PyPy"))
+
+    def test_another_processor_is_told_to_use_docker(self) -> None:
+        fault = fault_of(replace(SUPPORTED, processor="aarch64"))
+        assert "this is Linux on aarch64: use Docker, docker run " in fault
+
+    def test_another_system_is_told_to_use_docker(self) -> None:
+        fault = fault_of(replace(SUPPORTED, system="Darwin", processor="arm64", glibc=()))
+        assert "this is Darwin on arm64: use Docker, docker run " in fault
+
+    @pytest.mark.parametrize("glibc", [(2, 27), ()])
+    def test_a_c_library_without_packages_is_told_to_use_docker(self, glibc: tuple[int]) -> None:
+        assert "glibc 2.28 or newer" in fault_of(replace(SUPPORTED, glibc=glibc))
+
+    def test_the_machine_that_runs_the_tests_is_supported(self) -> None:
+        Machine.here().require_support()
+
+
+class TestExplanations:
+    @pytest.mark.parametrize(
+        ("output", "sentence"),
+        [
+            ("ERROR: Could not install: [Errno 28] No space left on device", "make room"),
+            ("Temporary failure in name resolution\nNo matching distribution found", "network"),
+            ("NewConnectionError: [Errno 101] Network is unreachable", "export HTTPS_PROXY="),
+            ("SSLError(SSLCertVerificationError: CERTIFICATE_VERIFY_FAILED", "export PIP_CERT="),
+            ("error: command 'x86_64-linux-gnu-gcc' failed: No such file", "no C compiler"),
+            ("error: command 'gcc' failed with exit code 1", "no C compiler"),
+            ("fatal error: Python.h: No such file or directory", "no C compiler"),
+            ("ERROR: No matching distribution found for rclpy", "does not exist for this Python"),
+            ("PermissionError: [Errno 13] Permission denied: 'x'", "sudo chown"),
+            ("something new", "pip failed"),
+        ],
+    )
+    def test_what_pip_says_becomes_one_sentence(self, output: str, sentence: str) -> None:
+        assert sentence in explain_pip_failure(output)
+        assert "\n" not in explain_pip_failure(output)
+
+    def test_a_missing_system_library_is_named_with_its_remedy(self) -> None:
+        error = "MuJoCo does not import (libGL.so.1: cannot open shared object file)"
+        assert "libGL.so.1 belongs to the operating system: " in explain_missing_library(error)
+
+    def test_another_import_error_stays_as_it_is(self) -> None:
+        assert explain_missing_library("No module named 'nest'") == "No module named 'nest'"
+
+
+def test_a_sourced_ros_distribution_does_not_reach_the_virtual_environment() -> None:
+    sourced = {
+        "PATH": "/usr/bin",
+        "PYTHONPATH": "/opt/ros/jazzy/lib/python3.12/site-packages",
+        "LD_LIBRARY_PATH": "/opt/ros/jazzy/lib",
+        "AMENT_PREFIX_PATH": "/opt/ros/jazzy",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+    }
+    assert clean_environment(sourced) == {"PATH": "/usr/bin"}
+
+
+def test_the_extras_are_those_of_the_project() -> None:
+    tomllib = pytest.importorskip("tomllib")
+    text = (ROOT / "pyproject.toml").read_text("utf-8")
+    declared = tomllib.loads(text)["project"]["optional-dependencies"]
+    assert extras_of(text) == tuple(declared)
+
+
+def test_shared_memory_keeps_only_what_was_there_before(tmp_path: Path) -> None:
+    (tmp_path / "lttng-ust-wait-6").touch()
+    (tmp_path / "of-others").touch()
+    with shared_memory_as_found(tmp_path):
+        (tmp_path / "lttng-ust-wait-6-0").touch()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["lttng-ust-wait-6", "of-others"]
+
+
+def test_progress_in_a_log_is_a_line_per_step_and_no_detail() -> None:
+    stream = StringIO()
+    progress = Progress(stream)
+    progress.step("one")
+    progress.detail("two")
+    progress.fail("three")
+    assert [row.partition("] ")[2] or row for row in stream.getvalue().splitlines()] == [
+        "one",
+        "three",
+    ]
+
+
+def test_progress_on_a_terminal_shows_details_in_place() -> None:
+    class Terminal(StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    stream = Terminal()
+    Progress(stream).detail("downloading")
+    assert stream.getvalue().startswith("\r\x1b[K[")
+    assert stream.getvalue().endswith("downloading")
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A source tree with nothing to install in it."""
+    (tmp_path / "pyproject.toml").write_text(PYPROJECT, "utf-8")
+    return tmp_path
+
+
+def environment_of(tree: Path, *extras: str) -> Environment:
+    return Environment(tree, extras, Progress(StringIO()))
+
+
+class TestStamp:
+    """What an earlier run left says whether there is anything to do."""
+
+    @pytest.fixture
+    def stamped(self, tree: Path) -> Path:
+        environment = environment_of(tree, "mujoco", "nest")
+        environment.folder.mkdir()
+        environment.write_stamp()
+        return tree
+
+    def test_without_a_virtual_environment_nothing_is_installed(self, tree: Path) -> None:
+        assert not environment_of(tree, "nest").is_installed
+
+    @pytest.mark.parametrize("extras", [("mujoco", "nest"), ("nest", "mujoco"), ("nest",), ()])
+    def test_the_same_or_less_is_installed(self, stamped: Path, extras: tuple[str, ...]) -> None:
+        assert environment_of(stamped, *extras).is_installed
+
+    def test_a_further_extra_is_not_installed(self, stamped: Path) -> None:
+        assert not environment_of(stamped, "nest", "dev").is_installed
+
+    def test_other_dependencies_are_not_installed(self, stamped: Path) -> None:
+        (stamped / "pyproject.toml").write_text(PYPROJECT + "# changed", "utf-8")
+        assert not environment_of(stamped, "nest").is_installed
+
+    @pytest.mark.parametrize("text", ["", "[]", "{}", '{"extras": 3}', "null"])
+    def test_a_broken_stamp_counts_for_nothing(self, stamped: Path, text: str) -> None:
+        (stamped / ".venv" / "neuros.json").write_text(text, "utf-8")
+        assert not environment_of(stamped, "nest").is_installed
+
+
+@pytest.fixture(scope="module")
+def pattern(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual environment with nothing in it but pip."""
+    folder = tmp_path_factory.mktemp("pattern") / ".venv"
+    venv.create(folder, with_pip=True)
+    return folder
+
+
+class TestVirtualEnvironment:
+    """A real one is kept where it can be used, and made anew where not."""
+
+    def test_without_one_there_is_no_version(self, tree: Path) -> None:
+        assert environment_of(tree).python_version() is None
+
+    def test_a_whole_one_is_kept(self, pattern: Path) -> None:
+        assert environment_of(pattern.parent).python_version() == sys.version_info[:2]
+
+    def test_one_that_was_copied_from_elsewhere_is_not(self, pattern: Path, tree: Path) -> None:
+        shutil.copytree(pattern, tree / ".venv", symlinks=True)
+        assert environment_of(tree).python_version() is None
+
+    def test_one_whose_python_is_gone_is_not(self, tree: Path) -> None:
+        venv.create(tree / ".venv", with_pip=False)
+        (tree / ".venv" / "bin" / "python").unlink()
+        assert environment_of(tree).python_version() is None
+
+    def test_one_that_never_got_its_pip_is_not(self, tree: Path) -> None:
+        venv.create(tree / ".venv", with_pip=False)
+        assert environment_of(tree).python_version() is None
+
+
+def run_script(script: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a script with a Python that has no packages, as on a bare machine."""
+    return subprocess.run(
+        [getattr(sys, "_base_executable", sys.executable), str(script), *arguments],
+        cwd=cwd, env=clean_environment(os.environ), capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+class TestLaunchScript:
+    @pytest.fixture
+    def copy(self, tmp_path: Path) -> Path:
+        """``launch.py`` in a folder of its own, in which nothing was installed."""
+        return Path(shutil.copy(ROOT / "launch.py", tmp_path))
+
+    def test_without_an_installation_it_says_what_to_run(self, copy: Path) -> None:
+        venv.create(copy.parent / "bare")
+        bare = copy.parent / "bare" / "bin" / "python"
+        done = subprocess.run([bare, copy], capture_output=True, text=True, check=False)
+        assert done.returncode == 4
+        install = copy.parent.resolve() / "install.py"
+        assert done.stderr == f"launch.py: NeuROS is not installed here: run {install} first\n"
+
+    @pytest.mark.parametrize("name", ["launch.py", "a link"])
+    def test_it_goes_on_in_the_virtual_environment_beside_it(self, copy: Path, name: str) -> None:
+        script = copy if name == copy.name else copy.parent / name
+        if script != copy:
+            script.symlink_to(copy)
+        python = copy.parent / ".venv" / "bin" / "python"
+        python.parent.mkdir(parents=True)
+        (copy.parent / ".venv" / "pyvenv.cfg").touch()
+        python.write_text(
+            '#!/bin/sh\necho "$@" [$LD_LIBRARY_PATH] [$PYTHONPATH]\nexit 7\n', "utf-8"
+        )
+        python.chmod(0o755)
+        environment = {
+            **clean_environment(os.environ),
+            "AMENT_PREFIX_PATH": "/opt/ros/jazzy",
+            "PYTHONPATH": "/opt/ros/jazzy/lib/python:/my/modules",
+            "LD_LIBRARY_PATH": "/opt/ros/jazzy/lib:/my/lib",
+        }
+        done = subprocess.run(
+            [getattr(sys, "_base_executable", sys.executable), script, "a b", "--dry-run"],
+            cwd="/", env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 7
+        assert done.stdout == f"{copy} a b --dry-run [/my/lib] [/my/modules]\n"
+
+
+class TestInstallScript:
+    def test_help_names_every_exit_code(self, tmp_path: Path) -> None:
+        done = run_script(ROOT / "install.py", "--help", cwd=tmp_path)
+        assert done.returncode == 0
+        assert "0 installed, 1 a test failed, 2 usage, 4 something is missing" in done.stdout
+
+    def test_an_extra_that_does_not_exist_is_wrong_usage(self, tmp_path: Path) -> None:
+        done = run_script(ROOT / "install.py", "--extras", "numpy", cwd=tmp_path)
+        assert done.returncode == 2
+        assert "no such extra: numpy (there are mujoco, nest," in done.stderr
+
+    @pytest.mark.parametrize("script", ["install.py", "launch.py"])
+    def test_an_old_python_can_read_it(self, script: str) -> None:
+        ast.parse((ROOT / script).read_text("utf-8"), feature_version=(3, 4))
