@@ -21,7 +21,7 @@ import pytest
 from neuros.errors import EnvironmentFault
 from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
-from neuros.installation.packages import explain_pip_failure
+from neuros.installation.packages import explain_failure
 from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,12 +78,16 @@ class TestExplanations:
             ("fatal error: Python.h: No such file or directory", "no C compiler"),
             ("ERROR: No matching distribution found for rclpy", "does not exist for this Python"),
             ("PermissionError: [Errno 13] Permission denied: 'x'", "sudo chown"),
-            ("something new", "pip failed"),
         ],
     )
     def test_what_pip_says_becomes_one_sentence(self, output: str, sentence: str) -> None:
-        assert sentence in explain_pip_failure(output)
-        assert "\n" not in explain_pip_failure(output)
+        explanation = explain_failure(output)
+        assert explanation is not None
+        assert sentence in explanation
+        assert "\n" not in explanation
+
+    def test_what_is_not_known_is_not_guessed(self) -> None:
+        assert explain_failure("something new") is None
 
     def test_a_missing_system_library_is_named_with_its_remedy(self) -> None:
         error = "MuJoCo does not import (libGL.so.1: cannot open shared object file)"
@@ -203,6 +207,12 @@ class TestVirtualEnvironment:
     def test_one_that_was_copied_from_elsewhere_is_not(self, pattern: Path, tree: Path) -> None:
         shutil.copytree(pattern, tree / ".venv", symlinks=True)
         assert environment_of(tree).python_version() is None
+
+    def test_one_that_was_interrupted_is_not(self, pattern: Path) -> None:
+        log = pattern / "neuros-install.log"
+        log.touch()
+        assert environment_of(pattern.parent).python_version() is None
+        log.unlink()
 
     def test_one_whose_python_is_gone_is_not(self, tree: Path) -> None:
         venv.create(tree / ".venv", with_pip=False)

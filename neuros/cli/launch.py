@@ -153,7 +153,8 @@ class Console:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - it lives as long as the process
 
     def log(self, severity: str, text: str) -> None:
-        """Write a record of the launcher itself."""
+        """Write a record of the launcher itself, after what nodes have logged so far."""
+        self.poll()
         self.write(format_record(severity, "neuros", text) + "\n")
 
     def poll(self) -> object:

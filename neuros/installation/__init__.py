@@ -17,6 +17,7 @@ from pathlib import Path
 from neuros.errors import EnvironmentFault
 from neuros.installation.environment import Environment, extras_of
 from neuros.installation.machine import Machine, system_install
+from neuros.installation.packages import explain_failure
 from neuros.installation.progress import Progress
 
 STANDARD_EXTRAS = ("mujoco", "nest", "plot")
@@ -42,6 +43,9 @@ def main(arguments: Sequence[str], root: str) -> int:
             return subprocess.call([str(environment.python), str(folder / "tests" / "run")])
     except EnvironmentFault as fault:
         progress.fail(f"install.py: {fault}")
+        return 4
+    except OSError as error:
+        progress.fail(f"install.py: {explain_failure(str(error)) or error}")
         return 4
     except KeyboardInterrupt:
         progress.fail("install.py: interrupted; run it again to go on")

@@ -133,6 +133,8 @@ class Environment:
 
     def python_version(self) -> tuple[int, int] | None:
         """The version of its Python, or ``None`` where ``.venv`` is absent or cannot be used."""
+        if (self.folder / packages.LOG).exists() and not self._stamp.exists():
+            return None  # an installation was interrupted: pip would take half a package for whole
         try:
             # A virtual environment that was moved or copied calls the programs of the old one.
             is_ours = str(self.folder) in (self.folder / "bin" / "pip").read_text("utf-8")[:1000]

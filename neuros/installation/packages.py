@@ -13,6 +13,9 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, other_python, system_install
 from neuros.installation.progress import Progress
 
+LOG = "neuros-install.log"
+"""What pip wrote, in ``.venv``."""
+
 _PIP_INSTALL = (
     *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
     *("--progress-bar", "off", "--prefer-binary", "--editable"),
@@ -32,14 +35,15 @@ def install(python: Path, root: Path, extras: Sequence[str], progress: Progress)
             f"{root} has {free_bytes / 1e9:.1f} GB free and the packages need "
             f"{need_bytes / 1e9:.1f} GB: make room (df -h)"
         )
-    log, names = folder / "neuros-install.log", f"[{','.join(extras)}]"
+    log, names = folder / LOG, f"[{','.join(extras)}]"
     progress.step(f"installing neuros{names} from PyPI (log: {log})")
     output = _follow([str(python), *_PIP_INSTALL, f".{names}"], root, log, progress)
     if output is not None:
-        errors = [row for row in output.splitlines() if "error" in row.lower()]
-        for row in (errors or output.splitlines())[-6:]:
-            progress.step(f"  {row.strip()[:300]}")
-        raise EnvironmentFault(f"{explain_pip_failure(output)} (log: {log})")
+        rows = [row.strip() for row in output.splitlines()]
+        errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
+        for row in (errors or rows)[-4:]:
+            progress.step(f"  {row[:300]}")
+        raise EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {log})")
 
 
 def _follow(command: Sequence[str], root: Path, log: Path, progress: Progress) -> str | None:
@@ -57,18 +61,26 @@ def _follow(command: Sequence[str], root: Path, log: Path, progress: Progress) -
             errors="replace",
         ) as process,
     ):
-        for row in process.stdout or ():
-            file.write(row)
-            rows.append(row)
-            if row.startswith("Installing collected packages"):
-                progress.step(f"unpacking {row.count(',') + 1} packages")
-            elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
-                progress.detail(row.strip())
+        try:
+            for row in process.stdout or ():
+                file.write(row)
+                rows.append(row)
+                _show(row, progress)
+        except KeyboardInterrupt:
+            process.terminate()
+            raise
     return "".join(rows) if process.returncode else None
 
 
-def explain_pip_failure(output: str) -> str:
-    """What made pip fail, from all that it wrote: one sentence, cause and remedy."""
+def _show(row: str, progress: Progress) -> None:
+    if row.startswith("Installing collected packages"):
+        progress.step(f"unpacking {row.count(',') + 1} packages")
+    elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
+        progress.detail(row.partition(" (from ")[0].strip())
+
+
+def explain_failure(text: str) -> str | None:
+    """One sentence, cause and remedy, for what pip or the operating system wrote, where known."""
     for pattern, sentence in (
         ("No space left on device", "the disk is full: make room (df -h)"),
         (
@@ -94,9 +106,9 @@ def explain_pip_failure(output: str) -> str:
         ),
         ("Permission denied", "a file cannot be written: sudo chown -R $(id -un) ."),
     ):
-        if re.search(pattern, output):
+        if re.search(pattern, text):
             return sentence
-    return "pip failed"
+    return None
 
 
 def _needed_bytes(extras: Sequence[str]) -> float:

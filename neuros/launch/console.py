@@ -18,6 +18,7 @@ LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
 """What ROS 2 prints unless ``RCUTILS_CONSOLE_OUTPUT_FORMAT`` says otherwise."""
 
 _RECORD = re.compile(r"\[(?P<severity>[A-Z]+)\] \[\d+\.\d{9}\] \[(?P<name>[^\]\s]+)\]: ?")
+_TIME = re.compile(rb"\[[A-Z]+\] \[(\d+)\.(\d{9})\] \[")
 _TOKEN = re.compile(r"\{(\w+)\}")
 _RESET = "\x1b[0m"
 _NODE_COLOURS = ("36", "32", "35", "34", "96", "92", "95", "94")
@@ -39,6 +40,9 @@ _LONGEST_LINE_BYTES = 1 << 16
 class LogTail:
     """Shows complete lines of several growing files, each in a colour of its own.
 
+    What is new in all files is shown in the order of its records' times; lines without a time stay
+    behind the record that they follow.
+
     Args:
         files: the name to show, usually the node's, and the file, which need not exist yet.
         write: takes text of whole lines, with the line feed.
@@ -57,19 +61,14 @@ class LogTail:
 
     def poll(self) -> bool:
         """Show what is new, at most 64 KiB per file; whether anything was."""
-        found = False
-        for file in self._files:
-            lines = file.read_lines()
-            found = found or file.has_grown
-            self._show(file.name, lines)
-        return found
+        self._show([(file, file.read_lines()) for file in self._files])
+        return any(file.has_grown for file in self._files)
 
     def drain(self) -> None:
         """Show all that is left, incomplete last lines too, and close the files."""
         while self.poll():
             pass
-        for file in self._files:
-            self._show(file.name, file.take_rest())
+        self._show([(file, file.take_rest()) for file in self._files])
         self.close()
 
     def close(self) -> None:
@@ -88,9 +87,15 @@ class LogTail:
     ) -> None:
         self.close()
 
-    def _show(self, name: str, lines: list[bytes]) -> None:
-        if lines:
-            self._write("".join(f"{self._painter.paint(name, line)}\n" for line in lines))
+    def _show(self, found: list[tuple[_GrowingFile, list[bytes]]]) -> None:
+        timed = [
+            (file.time_of(line), f"{self._painter.paint(file.name, line)}\n")
+            for file, lines in found
+            for line in lines
+        ]
+        if timed:
+            timed.sort(key=lambda pair: pair[0])
+            self._write("".join(text for _, text in timed))
 
 
 def format_record(
@@ -136,7 +141,16 @@ class _GrowingFile:
         self._path = path
         self._descriptor: int | None = None
         self._rest = b""
+        self._last_time_ns = 0
         self._is_closed = False
+
+    def time_of(self, line: bytes) -> int:
+        """Unix time of a line in ns, never before that of the lines above it in the file."""
+        record = _TIME.search(line)
+        if record:
+            time_ns = int(record[1]) * 1_000_000_000 + int(record[2])
+            self._last_time_ns = max(self._last_time_ns, time_ns)
+        return self._last_time_ns
 
     def read_lines(self) -> list[bytes]:
         """The lines that are complete now, without line feeds."""

@@ -51,10 +51,10 @@ def run_table(record: Mapping[str, Any]) -> str:
     )
     nodes = tabulate(
         [[name, *_shares(node)] for name, node in record["nodes"].items()],
-        headers=["node", "busy", "waiting", "blocked", "remark"],
+        headers=["node", "busy", "waiting", "blocked", "idle", "remark"],
         missingval="?",
         disable_numparse=True,
-        colalign=("left", "right", "right", "right", "left"),
+        colalign=("left", "right", "right", "right", "right", "left"),
     )
     parts = [connections] if record["connections"] else []
     return "\n\n".join([*parts, nodes, _times(record)])
@@ -104,7 +104,7 @@ def _node(name: str, ended: Ended) -> dict[str, Any]:
 
 def _shares(node: Mapping[str, Any]) -> list[str]:
     if node["report"] is None:
-        return ["?", "?", "?", "never reported"]
+        return ["?", "?", "?", "?", "never reported"]
     spent = node["accounting"]
     running_s = spent["total"] - spent["registering"]
 
@@ -114,6 +114,7 @@ def _shares(node: Mapping[str, Any]) -> list[str]:
     remark = "" if node["report"] == "final" else node["report"]
     return [
         *(share(sum(spent[kind].values())) for kind in ("executing", "waiting", "blocked")),
+        share(spent["idle"]),
         remark,
     ]
 

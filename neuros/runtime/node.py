@@ -17,7 +17,7 @@ from neuros.ports import Logger, Middleware
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.plugin import describe, load_plugin, plugin_traceback
-from neuros.runtime.scope import Scope, Stage
+from neuros.runtime.scope import Stage
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
@@ -30,6 +30,7 @@ class NodeRuntime:
         tell: reports to the supervisor, ``tell(kind, **fields)``.
         fail: called with an error that ends the project.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
+        clock: monotonic clock in nanoseconds.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class NodeRuntime:
         fail: Callable[[str, NeurosError], None],
         log_file: Path | None,
         duration_sim_s: float | None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -51,6 +53,7 @@ class NodeRuntime:
         self._tell = tell
         self._fail = fail
         self._duration_sim_s = duration_sim_s if file.node.owns_time else None
+        self._clock = clock
         self._has_run = False
         self._read_time_s: Callable[[], float] | None = None
         self._clock_ports = {p.name for p in file.node.outputs if p.type == CLOCK_TYPE}
@@ -58,7 +61,7 @@ class NodeRuntime:
         self._specs: Sequence[HookSpec] = ()
         self.engine: Engine | None = None
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
-        self._scope = Scope(environment, file.node.plugin, file.folders.project, log_file)
+        self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
         self._stage.enter(self._scope)
         self._transport = middleware.transport(file)
         self.logger: Logger = middleware.ros_node(file).get_logger()
@@ -89,7 +92,7 @@ class NodeRuntime:
             self.file.connections,
             self._specs,
             self,
-            time.monotonic_ns,
+            self._clock,
             types,
         )
         self._say_what_is_special(self.engine)
@@ -243,7 +246,7 @@ class NodeRuntime:
 
     def report(self) -> dict[str, Any]:
         """State and counters. Any thread."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock()
         engine = self.engine
         return {
             "node": self.name,
@@ -268,7 +271,7 @@ class NodeRuntime:
         """Why nothing moves here. Any thread."""
         if self.engine is None:
             return [f"imports its plugin {self.file.node.plugin.name}"]
-        return explain(self.engine, time.monotonic_ns())
+        return explain(self.engine, self._clock())
 
     @property
     def sim_time(self) -> float | None:

@@ -15,57 +15,91 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+# Below a project's folder there may be a virtual environment, or NeuROS itself: all share those.
+_SHARED = (str(Path(sys.prefix)) + os.sep, str(Path(__file__).resolve().parents[1]) + os.sep)
+
 
 class Scope:
-    """The surroundings of one node.
+    """The surroundings of one node, or those of the process itself; made by a :class:`Stage`.
 
-    Args:
-        environment: variables of this node, on top of those of the process.
-        plugin: its file; the folder of that is searched first by ``import``.
-        project: modules from below this folder are private to the node.
-        log_file: where its standard output and error go, ``None`` to leave them.
+    Attributes:
+        variables: environment variables of this node, on top of those of the process.
+        environ: all its environment variables, encoded as ``os.environ`` keeps them.
+        path: where ``import`` looks.
+        project: modules from below this folder are private to the node; empty: none are.
+        log_fd: where its standard output and error go, ``None`` to leave them.
     """
 
     def __init__(
         self,
-        environment: Mapping[str, str],
-        plugin: Path,
-        project: Path,
-        log_file: Path | None = None,
+        variables: Mapping[str, str],
+        environ: dict[Any, Any],
+        path: list[str],
+        project: str = "",
+        log_fd: int | None = None,
     ) -> None:
-        self.variables = dict(environment)
-        self.environ: dict[Any, Any] = {**_environ_data()}
-        for key, value in environment.items():
-            self.environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
-        self.path = [str(plugin.parent), *sys.path]
-        self.project = str(project) + os.sep
+        self.variables = dict(variables)
+        self.environ = environ
+        self.path = path
+        self.project = project
         self.modules: dict[str, ModuleType] = {}
-        self.log_fd = None if log_file is None else _open_log(log_file)
+        self.log_fd = log_fd
 
     def close(self) -> None:
         """Close the log file."""
         if self.log_fd is not None:
             os.close(self.log_fd)
 
+    def hides(self, module: ModuleType) -> bool:
+        """Whether a module is private to this node."""
+        file = str(getattr(module, "__file__", None) or "")
+        return bool(self.project) and file.startswith(self.project) and not _is_shared(file)
+
 
 class Stage:
     """The process, and the node that plays on it now."""
 
     def __init__(self) -> None:
-        self._current: Scope | None = None
+        self._process = Scope({}, _environ_data(), sys.path)
+        self._current = self._process
         self._known_modules = len(sys.modules)
+
+    def scope(
+        self,
+        environment: Mapping[str, str],
+        plugin: Path,
+        project: Path,
+        log_file: Path | None = None,
+    ) -> Scope:
+        """The surroundings for a node.
+
+        Args:
+            environment: variables of this node, on top of those of the process.
+            plugin: its file; the folder of that is searched first by ``import``.
+            project: modules from below this folder are private to the node.
+            log_file: where its standard output and error go, ``None`` to leave them.
+        """
+        environ = dict(self._process.environ)
+        for key, value in environment.items():
+            environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
+        return Scope(
+            environment,
+            environ,
+            [str(plugin.parent), *self._process.path],
+            str(project) + os.sep,
+            None if log_file is None else _open_log(log_file),
+        )
 
     def enter(self, scope: Scope) -> None:
         """Make the surroundings those of ``scope``."""
         current = self._current
         if current is scope:
             return
-        if current is not None:
-            self._leave(current)
+        self._take_modules(current)
         self._current = scope
-        _set_variables(current.variables if current else {}, scope.variables)
+        _set_variables(current.variables, scope)
         _exchange_environ(scope.environ)
-        sys.path = scope.path
+        current.path, sys.path = sys.path, scope.path
         if scope.modules:
             sys.modules.update(scope.modules)
         self._known_modules = len(sys.modules)
@@ -73,14 +107,27 @@ class Stage:
             os.dup2(scope.log_fd, 1)
             os.dup2(scope.log_fd, 2)
 
-    def _leave(self, scope: Scope) -> None:
+    def leave(self) -> None:
+        """Give the process its own surroundings back (but for its output, if a node has a log)."""
+        self.enter(self._process)
+
+    def hide_from_nodes(self, project: Path) -> None:
+        """Let nodes load modules below this folder anew, even if the process has them already."""
+        self._process.project = str(project) + os.sep
+        self._known_modules = -1
+
+    def _take_modules(self, scope: Scope) -> None:
+        """Take the modules that are private to a node out of the process."""
         if len(sys.modules) != self._known_modules:
             for name, module in tuple(sys.modules.items()):
-                if str(getattr(module, "__file__", None) or "").startswith(scope.project):
+                if scope.hides(module):
                     scope.modules[name] = module
         for name in scope.modules:
             sys.modules.pop(name, None)
-        scope.path = sys.path
+
+
+def _is_shared(file: str) -> bool:
+    return file.startswith(_SHARED)
 
 
 def _open_log(path: Path) -> int:
@@ -97,11 +144,15 @@ def _exchange_environ(data: dict[Any, Any]) -> None:
     os.environ._data = data  # type: ignore[attr-defined]
 
 
-def _set_variables(old: Mapping[str, str], new: Mapping[str, str]) -> None:
+def _set_variables(old: Mapping[str, str], scope: Scope) -> None:
     """Let C libraries see the variables that differ (``getenv``)."""
     for name in old:
-        if name not in new:
-            os.unsetenv(name)
-    for name, value in new.items():
-        if old.get(name) != value:
-            os.putenv(name, value)
+        if name not in scope.variables:
+            value = scope.environ.get(os.environ.encodekey(name))
+            if value is None:
+                os.unsetenv(name)
+            else:
+                os.putenv(name, value)
+    for name, text in scope.variables.items():
+        if old.get(name) != text:
+            os.putenv(name, text)

@@ -41,9 +41,7 @@ def wire(
 ) -> Connection:
     """A connection from ``"a.out -> b.in"``."""
     source, destination = text.split(" -> ")
-    return Connection(
-        *source.split("."), *destination.split("."), discard_limit, queue_size, index
-    )
+    return Connection(*source.split("."), *destination.split("."), discard_limit, queue_size, index)
 
 
 def _mark(decorator: Callable[..., Any], name: str, returns: Any) -> HookSpec:
@@ -150,9 +148,7 @@ class Bench:
         )
 
     def acknowledge_to_node(self, connection: str, position: int) -> list[str]:
-        return self._ran(
-            lambda: self.engine.on_acknowledgement(self.by_name[connection], position)
-        )
+        return self._ran(lambda: self.engine.on_acknowledgement(self.by_name[connection], position))
 
     def register(self, connection: str) -> list[str]:
         return self._ran(lambda: self.engine.on_registered(self.by_name[connection]))

@@ -157,9 +157,7 @@ class NaiveNode:
             return False
         acknowledged = self.acknowledged_by_receiver[c]
         if c.destination_node == self.name and c in self.would_take(hook):
-            positions = [
-                h.mailbox[c][0][1] if h is hook else h.position[c] for h in self.takers(c)
-            ]
+            positions = [h.mailbox[c][0][1] if h is hook else h.position[c] for h in self.takers(c)]
             acknowledged = max(acknowledged, min(positions))
         return self.sent[c] - acknowledged >= c.queue_size + c.discard_limit
 
@@ -210,6 +208,4 @@ class NaiveNode:
             self.hooks.remove(hook)
             for c in hook.mailbox:
                 takers = self.takers(c)
-                self.acknowledge(
-                    c, min((h.position[c] for h in takers), default=self.arrived[c])
-                )
+                self.acknowledge(c, min((h.position[c] for h in takers), default=self.arrived[c]))

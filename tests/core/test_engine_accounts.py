@@ -32,9 +32,7 @@ def test_executing_is_booked_per_hook():
 
 
 def test_waiting_is_booked_per_input():
-    bench = Bench(
-        function("f", ["x", "y"]), connections=[wire(IN), wire("b.o -> node.y")]
-    )
+    bench = Bench(function("f", ["x", "y"]), connections=[wire(IN), wire("b.o -> node.y")])
     bench.clock.advance(3)
     bench.packet(IN)
     bench.clock.advance(4)
@@ -56,7 +54,8 @@ def test_blocked_is_booked_per_connection():
 
 def test_a_blocked_output_counts_before_a_missing_input():
     bench = Bench(
-        function("f", "x"), function("g", outputs="o", returns=1),
+        function("f", "x"),
+        function("g", outputs="o", returns=1),
         connections=[wire(IN), wire(OUT, 0)],
     )
     assert bench.engine.rest() == Rest(State.BLOCKED, OUT)
@@ -86,8 +85,9 @@ def test_a_tick_that_is_due_waits_for_its_input():
 
 
 def test_until_every_receiver_is_there_a_node_is_registering():
-    bench = Bench(function("f", outputs="o", returns=1), connections=[wire(OUT)],
-                  is_registered=False)
+    bench = Bench(
+        function("f", outputs="o", returns=1), connections=[wire(OUT)], is_registered=False
+    )
     bench.clock.advance(5)
     bench.register(OUT)
     assert accounting(bench)["registering"] == 5.0
@@ -205,7 +205,8 @@ def test_received_is_consumed_plus_discarded_plus_unread():
 
 def two_takers() -> Bench:
     return Bench(
-        function("f", ["x", "f_go"]), function("g", ["x", "g_go"]),
+        function("f", ["x", "f_go"]),
+        function("g", ["x", "g_go"]),
         connections=[wire(IN, 9), wire("c.o -> node.f_go"), wire("c.p -> node.g_go")],
     )
 
@@ -230,8 +231,11 @@ def test_discarded_counts_what_at_least_one_skipped_once():
 
 
 def test_an_initialise_hook_that_has_gone_is_not_asked_any_more():
-    bench = Bench(initialise("init", "x"), function("f", ["x", "go"]),
-                  connections=[wire(IN, 9, 2), wire("c.o -> node.go", 0, 5)])
+    bench = Bench(
+        initialise("init", "x"),
+        function("f", ["x", "go"]),
+        connections=[wire(IN, 9, 2), wire("c.o -> node.go", 0, 5)],
+    )
     for _ in range(3):
         bench.packet(IN)
     assert incoming(bench) == (3, 0, 1, 2)
@@ -303,7 +307,8 @@ def test_a_read_that_is_disturbed_is_tried_again():
 
 def test_a_snapshot_may_be_taken_while_the_engine_runs():
     bench = Bench(
-        function("f", "x"), function("g", Optional("x"), "o", returns=1),
+        function("f", "x"),
+        function("g", Optional("x"), "o", returns=1),
         connections=[wire(IN), wire(OUT, 1)],
     )
     failures = []

@@ -29,9 +29,7 @@ def sender(discard_limit: int | None, queue_size: int = 1) -> Bench:
 
 @pytest.mark.parametrize("queue_size", [1, 2, 5])
 @pytest.mark.parametrize("discard_limit", [0, 1, 3])
-def test_a_reliable_sender_blocks_while_k_plus_n_packets_are_outstanding(
-    discard_limit, queue_size
-):
+def test_a_reliable_sender_blocks_while_k_plus_n_packets_are_outstanding(discard_limit, queue_size):
     bench = sender(discard_limit, queue_size)
     assert len(bench.sent) == queue_size + discard_limit
 
@@ -125,9 +123,7 @@ def test_a_full_mailbox_discards_the_oldest_unread_packet_and_counts_it(queue_si
 
 
 def test_with_limit_0_a_full_mailbox_fails_loudly():
-    bench = Bench(
-        function("f", ["x", "go"]), connections=[wire(A, 0), wire("c.o -> node.go")]
-    )
+    bench = Bench(function("f", ["x", "go"]), connections=[wire(A, 0), wire("c.o -> node.go")])
     bench.packet(A)
     with pytest.raises(ProtocolError, match=f"{A} is lossless, yet packet 2 arrived"):
         bench.packet(A)
@@ -154,9 +150,7 @@ def test_nothing_is_acknowledged_on_an_external_topic():
 
 
 def test_an_acknowledgement_is_sent_when_a_hook_starts_and_not_on_arrival():
-    bench = Bench(
-        function("f", ["x", "y"]), connections=[wire(A, 0), wire("b.o -> node.y")]
-    )
+    bench = Bench(function("f", ["x", "y"]), connections=[wire(A, 0), wire("b.o -> node.y")])
     bench.packet(A)
     assert bench.acknowledged == []
     bench.packet("b.o -> node.y")
@@ -279,9 +273,7 @@ def test_it_blocks_like_any_other():
 
 
 def test_a_hook_whose_start_takes_the_packet_that_blocks_it_is_not_blocked():
-    bench = Bench(
-        function("f", Optional("x"), "o", returns=1), connections=[wire(OWN, 0)]
-    )
+    bench = Bench(function("f", Optional("x"), "o", returns=1), connections=[wire(OWN, 0)])
     assert bench.ran == ["f"]
     assert bench.waiting == ["own packet"]  # blocked until it is there, so no loop-back
     assert bench.settle(5) == ["f"] * 5

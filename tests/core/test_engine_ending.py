@@ -101,8 +101,12 @@ def test_an_initialise_hook_that_sends_unasked_does_not():
 
 @pytest.mark.parametrize("is_before_initialisation", [True, False])
 def test_draining_holds_whenever_it_comes(is_before_initialisation):
-    bench = Bench(initialise("init", "x"), function("free", outputs="o", returns=1), tick("t", 1.0),
-                  connections=[wire(IN), wire(OUT)])
+    bench = Bench(
+        initialise("init", "x"),
+        function("free", outputs="o", returns=1),
+        tick("t", 1.0),
+        connections=[wire(IN), wire(OUT)],
+    )
     if is_before_initialisation:
         bench.engine.drain()
     bench.packet(IN)
@@ -116,7 +120,8 @@ def test_draining_holds_whenever_it_comes(is_before_initialisation):
 
 def test_drained_means_that_no_hook_could_start_on_a_packet():
     bench = Bench(
-        function("f", ["x", "y"]), function("loop"),
+        function("f", ["x", "y"]),
+        function("loop"),
         connections=[wire(IN, 0), wire("b.o -> node.y", 0)],
     )
     bench.packet(IN)
@@ -136,9 +141,7 @@ def test_a_packet_whose_hook_is_ready_is_startable():
 
 
 def test_a_packet_behind_a_blocked_output_is_not_startable():
-    bench = Bench(
-        function("f", "x", "o", returns=1), connections=[wire(IN, 0), wire(OUT, 0)]
-    )
+    bench = Bench(function("f", "x", "o", returns=1), connections=[wire(IN, 0), wire(OUT, 0)])
     bench.packet(IN)
     bench.packet(IN)
     assert not bench.engine.has_startable_packet
@@ -213,15 +216,16 @@ def test_an_all_input_lacks_a_packet_of_every_connection():
 
 def test_what_wakes_a_function_hook_does_not_help_while_an_initialise_hook_waits():
     assert not is_wakeable(
-        initialise("init", "x"), function("f", "y"), tick("t", 1.0),
-        connections=[wire(IN)], external_inputs=["y"],
+        initialise("init", "x"),
+        function("f", "y"),
+        tick("t", 1.0),
+        connections=[wire(IN)],
+        external_inputs=["y"],
     )
 
 
 def test_a_node_whose_receivers_have_still_to_appear_may_wake():
-    assert is_wakeable(
-        function("f", "x"), connections=[wire(IN), wire(OUT)], is_registered=False
-    )
+    assert is_wakeable(function("f", "x"), connections=[wire(IN), wire(OUT)], is_registered=False)
 
 
 # ------------------------------------------------------------------ a loop that stalls

@@ -48,9 +48,7 @@ def test_a_blocked_connection_says_how_many_are_outstanding_and_since_when():
     assert reasons(bench) == [f"is blocked on `{OUT}` (1 outstanding, none acknowledged yet)"]
     bench.acknowledge_to_node(OUT, 1)
     bench.clock.advance(2.1)
-    assert reasons(bench) == [
-        f"is blocked on `{OUT}` (1 outstanding, last acknowledged 2.1 s ago)"
-    ]
+    assert reasons(bench) == [f"is blocked on `{OUT}` (1 outstanding, last acknowledged 2.1 s ago)"]
 
 
 def test_its_own_packet_that_a_hook_would_take_is_no_reason():
@@ -63,8 +61,9 @@ def test_its_own_packet_that_a_hook_would_take_is_no_reason():
 
 
 def test_a_running_hook_is_the_only_reason():
-    bench = Bench(function("f", "imu"), function("g", "x"), connections=[
-        wire(IN), wire("a.o -> node.x")])
+    bench = Bench(
+        function("f", "imu"), function("g", "x"), connections=[wire(IN), wire("a.o -> node.x")]
+    )
     seen = []
     bench.hook_s = 7.2
     bench.during_call = lambda: seen.append(reasons(bench))

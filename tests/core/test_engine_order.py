@@ -15,7 +15,9 @@ def test_before_any_execution_the_order_is_that_of_declaration():
 
 def test_least_recently_executed_comes_first():
     bench = Bench(
-        function("f", "x"), function("g", "y"), function("h", ["x", "y"]),
+        function("f", "x"),
+        function("g", "y"),
+        function("h", ["x", "y"]),
         connections=[wire(A), wire("b.o -> node.y")],
     )
     assert bench.packet(A) == ["f"]
@@ -49,9 +51,7 @@ def test_readiness_is_asked_at_a_hooks_turn():
 
 
 def test_a_hook_runs_at_most_once_per_event():
-    bench = Bench(
-        function("f", "x"), connections=[wire(A, queue_size=3)], is_started=False
-    )
+    bench = Bench(function("f", "x"), connections=[wire(A, queue_size=3)], is_started=False)
     for number in range(3):
         bench.packet(A, number)
     bench.engine.start()
@@ -87,9 +87,7 @@ def test_a_hook_with_only_optional_inputs_or_none_runs_without_pause():
 
 
 def test_such_a_hook_sleeps_while_its_outputs_are_blocked():
-    bench = Bench(
-        function("f", outputs="o", returns=1), connections=[wire("node.o -> b.x", 0)]
-    )
+    bench = Bench(function("f", outputs="o", returns=1), connections=[wire("node.o -> b.x", 0)])
     assert bench.ran == ["f"]
     assert bench.waiting == []
     bench.acknowledge_to_node("node.o -> b.x", 1)
@@ -98,7 +96,9 @@ def test_such_a_hook_sleeps_while_its_outputs_are_blocked():
 
 def test_ticks_and_hooks_with_required_inputs_are_no_main_loops():
     bench = Bench(
-        tick("t", 1.0), function("f", "x"), function("g", ["x", Optional("y")]),
+        tick("t", 1.0),
+        function("f", "x"),
+        function("g", ["x", Optional("y")]),
         connections=[wire(A)],
     )
     assert bench.engine.free_running_hooks() == []
@@ -106,8 +106,9 @@ def test_ticks_and_hooks_with_required_inputs_are_no_main_loops():
 
 def test_hooks_never_nest_even_if_one_of_them_has_events_handled():
     """A plugin may spin its ROS node inside a hook; a node is single-threaded all the same."""
-    bench = Bench(function("f", "x"), function("g", "y"), connections=[wire(A), wire(
-        "b.o -> node.y")])
+    bench = Bench(
+        function("f", "x"), function("g", "y"), connections=[wire(A), wire("b.o -> node.y")]
+    )
     bench.during_call = lambda: bench.engine.on_packet(bench.by_name["b.o -> node.y"], 2)
     bench.packet(A, 1)
     bench.during_call = None
@@ -163,7 +164,8 @@ def test_a_discard_makes_the_next_packet_of_the_connection_the_oldest():
 
 def test_two_hooks_with_the_same_input_both_get_every_packet():
     bench = Bench(
-        function("f", "x"), function("g", ["x", "go"]),
+        function("f", "x"),
+        function("g", ["x", "go"]),
         connections=[wire(A, 0, 5), wire("c.o -> node.go", 0, 5)],
     )
     for number in range(3):
@@ -182,9 +184,7 @@ def test_they_share_the_object():
 
 
 def test_one_hook_may_take_the_same_input_plainly_and_another_all_of_it():
-    bench = Bench(
-        function("f", "x"), function("g", All("x")), connections=[wire(A), wire(B)]
-    )
+    bench = Bench(function("f", "x"), function("g", All("x")), connections=[wire(A), wire(B)])
     assert bench.packet(A, 1) == ["f"]
     assert bench.packet(B, 2) == ["g", "f"]
     assert ("g", ([1, 2],)) in bench.calls

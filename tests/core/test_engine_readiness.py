@@ -221,9 +221,7 @@ def test_initialise_hooks_run_once_and_before_all_others():
 
 
 def test_nothing_else_runs_before_every_initialise_hook_has_run():
-    bench = Bench(
-        function("f"), initialise("one"), initialise("two", "x"), connections=[wire(A)]
-    )
+    bench = Bench(function("f"), initialise("one"), initialise("two", "x"), connections=[wire(A)])
     assert bench.ran == ["one"]
     assert bench.packet(A) == ["two"]
     assert bench.settle(1) == ["f"]

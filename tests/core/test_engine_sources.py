@@ -101,9 +101,10 @@ def test_withdrawing_takes_back_that_very_offer_and_no_other():
 
 
 def test_nothing_is_sent_before_registration_and_initialisation():
-    bench, accepted = Bench(
-        initialise("init", "x"), connections=[wire(IN), wire(OUT)], is_registered=False
-    ), []
+    bench, accepted = (
+        Bench(initialise("init", "x"), connections=[wire(IN), wire(OUT)], is_registered=False),
+        [],
+    )
     offer(bench, accepted, o=1)
     bench.register(OUT)
     assert accepted == [False]
@@ -112,9 +113,12 @@ def test_nothing_is_sent_before_registration_and_initialisation():
 
 
 def test_it_takes_its_turn_least_recently_executed_first():
-    bench, accepted = Bench(
-        function("f", "x", "o", returns="from f"), connections=[wire(IN, 0, 9), wire(OUT, 0)]
-    ), []
+    bench, accepted = (
+        Bench(
+            function("f", "x", "o", returns="from f"), connections=[wire(IN, 0, 9), wire(OUT, 0)]
+        ),
+        [],
+    )
     bench.packet(IN)
     offer(bench, accepted, o="offer")
     bench.packet(IN)

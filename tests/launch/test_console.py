@@ -61,6 +61,22 @@ def test_files_may_appear_later(screen: Screen) -> None:
     screen.tail.close()
 
 
+def test_records_of_all_nodes_are_shown_in_the_order_of_their_times(screen: Screen) -> None:
+    def record(second: int, name: str, text: str) -> bytes:
+        return f"[INFO] [{second}.000000000] [{name}]: {text}\n".encode()
+
+    screen.log("snn", record(1, "snn", "one") + record(3, "snn", "three") + b"and more\n")
+    screen.log("robot", record(2, "robot", "two") + record(4, "robot", "four"))
+    screen.tail.poll()
+    assert re.findall(r"one|two|three|more|four", screen.shown) == [
+        "one",
+        "two",
+        "three",
+        "more",
+        "four",
+    ]
+
+
 def test_only_complete_lines_are_shown_before_the_end(screen: Screen) -> None:
     screen.log("snn", b"one\ntw")
     screen.tail.poll()

@@ -1,0 +1,158 @@
+"""What a plugin under test finds in place of ROS: real messages, a logger that remembers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from neuros.errors import NodeError
+from neuros.ports import Inbox, Transport
+from neuros.project.model import Connection, NodeFile, Port
+from neuros.testing.step_loop import StepLoop
+from neuros.transport.memory import MemoryHub, MemoryTransport
+from neuros.transport.messages import decode, encode, message_class
+
+_LEVELS = {
+    "DEBUG": logging.DEBUG,
+    "INFO": logging.INFO,
+    "WARN": logging.WARNING,
+    "ERROR": logging.ERROR,
+    "FATAL": logging.CRITICAL,
+}
+
+
+class Record(NamedTuple):
+    """One line that a node has logged; ``severity`` is DEBUG, INFO, WARN, ERROR or FATAL."""
+
+    severity: str
+    text: str
+
+
+class RecordingLogger:
+    """Looks like rclpy's logger. Every record is kept, and passed on to Python's ``logging``.
+
+    ``once``, ``skip_first`` and ``throttle_duration_sec`` are accepted and leave nothing out.
+    """
+
+    def __init__(self, name: str, records: list[Record]) -> None:
+        self.name = name
+        self._records = records
+        self._python = logging.getLogger(f"neuros.{name}")
+
+    def get_child(self, name: str) -> RecordingLogger:
+        """A logger below this one; it keeps its records in the same list."""
+        return RecordingLogger(f"{self.name}.{name}", self._records)
+
+    def debug(self, message: str, **_: Any) -> bool:
+        return self._keep("DEBUG", message)
+
+    def info(self, message: str, **_: Any) -> bool:
+        return self._keep("INFO", message)
+
+    def warning(self, message: str, **_: Any) -> bool:
+        return self._keep("WARN", message)
+
+    warn = warning
+
+    def error(self, message: str, **_: Any) -> bool:
+        return self._keep("ERROR", message)
+
+    def fatal(self, message: str, **_: Any) -> bool:
+        return self._keep("FATAL", message)
+
+    def _keep(self, severity: str, message: str) -> bool:
+        self._records.append(Record(severity, str(message)))
+        self._python.log(_LEVELS[severity], "%s", message)
+        return True
+
+
+class RosNodeStandIn:
+    """What ``node.get_ros_node()`` gives in a test: a name and a logger, and no ROS."""
+
+    def __init__(self, name: str, records: list[Record]) -> None:
+        self._name = name
+        self._logger = RecordingLogger(name, records)
+
+    def get_name(self) -> str:
+        """The node's name."""
+        return self._name
+
+    def get_logger(self) -> RecordingLogger:
+        """The logger whose records are ``harness.log``."""
+        return self._logger
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("__"):  # what copy, pickle and the like ask for
+            raise AttributeError(attribute)
+        raise NodeError(
+            f"get_ros_node().{attribute}: there is no ROS behind a PluginHarness, only"
+            " get_logger() and get_name(): test this part in a project that is launched"
+        )
+
+
+class Topics:
+    """External topics in a test: what the node publishes is kept (``Outside`` of a transport)."""
+
+    def __init__(self) -> None:
+        self.inbox: Inbox | None = None
+        self.published: dict[str, list[Any]] = {}
+
+    def open(self, inbox: Inbox) -> None:
+        """Remember who takes what is sent on external topics."""
+        self.inbox = inbox
+
+    def send_external(self, port: Port, packet: Any) -> None:
+        """Keep a packet."""
+        self.published.setdefault(port.name, []).append(decode(encode(packet)))
+
+    def show(self, connections: Sequence[Connection], packet: Any) -> None:
+        """Nobody else listens."""
+
+    def make_packet(self, type_name: str) -> Any:
+        """A new message with default values."""
+        return message_class(type_name)()
+
+    def close(self) -> None:
+        """Take nothing any more."""
+        self.inbox = None
+
+
+class Workbench:
+    """The middleware of one node under test (:class:`neuros.ports.Middleware`)."""
+
+    def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
+        self.loop = loop
+        self.topics = topics
+        self.hub = MemoryHub(loop.post, encode, decode)
+        self._log = log
+        self._ros_nodes: dict[str, RosNodeStandIn] = {}
+
+    def transport(self, file: NodeFile) -> Transport:
+        """The real transport of nodes that share a process."""
+        self._ros_nodes[file.node.name] = RosNodeStandIn(file.node.name, self._log)
+        return MemoryTransport(file, self.hub, self.topics)
+
+    def ros_node(self, file: NodeFile) -> RosNodeStandIn:
+        """A stand-in."""
+        return self._ros_nodes[file.node.name]
+
+    def mark_own_entities(self, file: NodeFile) -> None:
+        """There are none."""
+
+    def has_foreign_entities(self, file: NodeFile) -> bool:
+        """A plugin cannot create any here."""
+        return False
+
+    def copy(self, packet: Any) -> Any:
+        """A packet that shares nothing with this one."""
+        return decode(encode(packet))
+
+    def message_class(self, type_name: str) -> type:
+        """The class of a message type in ROS notation."""
+        return message_class(type_name)
+
+    def close(self) -> None:
+        """Nothing to give up."""
+
+
