@@ -56,7 +56,7 @@ def steadily(read: Callable[[], _T], otherwise: _T) -> _T:
     for _ in range(_ATTEMPTS):
         try:
             return read()
-        except (RuntimeError, LookupError, StopIteration):
+        except (RuntimeError, LookupError, ValueError, StopIteration):
             continue
     return otherwise
 

@@ -54,6 +54,7 @@ class Outcome:
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.
         started_s: when the first hook started, ``None`` if none did.
+        ending_s: when the end was asked for first: what comes after is draining and finalising.
     """
 
     exit_code: int = 0
@@ -61,6 +62,7 @@ class Outcome:
     reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     report_times_s: dict[str, float] = field(default_factory=dict)
     started_s: float | None = None
+    ending_s: float | None = None
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)
 
@@ -203,6 +205,7 @@ class Supervisor:
         if self._phase is not Phase.RUNNING:
             return
         self._phase = Phase.DRAINING
+        self.outcome.ending_s = time.monotonic()
         self.outcome.reason = reason
         self._deadline_s = time.monotonic() + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
@@ -219,6 +222,8 @@ class Supervisor:
 
     def _stop(self) -> None:
         self._phase = Phase.STOPPING
+        if self.outcome.ending_s is None:
+            self.outcome.ending_s = time.monotonic()
         self._deadline_s = time.monotonic() + STOP_S
         greeted = {name for names in self._lines.values() for name in names}
         self._broadcast("stop")

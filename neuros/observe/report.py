@@ -8,6 +8,9 @@ from typing import Any, Protocol
 from neuros.project.model import Connection, NodeFile, Project
 
 
+_COUNTS = ("sent", "received", "consumed", "discarded", "lost")
+
+
 class Ended(Protocol):
     """How a run ended, as far as a record needs it."""
 
@@ -15,6 +18,7 @@ class Ended(Protocol):
     reason: str
     reports: dict[str, Mapping[str, Any]]
     report_times_s: dict[str, float]
+    ending_s: float | None
     ended_s: float
 
 
@@ -24,6 +28,7 @@ def run_record(
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
     sim_s = max(sim_times, default=None)
+    running_s = _running_s(ended)
     return {
         "project": project.name,
         "file": str(project.file),
@@ -31,7 +36,8 @@ def run_record(
         "reason": ended.reason,
         "wall_s": wall_s,
         "sim_s": sim_s,
-        "real_time_factor": None if sim_s is None or wall_s <= 0 else sim_s / wall_s,
+        "running_s": running_s,
+        "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
         "connections": [_connection(c, ended.reports) for c in _connections(files)],
         "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
     }
@@ -42,11 +48,8 @@ def run_table(record: Mapping[str, Any]) -> str:
     from tabulate import tabulate
 
     connections = tabulate(
-        [
-            [c["connection"], *(c[key] for key in ("sent", "received", "consumed", "discarded"))]
-            for c in record["connections"]
-        ],
-        headers=["connection", "sent", "received", "consumed", "discarded"],
+        [[c["connection"], *(c[key] for key in _COUNTS)] for c in record["connections"]],
+        headers=["connection", *_COUNTS],
         missingval="?",
     )
     nodes = tabulate(
@@ -60,6 +63,26 @@ def run_table(record: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, nodes, _times(record)])
 
 
+def _running_s(ended: Ended) -> float | None:
+    """Wall time in which simulated time went on: without initialisation, draining and the end.
+
+    It counts from when every node had initialised, or, if that was not before the end, from when
+    the node that owns simulated time had.
+    """
+    since = {
+        name: report["running_since_s"]
+        for name, report in ended.reports.items()
+        if report["running_since_s"] is not None
+    }
+    if ended.ending_s is None:
+        return None
+    owners = [since[n] for n in since if ended.reports[n]["sim_time"] is not None]
+    start_s = max(since.values(), default=ended.ending_s)
+    if start_s >= ended.ending_s or len(since) < len(ended.reports):
+        start_s = max(owners, default=ended.ending_s)
+    return max(0.0, float(ended.ending_s - start_s))
+
+
 def _connections(files: Sequence[NodeFile]) -> list[Connection]:
     every = {connection for file in files for connection in file.connections}
     return sorted(every, key=lambda connection: connection.index)
@@ -70,11 +93,13 @@ def _connection(connection: Connection, reports: Mapping[str, Any]) -> dict[str,
     outgoing = _ledger(reports, connection.source_node, "outgoing").get(key, {})
     incoming = _ledger(reports, connection.destination_node, "incoming").get(key, {})
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
+    sent, received = outgoing.get("sent"), incoming.get("received")
     return {
         "connection": key,
         "discard_limit": connection.discard_limit,
         "queue_size": connection.queue_size,
-        "sent": outgoing.get("sent"),
+        "sent": sent,
+        "lost": None if sent is None or received is None else sent - received,
         **{field: incoming.get(field) for field in fields},
     }
 
@@ -124,6 +149,7 @@ def _times(record: Mapping[str, Any]) -> str:
     if record["sim_s"] is None:
         return wall
     return (
-        f"simulated time {record['sim_s']:.2f} s, {wall},"
-        f" real-time factor {record['real_time_factor']:.2f}"
+        f"simulated time {record['sim_s']:.2f} s, {wall}, real-time factor"
+        f" {record['real_time_factor'] or 0:.2f} ({record['running_s'] or 0:.2f} s without"
+        " initialisation and ending)"
     )

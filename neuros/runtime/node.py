@@ -65,7 +65,7 @@ class NodeRuntime:
         self._stage.enter(self._scope)
         self._transport = middleware.transport(file)
         self.logger: Logger = middleware.ros_node(file).get_logger()
-        self._handle = NodeHandle(file, middleware.ros_node(file), self)
+        self.handle = NodeHandle(file, middleware.ros_node(file), self)
 
     @property
     def run_dir(self) -> Path:
@@ -253,6 +253,7 @@ class NodeRuntime:
             "has_run": self._has_run,
             "waiting_for": [str(each) for each in self._transport.waiting_for()],
             "sim_time": self.sim_time,
+            "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "ledger": None if engine is None else snapshot(engine, now_ns),
         }
 
@@ -293,7 +294,7 @@ class NodeRuntime:
 
     def _run_spec(self, spec: HookSpec, arguments: Sequence[Any]) -> Any:
         try:
-            return spec.function(self._handle, *arguments)
+            return spec.function(self.handle, *arguments)
         except HookError:
             raise
         except BaseException as error:

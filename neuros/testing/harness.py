@@ -1,30 +1,38 @@
-"""``PluginHarness``: one plugin on the real engine, with the test in the place of everybody else."""
+"""``PluginHarness``: one plugin on the real engine; the test is everybody else."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import neuros
+from neuros.core.engine import Engine
+from neuros.core.ledger import snapshot
 from neuros.errors import NeurosError, NodeError
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
+from neuros.runtime.handle import NodeHandle
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.scope import Stage
 from neuros.testing.neighbours import Neighbours
 from neuros.testing.stand_ins import Record, Topics, Workbench
 from neuros.testing.step_loop import ManualClock, StepLoop
-from neuros.testing.wiring import check_ends, ports, with_neighbours, with_observer
+from neuros.testing.wiring import ports, with_neighbours, with_observer
+from neuros.transport.messages import decode, encode, message_class
 
 _WORKSPACE = Path(neuros.__file__).resolve().parents[1] / "workspace"
 _MANY = 10_000
+"""Hook executions after which :meth:`PluginHarness.run` takes it that they will never end."""
 
 
 class PluginHarness:
@@ -76,7 +84,11 @@ class PluginHarness:
 
     Where nothing else is said, each input has one lossless connection, from a node ``sender``, and
     each output one to a node ``receiver``. A failing hook makes :meth:`run` raise ``HookError``.
-    During :meth:`run` environment variables, current folder and import path are the node's.
+    Around hooks, environment variables, current folder and import path are the node's.
+
+    Attributes:
+        log: what the node has logged; it goes to Python's ``logging`` as well (``neuros.<name>``).
+        shutdown_reason: what the plugin gave to ``node.shutdown``, ``None`` before.
 
     Args:
         plugin: the plugin file.
@@ -84,7 +96,7 @@ class PluginHarness:
         connections: those that differ, ``wire("camera.image -> node.view", discard_limit=3)``.
         environment: environment variables of the node.
         name: the node's name.
-        run_dir: its own writable folder; a temporary one if not given.
+        run_folder: the run folder, a temporary one if not given.
 
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
@@ -100,7 +112,7 @@ class PluginHarness:
         connections: Sequence[Connection] = (),
         environment: Mapping[str, str] | None = None,
         name: str = "node",
-        run_dir: Path | None = None,
+        run_folder: Path | None = None,
     ) -> None:
         path = Path(plugin).resolve()
         node = Node(
@@ -112,8 +124,8 @@ class PluginHarness:
             environment=dict(environment or {}),
             file=path,
         )
-        check_ends(node, connections)
-        self._open(node, with_neighbours(node, connections), path.parent, _WORKSPACE, run_dir)
+        wires = with_neighbours(node, connections)
+        self._open(node, wires, path.parent, _WORKSPACE, run_folder)
 
     @classmethod
     def from_project(
@@ -124,7 +136,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         overrides: Sequence[str] = (),
         workspace: Path = _WORKSPACE,
-        run_dir: Path | None = None,
+        run_folder: Path | None = None,
     ) -> PluginHarness:
         """One node of a project, with the connections that it has there.
 
@@ -142,7 +154,7 @@ class PluginHarness:
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
-        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_dir)
+        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_folder)
         return harness
 
     @classmethod
@@ -153,7 +165,7 @@ class PluginHarness:
         connections: Sequence[Connection] = (),
         environment: Mapping[str, str] | None = None,
         workspace: Path = _WORKSPACE,
-        run_dir: Path | None = None,
+        run_folder: Path | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
 
@@ -163,14 +175,12 @@ class PluginHarness:
         file = Path(node_file).resolve()
         with tempfile.TemporaryDirectory() as folder:
             project = Path(folder) / "project.json"
-            project.write_text(f'{{"nodes": ["{file.name}"], "connections": []}}')
+            project.write_text(json.dumps({"nodes": [file.name], "connections": []}))
             loaded = load_project(project, workspace=workspace, folder=file.parent).project
         node = _with_environment(loaded.nodes[0], environment)
-        check_ends(node, connections)
         harness = cls.__new__(cls)
-        harness._open(
-            node, with_neighbours(node, connections), file.parent, workspace, run_dir
-        )
+        wires = with_neighbours(node, connections)
+        harness._open(node, wires, file.parent, workspace, run_folder)
         return harness
 
     def _open(
@@ -179,28 +189,23 @@ class PluginHarness:
         connections: tuple[Connection, ...],
         project: Path,
         workspace: Path,
-        run_dir: Path | None,
+        run_folder: Path | None,
     ) -> None:
-        if run_dir is None:
-            self._run_folder = Path(tempfile.mkdtemp(prefix="neuros-harness-"))
-            weakref.finalize(self, shutil.rmtree, self._run_folder, ignore_errors=True)
-        else:
-            self._run_folder = run_dir.absolute().parent
-        self.run_dir = run_dir.absolute() if run_dir else self._run_folder / node.name
-        self.run_dir.mkdir(parents=True, exist_ok=True)
-        self._node = node
-        self._clock = ManualClock()
-        self._loop = StepLoop(self._clock)
-        self._topics = Topics()
+        folder = _temporary_folder_of(self) if run_folder is None else run_folder.resolve()
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
         self._failure: NeurosError | None = None
+        self._is_final = False
+        self._clock = ManualClock()
+        self._loop = StepLoop(self._clock)
+        self._topics = Topics()
+        file = NodeFile(node, connections, Folders(project, workspace, folder))
         bench = Workbench(self._loop, self._topics, self.log)
-        file = NodeFile(node, connections, Folders(project, workspace, self._run_folder))
-        self._neighbours = Neighbours(file, bench.hub, self._topics)
-        self._bench = bench
+        self._ends = Neighbours(file, bench.hub, self._topics)
         self._stage = Stage()
         self._stage.hide_from_nodes(project)
+        (folder / node.name).mkdir(parents=True, exist_ok=True)
+        self._file = file
         with self._on_stage():
             self._runtime = NodeRuntime(
                 file,
@@ -214,3 +219,240 @@ class PluginHarness:
             )
             self._runtime.load()
         self._loop.post(self._runtime.start)
+
+    # ------------------------------------------------------------------ what goes in
+
+    def make_packet(self, port: str) -> Any:
+        """A new message of the type of an input (or else an output), with default values."""
+        return message_class(self._port(port, "port", self._inputs | self._outputs).type)()
+
+    def send(self, input_name: str, *packets: Any, source: str | None = None) -> None:
+        """Send packets to an input; those that its connection does not let through yet wait.
+
+        They arrive when :meth:`run` is called, as they are now: changing them later has no effect.
+
+        Args:
+            source: which connection, ``"camera"`` or ``"camera.image"``, where there are several.
+        """
+        port = self._port(input_name, "input", self._inputs)
+        kind = message_class(port.type)
+        for packet in packets:
+            if not isinstance(packet, kind):
+                raise TypeError(f"input '{input_name}' takes {port.type}, not {packet!r}")
+        if port.external_topic is not None:
+            for packet in packets:
+                self._loop.post(partial(self._topics.deliver, port, decode(encode(packet))))
+            return
+        connections = self._from(input_name, source)
+        if len(connections) != 1:
+            names = ", ".join(f"{c.source_node}.{c.source_output}" for c in connections)
+            raise ValueError(f"input '{input_name}': say which source: {names or 'it has none'}")
+        for packet in packets:
+            self._ends.send(connections[0], packet)
+
+    def unsent(self, input_name: str, source: str | None = None) -> int:
+        """Packets that still wait at their sender, since the node has not taken earlier ones."""
+        self._port(input_name, "input", self._inputs)
+        return self._ends.unsent(self._from(input_name, source))
+
+    # ------------------------------------------------------------------ running
+
+    def run(self, executions: int | None = None) -> int:
+        """Run hooks until none is ready, or until so many have run; returns how many have.
+
+        Raises:
+            HookError: if one fails; again at every later call.
+            NodeError: if they go on for ever and ``executions`` was not given.
+        """
+        before, limit = self._executions(), _MANY if executions is None else executions
+        with self._on_stage():
+            while self._executions() - before < limit and self._loop.step():
+                self._raise_failure()
+        self._raise_failure()
+        ran = self._executions() - before
+        if executions is None and ran >= _MANY:
+            names = ", ".join(hook.name for hook in self._engine.hooks() if hook.is_ready())
+            raise NodeError(
+                f"{ran} hooks have run and there is no end of it ({names}): a hook that requires"
+                " no input runs without pause; use run(executions=...), or block an output"
+            )
+        return ran
+
+    def advance(self, seconds: float) -> int:
+        """Let time pass: run what is ready, then each tick at its time; returns how many ran.
+
+        Raises:
+            HookError, NodeError: as :meth:`run`.
+        """
+        before = self._executions()
+        end_ns = self._clock.now_ns + round(seconds * 1e9)
+        self.run()
+        while (due_ns := self._loop.next_due_ns) is not None and due_ns <= end_ns:
+            with self._on_stage():
+                self._loop.advance_to(due_ns)
+            self.run()
+        self._loop.advance_to(end_ns)
+        return self._executions() - before
+
+    def finalise(self) -> None:
+        """End the node: run its finalise hooks; a second call has no effect.
+
+        Raises:
+            HookError: if one of them fails.
+        """
+        if self._is_final:
+            return
+        self._is_final, failure = True, self._failure
+        with self._on_stage():
+            self._runtime.finalise()
+        if failure is None:
+            self._raise_failure()
+
+    def __enter__(self) -> PluginHarness:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with contextlib.suppress(*([NeurosError] if error else [])):
+            self.finalise()
+
+    # ------------------------------------------------------------------ what comes out
+
+    def received(self, output: str, receiver: str | None = None) -> list[Any]:
+        """What has arrived from an output so far, oldest first.
+
+        Args:
+            receiver: who received it, ``"viewer"`` or ``"viewer.image"``; all receive the same.
+        """
+        port = self._port(output, "output", self._outputs)
+        if port.external_topic is not None:
+            return list(self._topics.published.get(output, ()))
+        return list(self._ends.received[self._to(output, receiver)[0]])
+
+    def block(self, output: str, receiver: str | None = None) -> None:
+        """Let receivers of an output be busy: they start on no packet from now on."""
+        self._ends.busy.update(self._to(output, receiver))
+
+    def acknowledge(self, output: str, count: int | None = 1, receiver: str | None = None) -> None:
+        """Let busy receivers start on ``count`` packets, ``None``: on all; they stay busy."""
+        for connection in self._to(output, receiver):
+            self._ends.start_on(connection, count)
+
+    def unblock(self, output: str, receiver: str | None = None) -> None:
+        """Let receivers start on all that they have, and on each packet as it comes."""
+        self._ends.busy.difference_update(self._to(output, receiver))
+        self.acknowledge(output, None, receiver)
+
+    @property
+    def node(self) -> NodeHandle:
+        """The ``node`` that hooks receive."""
+        return self._runtime.handle
+
+    @property
+    def run_dir(self) -> Path:
+        """The node's own folder."""
+        return self._runtime.run_dir
+
+    @property
+    def time_s(self) -> float:
+        """Seconds that have passed by :meth:`advance`."""
+        return self._clock.now_ns / 1e9
+
+    @property
+    def executions(self) -> dict[str, int]:
+        """How often each hook has run."""
+        hooks = snapshot(self._engine, self._clock())["hooks"]
+        return {name: entry["executions"] for name, entry in hooks.items()}
+
+    @property
+    def connections(self) -> dict[str, dict[str, Any]]:
+        """The counters by connection, as ``run.json`` has them: sent, received, discarded, ..."""
+        books = snapshot(self._engine, self._clock())
+        return {**books["outgoing"], **books["incoming"]}
+
+    def explain(self) -> list[str]:
+        """Why nothing moves, in the words of the stall explainer."""
+        return self._runtime.explain()
+
+    # ------------------------------------------------------------------ inside
+
+    @property
+    def _engine(self) -> Engine:
+        assert self._runtime.engine is not None
+        return self._runtime.engine
+
+    def _executions(self) -> int:
+        return sum(hook.executions for hook in self._engine.all_hooks)
+
+    @property
+    def _inputs(self) -> dict[str, Port]:
+        return {port.name: port for port in self._file.node.inputs}
+
+    @property
+    def _outputs(self) -> dict[str, Port]:
+        return {port.name: port for port in self._file.node.outputs}
+
+    def _port(self, name: str, side: str, known: Mapping[str, Port]) -> Port:
+        if name not in known:
+            has = ", ".join(known) or "none"
+            raise ValueError(f"node '{self._file.node.name}' has no {side} '{name}' (it has {has})")
+        return known[name]
+
+    def _from(self, input_name: str, source: str | None) -> list[Connection]:
+        return [
+            c
+            for c in self._ends.incoming
+            if c.destination_input == input_name
+            and source in (None, c.source_node, f"{c.source_node}.{c.source_output}")
+        ]
+
+    def _to(self, output: str, receiver: str | None) -> list[Connection]:
+        self._port(output, "output", self._outputs)
+        found = [
+            c
+            for c in self._ends.outgoing
+            if c.source_output == output
+            and receiver
+            in (None, c.destination_node, f"{c.destination_node}.{c.destination_input}")
+        ]
+        if not found:
+            raise ValueError(f"output '{output}' has no such receiver: {receiver or 'none at all'}")
+        return found
+
+    def _listen(self, kind: str, **fields: Any) -> None:
+        if kind == "shutdown" and self.shutdown_reason is None:
+            self.shutdown_reason = str(fields["reason"])
+
+    def _fail(self, _: str, error: NeurosError) -> None:
+        self._failure = self._failure or error
+        self._runtime.stop()
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    @contextlib.contextmanager
+    def _on_stage(self) -> Iterator[None]:
+        """The surroundings of the node for a while; those of the test again afterwards."""
+        folder = os.getcwd()
+        os.chdir(self._file.folders.run)
+        try:
+            yield
+        finally:
+            self._stage.leave()
+            os.chdir(folder)
+
+
+def _with_environment(node: Node, environment: Mapping[str, str] | None) -> Node:
+    return replace(node, environment={**node.environment, **(environment or {})})
+
+
+def _temporary_folder_of(owner: object) -> Path:
+    """A folder that goes when ``owner`` does."""
+    folder = Path(tempfile.mkdtemp(prefix="neuros-"))
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return folder

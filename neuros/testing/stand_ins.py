@@ -102,6 +102,11 @@ class Topics:
         """Remember who takes what is sent on external topics."""
         self.inbox = inbox
 
+    def deliver(self, port: Port, packet: Any) -> None:
+        """Let a packet arrive on the external topic of an input."""
+        if self.inbox is not None:
+            self.inbox.on_external_packet(port, packet)
+
     def send_external(self, port: Port, packet: Any) -> None:
         """Keep a packet."""
         self.published.setdefault(port.name, []).append(decode(encode(packet)))
@@ -154,5 +159,3 @@ class Workbench:
 
     def close(self) -> None:
         """Nothing to give up."""
-
-

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from neuros.project.model import Connection, Node, Port
 from neuros.project.message_types import normalised
+from neuros.project.model import Connection, Node, Port
 
 SENDER, RECEIVER, OBSERVER = "sender", "receiver", "observer"
 
@@ -37,7 +37,7 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
     return tuple(found)
 
 
-def check_ends(node: Node, connections: Iterable[Connection]) -> None:
+def _check_ends(node: Node, connections: Iterable[Connection]) -> None:
     """Raise ``ValueError`` for a connection that does not fit the node."""
     inputs, outputs = {p.name for p in node.inputs}, {p.name for p in node.outputs}
     for each in connections:
@@ -52,7 +52,11 @@ def check_ends(node: Node, connections: Iterable[Connection]) -> None:
 
 
 def with_neighbours(node: Node, connections: Sequence[Connection]) -> tuple[Connection, ...]:
-    """Add a lossless connection for each port that has none: from ``sender``, to ``receiver``."""
+    """Add a lossless connection for each port that has none: from ``sender``, to ``receiver``.
+
+    Raises ``ValueError`` for a given connection that does not fit the node.
+    """
+    _check_ends(node, connections)
     taken = {c.destination_input for c in connections if c.destination_node == node.name}
     given = {c.source_output for c in connections if c.source_node == node.name}
     added = [

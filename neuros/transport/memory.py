@@ -6,6 +6,7 @@ given from outside, which is also what makes it the deterministic transport of t
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -63,6 +64,9 @@ class MemoryTransport:
         self._connections = file.connections
         self._hub = hub
         self._outside = outside
+        self._channels = {
+            c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
+        }
 
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
@@ -74,7 +78,7 @@ class MemoryTransport:
         hub = self._hub
         parcel = hub.encode(packet)
         for connection in connections:
-            hub.post(_Delivery(hub, connection, parcel))
+            self._channels[connection].send(parcel)
         self._outside.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
@@ -99,16 +103,26 @@ class MemoryTransport:
         self._outside.close()
 
 
-class _Delivery:
-    """A packet on its way."""
+class _Channel:
+    """What is on its way on one connection: the last K + N packets, as a DDS reader keeps them.
 
-    __slots__ = ("_connection", "_hub", "_parcel")
+    A sender that nobody acknowledges (BEST_EFFORT) may be faster than its receiver for ever; what
+    no longer fits is lost in transport, and the loop's queue stays short.
+    """
 
-    def __init__(self, hub: MemoryHub, connection: Connection, parcel: Any) -> None:
+    __slots__ = ("_connection", "_hub", "_parcels")
+
+    def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
         self._connection = connection
-        self._parcel = parcel
+        self._parcels: deque[Any] = deque(maxlen=connection.window)
 
-    def __call__(self) -> None:
+    def send(self, parcel: Any) -> None:
+        if len(self._parcels) < self._connection.window:
+            self._hub.post(self._deliver)  # else an event is on its way for the one that is lost
+        self._parcels.append(parcel)
+
+    def _deliver(self) -> None:
         hub, connection = self._hub, self._connection
-        hub.inboxes[connection.destination_node].on_packet(connection, hub.decode(self._parcel))
+        packet = hub.decode(self._parcels.popleft())
+        hub.inboxes[connection.destination_node].on_packet(connection, packet)

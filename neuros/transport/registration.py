@@ -95,29 +95,21 @@ class Registration:
         self._on_registered()
 
     def _has_found_peer(self) -> bool:
-        return all(
-            self._includes_peer(
-                self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name),
-                publisher.get_subscription_count(),
-                lambda other, own=publisher.qos_profile: _match(own, other),
-            )
-            for publisher in self._publishers
-        ) and all(
-            self._includes_peer(
-                self._ros_node.get_publishers_info_by_topic(subscription.topic_name),
-                subscription.get_publisher_count(),
-                lambda other, own=subscription.qos_profile: _match(other, own),
-            )
-            for subscription in self._subscriptions
+        return all(self._reaches_peer(publisher) for publisher in self._publishers) and all(
+            self._hears_peer(subscription) for subscription in self._subscriptions
         )
 
-    def _includes_peer(
-        self,
-        endpoints: Sequence[TopicEndpointInfo],
-        matched: int,
-        is_compatible: Callable[[QoSProfile], bool],
-    ) -> bool:
-        compatible = [e for e in endpoints if is_compatible(e.qos_profile)]
+    def _reaches_peer(self, publisher: Publisher) -> bool:
+        listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
+        compatible = [e for e in listed if _match(publisher.qos_profile, e.qos_profile)]
+        return self._is_among(compatible, publisher.get_subscription_count())
+
+    def _hears_peer(self, subscription: Subscription) -> bool:
+        listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
+        compatible = [e for e in listed if _match(e.qos_profile, subscription.qos_profile)]
+        return self._is_among(compatible, subscription.get_publisher_count())
+
+    def _is_among(self, compatible: Sequence[TopicEndpointInfo], matched: int) -> bool:
         return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)
 
 
@@ -127,10 +119,8 @@ def _match(publisher: QoSProfile, subscription: QoSProfile) -> bool:
     ``rclpy.qos.qos_check_compatible`` takes the "infinite" deadline that the graph reports for one
     that was asked for, and so refuses all that the graph lists.
     """
-    return (
-        subscription.reliability != QoSReliabilityPolicy.RELIABLE
-        or publisher.reliability == QoSReliabilityPolicy.RELIABLE
-    ) and (
-        subscription.durability != QoSDurabilityPolicy.TRANSIENT_LOCAL
-        or publisher.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
-    )
+    is_reliable = publisher.reliability == QoSReliabilityPolicy.RELIABLE
+    is_latched = publisher.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
+    wants_reliable = subscription.reliability == QoSReliabilityPolicy.RELIABLE
+    wants_latched = subscription.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
+    return (is_reliable or not wants_reliable) and (is_latched or not wants_latched)

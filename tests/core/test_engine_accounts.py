@@ -164,7 +164,7 @@ def test_the_whole_wall_time_is_booked_and_nothing_is_negative(events):
     for kind, wait_ms, hook_ms in events:
         bench.clock.advance(wait_ms / 1000)
         bench.hook_s = hook_ms / 1000
-        match_event = {
+        event_of = {
             "p": lambda: bench.packet(IN),
             "a": lambda: bench.engine.on_acknowledgement(free, bench.engine.outlets[free].sent),
             "t": bench.engine.on_timer,
@@ -174,7 +174,7 @@ def test_the_whole_wall_time_is_booked_and_nothing_is_negative(events):
             "e": lambda: bench.settle(1),
             "s": bench.engine.stop_hooks,
         }
-        match_event[kind]()
+        event_of[kind]()
         spent = bench.engine.accounts.totals_ns
         busy_ns = sum(hook.busy_ns for hook in bench.engine.all_hooks)
         assert all(duration_ns >= 0 for duration_ns in spent.values())

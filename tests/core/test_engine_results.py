@@ -10,13 +10,13 @@ from engine_bench import Bench, function, wire
 from neuros.errors import HookError
 from neuros.hooks import Optional
 
-IN, O, P = "a.o -> node.x", "node.o -> b.o", "node.p -> b.p"
+IN, OUT_O, OUT_P = "a.o -> node.x", "node.o -> b.o", "node.p -> b.p"
 
 
 def run(outputs, returns, types=None) -> Bench:
     bench = Bench(
         function("f", "x", outputs, returns=lambda _: returns),
-        connections=[wire(IN), wire(O), wire(P)],
+        connections=[wire(IN), wire(OUT_O), wire(OUT_P)],
         packet_types=types,
     )
     bench.packet(IN)
@@ -35,15 +35,15 @@ def failure_of(outputs, returns, types=None) -> HookError:
     ("outputs", "returns", "sent"),
     [
         (None, None, []),
-        ("o", "packet", [(O, "packet")]),
-        ("o", ("packet",), [(O, "packet")]),
-        ("o", ["packet"], [(O, "packet")]),
-        (["o", "p"], ("first", "second"), [(O, "first"), (P, "second")]),
-        (["p", "o"], ["first", "second"], [(P, "first"), (O, "second")]),
+        ("o", "packet", [(OUT_O, "packet")]),
+        ("o", ("packet",), [(OUT_O, "packet")]),
+        ("o", ["packet"], [(OUT_O, "packet")]),
+        (["o", "p"], ("first", "second"), [(OUT_O, "first"), (OUT_P, "second")]),
+        (["p", "o"], ["first", "second"], [(OUT_P, "first"), (OUT_O, "second")]),
         (Optional("o"), None, []),
         (Optional("o"), (None,), []),
         ([Optional("o"), Optional("p")], None, []),
-        ([Optional("o"), "p"], (None, "second"), [(P, "second")]),
+        ([Optional("o"), "p"], (None, "second"), [(OUT_P, "second")]),
     ],
 )
 def test_what_is_allowed(outputs, returns, sent):
@@ -74,13 +74,13 @@ def test_a_packet_of_a_wrong_type_is_an_error_that_says_what_to_do():
 
 
 def test_a_packet_of_the_right_type_passes():
-    assert run("o", 7, {"o": int}).sent == [(O, 7)]
+    assert run("o", 7, {"o": int}).sent == [(OUT_O, 7)]
 
 
 def test_nothing_is_sent_if_one_of_the_packets_is_wrong():
     bench = Bench(
         function("f", "x", ["o", "p"], returns=("fine", None)),
-        connections=[wire(IN), wire(O), wire(P)],
+        connections=[wire(IN), wire(OUT_O), wire(OUT_P)],
     )
     with pytest.raises(HookError):
         bench.packet(IN)
