@@ -51,7 +51,7 @@ class Lines:
     def send(self, kind: str, **fields: Any) -> bool:
         """Send one object; returns False if the other end is gone."""
         try:
-            self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
+            self.socket.sendall(encode_line(kind, fields))
         except OSError:
             return False
         return True
@@ -59,9 +59,19 @@ class Lines:
     def receive(self) -> list[Mapping[str, Any]] | None:
         """What has arrived, after one read; ``None`` once the other end is gone."""
         try:
-            data = self.socket.recv(1 << 16)
-        except (BlockingIOError, InterruptedError):
+            return self.receive_now()
+        except BlockingIOError:
             return []
+
+    def receive_now(self) -> list[Mapping[str, Any]] | None:
+        """As :meth:`receive`; a socket that does not block raises ``BlockingIOError`` at its end.
+
+        ``ValueError`` means that the other end does not keep to the format.
+        """
+        try:
+            data = self.socket.recv(1 << 16)
+        except BlockingIOError:
+            raise
         except OSError:
             return None
         if not data:
@@ -72,6 +82,11 @@ class Lines:
     def close(self) -> None:
         """Hang up."""
         self.socket.close()
+
+
+def encode_line(kind: str, fields: Mapping[str, Any]) -> bytes:
+    """One object as it goes through the socket."""
+    return json.dumps({"kind": kind, **fields}).encode() + b"\n"
 
 
 @contextlib.contextmanager

@@ -206,9 +206,9 @@ class Engine:
 
     @property
     def has_startable_packet(self) -> bool:
-        """Whether some hook could start now on a packet."""
+        """Whether some hook could start now on a packet of a reliable connection."""
         return not self.is_stopped and any(
-            hook.is_ready() and hook.has_packet() for hook in self._order
+            hook.has_reliable_packet() and hook.is_ready() for hook in self._order
         )
 
     @property

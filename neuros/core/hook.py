@@ -109,9 +109,9 @@ class Hook:
         freed = self._freed_outlets()
         return [outlet for outlet in self.outlets() if outlet.is_blocked and outlet not in freed]
 
-    def has_packet(self) -> bool:
-        """Whether a start would take a packet."""
-        return any(slot.has_packet() for slot in self.slots)
+    def has_reliable_packet(self) -> bool:
+        """Whether a packet that must not be lost waits for it."""
+        return any(slot.has_reliable_packet() for slot in self.slots)
 
     def set_due(self, start_ns: int, now_ns: int) -> None:
         """Set the next due time, ``start + k * period`` after now; passed ones coalesce."""

@@ -215,9 +215,11 @@ class InputSlot:
         else:
             self.missing = 0 if self._filled else 1
 
-    def has_packet(self) -> bool:
-        """Whether a start of the hook would take something from this slot."""
-        return self._filled > 0
+    def has_reliable_packet(self) -> bool:
+        """Whether a packet that must not be lost waits here."""
+        return self._filled > 0 and any(
+            mailbox.packets and mailbox.inlet.is_acknowledged for mailbox in self.mailboxes
+        )
 
     def could_be_filled_from_outside(self) -> bool:
         """Whether external topics alone could bring all that it still needs."""

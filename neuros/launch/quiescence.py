@@ -7,7 +7,7 @@ counters cannot (F. Mattern, "Algorithms for distributed termination detection",
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from neuros.project.model import Connection
@@ -15,9 +15,12 @@ from neuros.project.model import Connection
 Probes = Mapping[str, Mapping[str, Any]]
 """The newest probe by node."""
 
+Waits = Mapping[str, Mapping[str, str]]
+"""``waits[node]`` maps the nodes that it waits for to the reason."""
+
 
 def counters(probes: Probes) -> tuple[Any, ...]:
-    """All that must stay the same from one round to the next."""
+    """All that happens in a project, counted: it rests if this stays the same."""
     return tuple(
         (
             name,
@@ -37,56 +40,43 @@ def counters(probes: Probes) -> tuple[Any, ...]:
     )
 
 
-def nothing_is_under_way(probes: Probes, connections: Sequence[Connection]) -> bool:
-    """Whether every packet and acknowledgement on a reliable connection has arrived."""
-    for connection in connections:
-        if not connection.is_reliable:
-            continue
-        key = str(connection)
-        sender = probes[connection.source_node]["ledger"]["outgoing"][key]
-        receiver = probes[connection.destination_node]["ledger"]["incoming"][key]
-        if sender["sent"] != receiver["received"]:
-            return False
-        if sender["acknowledged"] != receiver["acknowledged"]:
-            return False
-    return True
+def reliable_counters(
+    probes: Probes, connections: Sequence[Connection]
+) -> tuple[tuple[int, ...], ...]:
+    """What happens on reliable connections, counted; packets that may be lost flood on."""
+    return tuple(
+        (outgoing["sent"], outgoing["acknowledged"], incoming["received"], incoming["acknowledged"])
+        for _, outgoing, incoming in _reliable(probes, connections)
+    )
+
+
+def under_way(probes: Probes, connections: Sequence[Connection]) -> list[str]:
+    """Reliable connections with a packet or an acknowledgement that has not arrived."""
+    return [
+        str(connection)
+        for connection, outgoing, incoming in _reliable(probes, connections)
+        if outgoing["sent"] != incoming["received"]
+        or outgoing["acknowledged"] != incoming["acknowledged"]
+    ]
 
 
 def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
-    """Whether no packet is under way, and none waits that some hook could start on."""
-    return nothing_is_under_way(probes, connections) and not any(
-        probe["is_startable"] or not probe["is_idle"] for probe in probes.values()
+    """Whether no reliable packet is under way, and none waits that some hook could start on."""
+    return not under_way(probes, connections) and not any(
+        probe["is_startable"] for probe in probes.values()
     )
 
 
 def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
     """Whether no node can ever run a hook again."""
-    return nothing_is_under_way(probes, connections) and all(
+    return not under_way(probes, connections) and all(
         probe["is_running"] and probe["is_idle"] and not probe["is_wakeable"]
         for probe in probes.values()
     )
 
 
-def cycle(waits: Mapping[str, Mapping[str, str]]) -> list[tuple[str, str]]:
-    """A ring of nodes that wait for each other, as ``(node, why)``; all of them if there is none.
-
-    ``waits[node]`` maps the nodes that it waits for to the reason.
-    """
-    for start in sorted(waits):
-        path: list[str] = []
-        node = start
-        while node in waits and waits[node] and node not in path:
-            path.append(node)
-            node = min(waits[node])
-        if node in path:
-            ring = path[path.index(node) :]
-            follow = [*ring[1:], ring[0]]
-            return [(a, waits[a][b]) for a, b in zip(ring, follow, strict=True)]
-    return [(node, next(iter(why.values()))) for node, why in sorted(waits.items()) if why]
-
-
 def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[str, str]]:
-    """Who waits for whom: ``waits[node][other] = reason``."""
+    """Who waits for whom, and why."""
     result: dict[str, dict[str, str]] = {name: {} for name in probes}
     for connection in connections:
         key = str(connection)
@@ -96,10 +86,48 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
         outgoing = probes[sender]["ledger"]["outgoing"][key]
         if outgoing["is_blocked"]:
             outstanding = outgoing["outstanding"]
-            result[sender][receiver] = f"is blocked on {key} ({outstanding} outstanding)"
+            result[sender][receiver] = f"is blocked on `{key}` ({outstanding} outstanding)"
         state = probes[receiver]["ledger"]["state"]
         if state["state"] == "waiting" and state["cause"] == connection.destination_input:
             result[receiver].setdefault(
-                sender, f"waits for '{connection.destination_input}' from {sender}"
+                sender, f"waits for `{connection.destination_input}` from {sender}"
             )
     return result
+
+
+def cycle(waits: Waits) -> list[tuple[str, str]]:
+    """A smallest ring of nodes that wait for each other, as ``(node, why)``; else every wait."""
+    rings = [ring for node in sorted(waits) if (ring := _ring_through(node, waits))]
+    if not rings:
+        return [(node, next(iter(why.values()))) for node, why in sorted(waits.items()) if why]
+    ring = min(rings, key=len)
+    return [(a, waits[a][b]) for a, b in zip(ring, [*ring[1:], ring[0]], strict=True)]
+
+
+def _ring_through(start: str, waits: Waits) -> list[str]:
+    """The shortest way from a node back to itself (breadth first); empty if there is none."""
+    paths = [[start]]
+    seen: set[str] = set()
+    while paths:
+        longer = []
+        for path in paths:
+            for node in sorted(waits.get(path[-1], ())):
+                if node == start:
+                    return path
+                if node not in seen:
+                    seen.add(node)
+                    longer.append([*path, node])
+        paths = longer
+    return []
+
+
+def _reliable(
+    probes: Probes, connections: Sequence[Connection]
+) -> Iterator[tuple[Connection, Mapping[str, Any], Mapping[str, Any]]]:
+    """Both ends' books of every reliable connection between nodes that were probed."""
+    for connection in connections:
+        sender = probes.get(connection.source_node)
+        receiver = probes.get(connection.destination_node)
+        if connection.is_reliable and sender and receiver:
+            key = str(connection)
+            yield connection, sender["ledger"]["outgoing"][key], receiver["ledger"]["incoming"][key]

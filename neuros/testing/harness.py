@@ -1,4 +1,4 @@
-"""``PluginHarness``: one plugin on the real engine; the test is everybody else."""
+"""``PluginHarness``: one plugin on the real engine, where the test is everybody else."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ class PluginHarness:
         self._topics = Topics()
         file = NodeFile(node, connections, Folders(project, workspace, folder))
         bench = Workbench(self._loop, self._topics, self.log)
-        self._ends = Neighbours(file, bench.hub, self._topics)
+        self._ends = Neighbours(file, bench.hub)
         self._stage = Stage()
         self._stage.hide_from_nodes(project)
         (folder / node.name).mkdir(parents=True, exist_ok=True)
@@ -271,10 +271,10 @@ class PluginHarness:
         self._raise_failure()
         ran = self._executions() - before
         if executions is None and ran >= _MANY:
-            names = ", ".join(hook.name for hook in self._engine.hooks() if hook.is_ready())
+            last = self._engine.hooks()[-1].name  # they are in the order of their execution
             raise NodeError(
-                f"{ran} hooks have run and there is no end of it ({names}): a hook that requires"
-                " no input runs without pause; use run(executions=...), or block an output"
+                f"hooks have run {ran} times with no end, the last of them '{last}': one that"
+                " requires no input runs without pause; use run(executions=...), or block an output"
             )
         return ran
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from neuros.core.flow import Outlet
-from neuros.project.model import Connection, Folders, Node, NodeFile, Port
-from neuros.testing.stand_ins import Topics
-from neuros.transport.memory import MemoryHub, MemoryTransport
+from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.memory import MemoryHub
 from neuros.transport.messages import decode, encode
 
 
@@ -21,7 +20,7 @@ class Neighbours:
     What it sends they start on at once, and so acknowledge, unless they are busy.
     """
 
-    def __init__(self, file: NodeFile, hub: MemoryHub, topics: Topics) -> None:
+    def __init__(self, file: NodeFile, hub: MemoryHub) -> None:
         name = file.node.name
         self.incoming = [c for c in file.connections if c.destination_node == name != c.source_node]
         self.outgoing = [c for c in file.connections if c.source_node == name != c.destination_node]
@@ -30,8 +29,7 @@ class Neighbours:
         self.received: dict[Connection, list[Any]] = {c: [] for c in self.outgoing}
         self._started: dict[Connection, int] = dict.fromkeys(self.outgoing, 0)
         self.busy: set[Connection] = set()
-        everybody = NodeFile(Node("", "", Path()), (), Folders(Path(), Path(), Path()))
-        self._transport = MemoryTransport(everybody, hub, topics)
+        self._hub = hub
         ends = [c.source_node for c in self.incoming] + [c.destination_node for c in self.outgoing]
         for end in dict.fromkeys(ends):
             hub.join(end, self, [c for c in self.incoming if c.source_node == end])
@@ -53,7 +51,8 @@ class Neighbours:
         if position > started:
             self._started[connection] = position
             if connection.is_reliable:
-                self._transport.acknowledge(connection, position)
+                node = self._hub.inboxes[connection.source_node]
+                self._hub.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
 
@@ -78,4 +77,5 @@ class Neighbours:
         outlet, waiting = self._outlets[connection], self._waiting[connection]
         while waiting and not outlet.is_blocked:
             outlet.spend()
-            self._transport.send([connection], waiting.popleft())
+            node = self._hub.inboxes[connection.destination_node]
+            self._hub.post(partial(node.on_packet, connection, waiting.popleft()))

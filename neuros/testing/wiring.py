@@ -9,6 +9,7 @@ from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node, Port
 
 SENDER, RECEIVER, OBSERVER = "sender", "receiver", "observer"
+_MANY = 1_000_000
 
 
 def wire(text: str, discard_limit: int | None = None, queue_size: int = 1) -> Connection:
@@ -79,7 +80,7 @@ def with_observer(node: Node, connections: Sequence[Connection]) -> tuple[Connec
         if c.source_node == node.name and c.destination_node != node.name
     }
     added = [
-        Connection(node.name, port.name, OBSERVER, port.name)
+        Connection(node.name, port.name, OBSERVER, port.name, queue_size=_MANY)
         for port in node.outputs
         if port.name not in seen and port.external_topic is None
     ]

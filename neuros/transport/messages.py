@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from functools import cache
 from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.type_support import check_for_type_support
 
 from neuros.errors import EnvironmentFault
 
@@ -27,6 +29,10 @@ def message_class(type_name: str) -> type:
             " installed in this node's container?"
         ) from error
     assert isinstance(found, type)
+    with warnings.catch_warnings():
+        # What ROS loads for its first message uses a module that Python calls deprecated.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        check_for_type_support(found)
     return found
 
 
