@@ -38,6 +38,8 @@ def is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(package + ".")
 
 
+SUPERVISOR = ("supervisor", "channels", "probing", "quiescence", "watch")
+
 # The first room that holds a module is its room.
 ROOMS = (
     Room(0, ("errors",)),
@@ -45,7 +47,7 @@ ROOMS = (
     Room(1, ("project",)),
     Room(2, ("core",)),
     Room(3, ("ports", "control")),
-    Room(5, ("launch.supervisor", "launch.quiescence", "launch.watch")),
+    Room(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
     Room(4, ("launch",)),
     Room(4, ("transport",)),
     Room(4, ("simulators",)),

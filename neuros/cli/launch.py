@@ -10,26 +10,32 @@ import secrets
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+from neuros.cli.console import Console
 from neuros.cli.projects import WORKSPACE, load
 from neuros.control import SOCKET_NAME
-from neuros.errors import Problem, ProjectError, UsageError
-from neuros.launch.console import LogTail, format_record, wants_colours
+from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.outcome import Outcome
 from neuros.launch.process import ProcessLauncher
-from neuros.launch.supervisor import Outcome, Supervisor
+from neuros.launch.supervisor import Supervisor
 from neuros.observe.report import run_record, run_table
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_to_json, project_to_json, split
 from neuros.project.validate import nest_conflicts
+
+_ENDED_BY_SIGNAL = (130, 143)
+_PATIENCE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,8 @@ def launch(options: argparse.Namespace) -> int:
         backend = choose_backend(options.backend)
         names = _chosen_names(project, options.node, backend)
         _check(project, names, backend, duration)
+        if not options.dry_run:
+            _check_machine()
         is_partial = len(names) < len(project.nodes)
         with ExitStack() as stack:
             domain = stack.enter_context(
@@ -59,8 +67,10 @@ def launch(options: argparse.Namespace) -> int:
                 return _dry_run(project, names, backend, duration, domain, options)
             run_folder = make_run_folder(options.output, project.name)
             files = _write_node_files(project, names, run_folder)
-            run = _Run(project, files, backend, duration, domain, run_folder, is_partial, options)
-            return run.execute(signals)
+            run = _Run(
+                project, files, backend, duration, domain, run_folder, is_partial, options, signals
+            )
+            return run.execute()
 
 
 class _Run:
@@ -76,6 +86,7 @@ class _Run:
         run_folder: Path,
         is_partial: bool,
         options: argparse.Namespace,
+        signals: list[int],
     ) -> None:
         self._project = project
         self._files = files
@@ -89,42 +100,53 @@ class _Run:
         logs = {file.node.name: run_folder / file.node.name / "node.log" for file in files}
         if backend == "in-process":
             logs["host"] = run_folder / "host.log"
-        self._console = Console(logs)
+        self._signals = signals
+        self._console = Console(logs, lambda: bool(signals))
 
-    def execute(self, signals: list[int]) -> int:
+    def execute(self) -> int:
         """Start, supervise, clean up, report."""
-        started = time.time()
-        started_s = time.monotonic()
+        started, started_s = time.time(), time.monotonic()
         guardian = Guardian.start(self._run_id, self._domain)
         guardian.remove_later(self._run_folder / SOCKET_NAME)
-        outcome = Outcome(exit_code=1, reason="the launcher failed")
+        outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self._run_folder}")
-            supervisor = Supervisor(
-                self._files,
-                make_launcher(self._backend, self._duration, self._options.verbose, guardian.watch),
-                self._environment(),
-                self._run_folder,
-                self._console,
-                signals,
-                duration_s=self._duration.wall_s,
-                is_partial=self._is_partial,
-            )
+            supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
             supervisor.run()
         finally:
             guardian.finish()
-            self._console.drain()
+            # Whoever has ended the run is not made to wait for a reader that does not read.
+            self._console.finish(_PATIENCE_S if outcome.exit_code in _ENDED_BY_SIGNAL else None)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._project, self._files, outcome, wall_s)
             record |= {"backend": self._backend, "domain_id": self._domain.id, "started": started}
-            (self._run_folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
+            self._write_record(record)
         self._console.write("\n" + run_table(record) + "\n")
-        severity = "INFO" if outcome.exit_code in (0, 130, 143) else "ERROR"
-        for reason in outcome.failures[1:]:
-            self._console.log("ERROR", reason)
-        self._console.log(severity, outcome.reason)
+        for reason in outcome.failures:
+            if reason != outcome.reason:
+                self._console.log("ERROR", reason)
+        is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
+        self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return outcome.exit_code
+
+    def _supervisor(self, guardian: Guardian) -> Supervisor:
+        return Supervisor(
+            self._files,
+            make_launcher(self._backend, self._duration, self._options.verbose, guardian.watch),
+            self._environment(),
+            self._run_folder,
+            self._console,
+            self._signals,
+            duration_s=self._duration.wall_s,
+            is_partial=self._is_partial,
+        )
+
+    def _write_record(self, record: Mapping[str, Any]) -> None:
+        try:
+            (self._run_folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
+        except OSError as error:
+            self._console.log("ERROR", f"run.json cannot be written: {error.strerror}")
 
     def _environment(self) -> dict[str, str]:
         return {
@@ -135,35 +157,6 @@ class _Run:
             ),
             "ROS_LOG_DIR": str(self._run_folder),
         }
-
-
-class Console:
-    """What the user sees: the launcher's own records and the lines that nodes log."""
-
-    def __init__(self, logs: dict[str, Path]) -> None:
-        self._colours = wants_colours(sys.stdout, os.environ)
-        self._tail = LogTail(logs, self.write, self._colours)
-
-    def write(self, text: str) -> None:
-        """Write as it is; a reader that has gone is no reason to lose the run."""
-        try:
-            sys.stdout.write(text)
-            sys.stdout.flush()
-        except BrokenPipeError:
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - it lives as long as the process
-
-    def log(self, severity: str, text: str) -> None:
-        """Write a record of the launcher itself, after what nodes have logged so far."""
-        self.poll()
-        self.write(format_record(severity, "neuros", text) + "\n")
-
-    def poll(self) -> object:
-        """Show what nodes have logged since."""
-        return self._tail.poll()
-
-    def drain(self) -> None:
-        """Show the rest."""
-        self._tail.drain()
 
 
 def parse_duration(text: str | None) -> Duration:
@@ -222,20 +215,31 @@ def make_run_folder(output: str | None, project_name: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=output is not None)
     except OSError as error:
-        raise UsageError(f"run folder {folder}: {error.strerror}") from error
+        raise UsageError(
+            f"the run folder {folder} cannot be made ({error.strerror}): name one with -o"
+        ) from error
     return folder
 
 
 def _write_node_files(project: Project, names: Sequence[str], run_folder: Path) -> list[NodeFile]:
     folders = Folders(project.folder, WORKSPACE, run_folder)
     files = [file for file in split(project, lambda _: folders) if file.node.name in names]
-    for file in files:
-        folder = run_folder / file.node.name
-        folder.mkdir(exist_ok=True)
-        text = json.dumps(node_file_to_json(file), indent=2) + "\n"
-        (folder / "node.json").write_text(text)
-    expanded = json.dumps(project_to_json(project), indent=2) + "\n"
-    (run_folder / "project.json").write_text(expanded)
+    try:
+        # Two runs that were given the same empty folder: only one of them gets it.
+        with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
+            expanded.write(json.dumps(project_to_json(project), indent=2) + "\n")
+        for file in files:
+            (run_folder / file.node.name).mkdir(exist_ok=True)
+            text = json.dumps(node_file_to_json(file), indent=2) + "\n"
+            (run_folder / file.node.name / "node.json").write_text(text, "utf-8")
+    except FileExistsError as error:
+        raise UsageError(
+            f"{run_folder}: another run has just begun there; name a new one"
+        ) from error
+    except OSError as error:
+        raise UsageError(
+            f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
+        ) from error
     return files
 
 
@@ -278,6 +282,14 @@ def _check(project: Project, names: Sequence[str], backend: str, duration: Durat
         raise ProjectError(problems)
 
 
+def _check_machine() -> None:
+    if find_spec("rclpy") is None:
+        raise EnvironmentFault(
+            f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
+            " install.py"
+        )
+
+
 def _needs_known_domain(project: Project, is_partial: bool) -> bool:
     ports = (port for node in project.nodes for port in (*node.inputs, *node.outputs))
     return is_partial or any(port.external_topic is not None for port in ports)
@@ -304,7 +316,9 @@ def _dry_run(
 def _signals_noted() -> Iterator[list[int]]:
     """Collect SIGINT and SIGTERM instead of dying of them, until the run is cleaned up."""
     noted: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else nohup wants it to go on
+        numbers.append(signal.SIGHUP)
     previous = {
         number: signal.signal(number, lambda number, _: noted.append(number)) for number in numbers
     }

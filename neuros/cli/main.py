@@ -7,7 +7,7 @@
 3   invalid project
 4   something is missing on this machine (package, engine, image)
 130 ended by Ctrl+C
-143 ended by SIGTERM
+143 ended by SIGTERM, or because the terminal was closed
 === ===========================================================
 
 Heavy imports are late: ``neuros --help`` must not wait for them.
@@ -16,13 +16,15 @@ Heavy imports are late: ``neuros --help`` must not wait for them.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import sys
 from collections.abc import Sequence
 
 from neuros import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
-EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT = 1, 2, 3, 4
+EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
 _EXIT_CODES = """\
 exit codes:
@@ -32,7 +34,7 @@ exit codes:
   3    invalid project: every problem is listed with its file and line
   4    something is missing on this machine
   130  ended by Ctrl+C (a second one kills at once)
-  143  ended by SIGTERM
+  143  ended by SIGTERM, or because the terminal was closed
 """
 
 
@@ -43,9 +45,13 @@ def console_script() -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command; returns its exit code. Errors are written for the user."""
+    _open_standard_streams()
     options = parser().parse_args(arguments)
     try:
-        return int(options.command(options))
+        code = int(options.command(options))
+        if sys.stdout is not None:
+            sys.stdout.flush()  # so that a reader that has gone is noticed here
+        return code
     except ProjectError as error:
         _complain(str(error))
         count = len(error.problems)
@@ -61,7 +67,11 @@ def main(arguments: Sequence[str]) -> int:
         _complain(f"neuros: {error}")
         return EXIT_NODE
     except KeyboardInterrupt:
-        return 130
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # As in `neuros graph PROJECT | head`: Python must not try again to write, when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -215,4 +225,14 @@ def _node(options: argparse.Namespace) -> int:
 
 
 def _complain(text: str) -> None:
-    print(text, file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody reads it
+        print(text, file=sys.stderr)
+
+
+def _open_standard_streams() -> None:
+    """Where one of the three was closed, its number would go to the next file that is opened."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from neuros.runtime.process import NodeProcess
 
 def run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
+    faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log
     files = [node_file_from_json(json.loads(Path(p).read_text())) for p in options.node_files]
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)

@@ -24,6 +24,7 @@ class Watch:
     """
 
     def __init__(self, names: Sequence[str], now_s: float) -> None:
+        self._names = tuple(names)
         self._silent = set(names)
         self._reports: dict[str, Mapping[str, Any]] = {}
         self._heard_s: dict[str, float] = {}
@@ -53,10 +54,19 @@ class Watch:
             self._moved_s = now_s
             self._has_explained = False
 
+    def is_greeted(self, name: str) -> bool:
+        """Whether the process of a node has said hello."""
+        return name not in self._silent
+
     def is_loaded(self, name: str) -> bool:
         """Whether a node has come as far as having an engine that may run hooks."""
         report = self._reports.get(name)
         return report is not None and report["ledger"] is not None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all nodes have been loaded."""
+        return not self._silent and all(map(self.is_loaded, self._names))
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
@@ -71,7 +81,7 @@ class Watch:
         """
         if self._has_explained or now_s - self._moved_s < STALL_S:
             return False
-        if self._silent or not all(map(self.is_loaded, self._reports)) or self._waiting():
+        if not self.is_complete or self._waiting():
             return False
         self._has_explained = True
         return True

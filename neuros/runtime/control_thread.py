@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import selectors
+import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from neuros.control import Lines
@@ -28,7 +30,8 @@ class Controlled(Protocol):
 class ControlThread(threading.Thread):
     """Reports once per second and passes on what the supervisor asks for.
 
-    A supervisor that has gone, and a signal, both mean: stop.
+    A supervisor that has gone, and a signal, both mean: stop. What fails here (a simulator whose
+    time cannot be read, say) fails again in the loop, which knows what to do about it.
     """
 
     def __init__(self, lines: Lines, signalled: socket.socket, process: Controlled) -> None:
@@ -51,8 +54,8 @@ class ControlThread(threading.Thread):
                     elif not self._on_lines():
                         return
                 if time.monotonic() >= next_report_s:
-                    next_report_s += REPORT_S
-                    self._process.report()
+                    next_report_s = time.monotonic() + REPORT_S
+                    self._try(self._process.report)
 
     def end(self) -> None:
         """Report no more."""
@@ -84,4 +87,31 @@ class ControlThread(threading.Thread):
             number = int(message["number"])
             process.post(lambda: process.probe(number))
         elif kind == "explain":
-            process.explain()
+            self._try(process.explain)
+
+    def _try(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception as error:
+            self._process.post(lambda error=error: _raise(error))  # type: ignore[misc]
+
+
+def _raise(error: Exception) -> None:
+    raise error
+
+
+@contextlib.contextmanager
+def signals_as_socket() -> Iterator[socket.socket]:
+    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    reader.setblocking(False)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    try:
+        yield reader
+    finally:
+        signal.set_wakeup_fd(previous)
+        reader.close()
+        writer.close()

@@ -123,7 +123,10 @@ class NodeRuntime:
                 if spec.kind is HookKind.FINALISE:
                     self._guard(lambda spec=spec: self._run_spec(spec, ()))  # type: ignore[misc]
         for close in reversed(self._closers):
-            self._guard(close)
+            try:
+                close()
+            except BaseException as error:  # the others must be closed all the same
+                self._fail(self.name, _failed_to_close(error))
 
     # ------------------------------------------------------------------ inbox
 
@@ -312,6 +315,8 @@ class NodeRuntime:
     def _note_clock(self, packet: Any) -> None:
         seconds = packet.clock.sec + packet.clock.nanosec * 1e-9
         self._read_time_s = lambda: seconds
+        if self._duration_sim_s is not None:
+            self._check_duration()
 
     def _check_duration(self) -> None:
         time_s = self.sim_time
@@ -328,3 +333,9 @@ class NodeRuntime:
                 f"no hook takes input '{inlet.input_name}': packets on {inlet.name} are"
                 " acknowledged on arrival and dropped"
             )
+
+
+def _failed_to_close(error: BaseException) -> NodeError:
+    wrapped = NodeError(f"failed while it was closed: {describe(error)}")
+    wrapped.__cause__ = error
+    return wrapped

@@ -44,15 +44,22 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
 
 
 def describe(error: BaseException) -> str:
-    """An exception in one line."""
-    return "".join(traceback.format_exception_only(type(error), error)).strip().splitlines()[-1]
+    """An exception in one line: its type, and the first line of its text."""
+    lines = "".join(traceback.format_exception_only(type(error), error)).splitlines()
+    # A syntax error shows the place first, indented.
+    return next(line for line in lines if line and not line.startswith(" ")).strip()
 
 
 def plugin_traceback(error: BaseException, plugin: Path) -> str:
-    """The traceback from the first frame inside the plugin on; all of it if there is none."""
-    frames = traceback.extract_tb(error.__traceback__)
-    first = next((i for i, frame in enumerate(frames) if frame.filename == str(plugin)), 0)
-    lines = traceback.format_list(frames[first:])
-    return "Traceback (most recent call last):\n" + "".join(
-        lines + traceback.format_exception_only(type(error), error)
-    )
+    """The traceback from the first frame inside the plugin on; all of it if there is none.
+
+    The errors that led to this one are shown before it, as Python does.
+    """
+    shown = traceback.TracebackException.from_exception(error)
+    each: traceback.TracebackException | None = shown
+    while each is not None:
+        names = [frame.filename for frame in each.stack]
+        if str(plugin) in names:
+            del each.stack[: names.index(str(plugin))]
+        each = each.__cause__ or each.__context__
+    return "".join(shown.format())

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
-import socket
+import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,13 @@ from neuros.control import Lines, connect
 from neuros.errors import NeurosError, NodeError
 from neuros.ports import Middleware
 from neuros.project.model import NodeFile
-from neuros.runtime.control_thread import ControlThread
+from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.plugin import plugin_traceback
+from neuros.runtime.plugin import describe, plugin_traceback
 from neuros.runtime.scope import Stage
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
+Event = Callable[[], None]
 
 
 class NodeProcess:
@@ -49,6 +49,8 @@ class NodeProcess:
         self._stage = Stage()
         self._nodes: list[NodeRuntime] = []
         self._middleware: Middleware | None = None
+        self._early_events: list[Event] = []
+        self._early_lock = threading.Lock()
         self._has_failed = False
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
@@ -60,15 +62,15 @@ class NodeProcess:
         os.chdir(run_folder)
         self._lines = connect(run_folder)
         self._tell("hello", nodes=[file.node.name for file in self._files], pid=os.getpid())
-        with _signals() as signalled:
+        with signals_as_socket() as signalled:
             thread = ControlThread(self._lines, signalled, self)
             thread.start()
-            self._live()
+            self._guard(self._live)
             for node in self._nodes:
-                node.finalise()
-            self.report(is_final=True)
+                self._guard(node.finalise)
+            self._guard(lambda: self.report(is_final=True))
             if self._middleware is not None:
-                self._middleware.close()
+                self._guard(self._middleware.close)
             thread.end()
         return 1 if self._has_failed else 0
 
@@ -77,15 +79,18 @@ class NodeProcess:
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
         self._stop_asked.set()
-        for node in self._nodes:
+        for node in tuple(self._nodes):
             node.stop()
         if self._middleware is not None:
             self._middleware.loop.stop()
 
-    def post(self, event: Callable[[], None]) -> None:
-        """Have an event handled by the loop. Any thread."""
-        if self._middleware is not None:
-            self._middleware.loop.post_from_thread(event)
+    def post(self, event: Event) -> None:
+        """Have an event handled by the loop, as soon as there is one. Any thread."""
+        with self._early_lock:
+            if self._middleware is None:
+                self._early_events.append(event)
+                return
+        self._middleware.loop.post_from_thread(event)
 
     def drain(self) -> None:
         """Stop the hooks that send unasked. Loop thread only."""
@@ -97,7 +102,10 @@ class NodeProcess:
         assert self._middleware is not None
         is_idle = not self._middleware.loop.has_waiting_events
         for node in self._nodes:
-            self._tell("report", **node.probe(), probe=number, is_idle=is_idle)
+            fields = node.probe()
+            # A thread of a plugin may submit packets, or end the project, at any time.
+            fields["is_wakeable"] = fields["is_wakeable"] or _has_other_threads()
+            self._tell("report", **fields, probe=number, is_idle=is_idle)
 
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
@@ -105,31 +113,49 @@ class NodeProcess:
             self._tell("report", **node.report(), is_final=is_final)
 
     def explain(self) -> None:
-        """Report why nothing moves. Any thread."""
+        """Report why nothing moves, but for nodes whose hook runs. Any thread."""
         for node in tuple(self._nodes):
-            self._tell("explanation", node=node.name, lines=node.explain())
+            if node.engine is None or node.engine.executing is None:
+                self._tell("explanation", node=node.name, lines=node.explain())
 
     # ------------------------------------------------------------------ inside
 
     def _live(self) -> None:
-        try:
-            self._middleware = self._make_middleware(self._files, self._fail_outside_hooks)
-            for file in self._files:
-                self._add(file)
-            for node in self._nodes:
-                if not (self._stop_asked.is_set() or self._has_failed):
-                    node.load()
-        except NeurosError as error:
-            name = self._nodes[-1].name if self._nodes else self._files[0].node.name
-            failing = next((node for node in self._nodes if node.engine is None), None)
-            self._fail(failing.name if failing else name, error)
-        if self._stop_asked.is_set() or self._has_failed:
+        self._open_middleware()
+        assert self._middleware is not None
+        for file in self._files:
+            self._add(file)
+        for node in self._nodes:
+            if self._is_ending:
+                return
+            try:
+                node.load()
+            except NeurosError as error:
+                self._fail(node.name, error)
+        if self._is_ending:
             return
         self.report()
-        assert self._middleware is not None
         for node in self._nodes:
             self._middleware.loop.post(node.start)
         self._middleware.loop.run()
+
+    def _open_middleware(self) -> None:
+        middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+        with self._early_lock:
+            self._middleware = middleware
+            for event in self._early_events:
+                middleware.loop.post_from_thread(event)
+
+    @property
+    def _is_ending(self) -> bool:
+        return self._stop_asked.is_set() or self._has_failed
+
+    def _guard(self, action: Event) -> None:
+        """A failure anywhere must not keep the others from finalising."""
+        try:
+            action()
+        except BaseException as error:
+            self._fail_outside_hooks(error)
 
     def _add(self, file: NodeFile) -> None:
         assert self._middleware is not None
@@ -155,6 +181,8 @@ class NodeProcess:
         node = next((node for node in self._nodes if node.name == name), None)
         if node is not None:
             node.log_failure(error)
+        else:  # there is no logger yet
+            traceback.print_exception(error, file=sys.stderr)
         self._tell(
             "failed",
             node=name,
@@ -166,17 +194,23 @@ class NodeProcess:
 
     def _fail_outside_hooks(self, error: BaseException) -> None:
         """A callback that a plugin registered with ROS has failed, or NeuROS itself."""
-        if len(self._nodes) == 1:
-            node = self._nodes[0]
-        else:
-            files = {str(n.file.node.plugin): n for n in self._nodes}
-            node = next(
-                (files[name] for name in _filenames(error) if name in files), self._nodes[0]
-            )
-        wrapped = NodeError(
-            "failed outside its hooks:\n" + plugin_traceback(error, node.file.node.plugin)
-        )
-        self._fail(node.name, wrapped)
+        if not self._nodes:
+            self._fail(self._files[0].node.name, _as_neuros_error(error))
+            return
+        files = {str(node.file.node.plugin): node for node in self._nodes}
+        node = next((files[name] for name in _filenames(error) if name in files), self._nodes[0])
+        if not isinstance(error, NeurosError):
+            text = plugin_traceback(error, node.file.node.plugin)
+            error = NodeError(f"failed outside its hooks: {describe(error)}\n{text}")
+        self._fail(node.name, error)
+
+
+def _as_neuros_error(error: BaseException) -> NeurosError:
+    if isinstance(error, NeurosError):
+        return error
+    wrapped = NodeError(describe(error))
+    wrapped.__cause__ = error
+    return wrapped
 
 
 def _filenames(error: BaseException) -> Iterator[str]:
@@ -186,22 +220,14 @@ def _filenames(error: BaseException) -> Iterator[str]:
         trace = trace.tb_next
 
 
+def _has_other_threads() -> bool:
+    """Whether there are threads besides the loop's and NeuROS's own."""
+    own = (threading.main_thread(), threading.current_thread())
+    return any(
+        thread not in own and not isinstance(thread, ControlThread)
+        for thread in threading.enumerate()
+    )
+
+
 def _log_file(file: NodeFile) -> Path:
     return file.folders.run / file.node.name / "node.log"
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[socket.socket]:
-    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++."""
-    reader, writer = socket.socketpair()
-    writer.setblocking(False)
-    reader.setblocking(False)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: None)
-    previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    try:
-        yield reader
-    finally:
-        signal.set_wakeup_fd(previous)
-        reader.close()
-        writer.close()

@@ -51,9 +51,13 @@ class MemoryHub:
                 self._waiting.remove(connection)
                 self._register(connection)
 
+    def leave(self, name: str) -> None:
+        """Let what is under way to a node go nowhere."""
+        if name in self.inboxes:
+            self.inboxes[name] = _Nobody()
+
     def _register(self, connection: Connection) -> None:
-        sender = self.inboxes[connection.source_node]
-        self.post(lambda: sender.on_registered(connection))
+        self.post(lambda: self.inboxes[connection.source_node].on_registered(connection))
 
 
 class MemoryTransport:
@@ -64,17 +68,21 @@ class MemoryTransport:
         self._connections = file.connections
         self._hub = hub
         self._outside = outside
+        self._is_open = False
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
         }
 
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
+        self._is_open = True
         self._outside.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         """Hand a packet over; each receiver gets its own copy."""
+        if not self._is_open:
+            return
         hub = self._hub
         parcel = hub.encode(packet)
         for connection in connections:
@@ -87,20 +95,38 @@ class MemoryTransport:
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
-        sender = self._hub.inboxes[connection.source_node]
-        self._hub.post(lambda: sender.on_acknowledgement(connection, position))
+        if not self._is_open:
+            return
+        inboxes, sender = self._hub.inboxes, connection.source_node
+        self._hub.post(lambda: inboxes[sender].on_acknowledgement(connection, position))
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose receiver has not joined yet."""
-        return [c for c in self._connections if c.destination_node not in self._hub.inboxes]
+        """Connections whose other end has not joined yet."""
+        joined = self._hub.inboxes
+        return [
+            c
+            for c in self._connections
+            if c.source_node not in joined or c.destination_node not in joined
+        ]
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""
         return self._outside.make_packet(type_name)
 
     def close(self) -> None:
-        """Give up what lies outside."""
+        """Send and receive nothing any more."""
+        self._is_open = False
+        self._hub.leave(self._name)
         self._outside.close()
+
+
+class _Nobody:
+    """Takes the place of a node that has left."""
+
+    def on_packet(self, connection: Connection, packet: Any) -> None: ...
+    def on_external_packet(self, port: Port, packet: Any) -> None: ...
+    def on_acknowledgement(self, connection: Connection, position: int) -> None: ...
+    def on_registered(self, connection: Connection) -> None: ...
 
 
 class _Channel:

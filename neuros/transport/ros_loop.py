@@ -115,10 +115,16 @@ class RosLoop:
         """End :meth:`run` after the current event. Any thread."""
         self._is_stopping = True
         self._waker.wake(None)
+        # The executor gets hold of the waker only when it spins for the first time; a stop a moment
+        # before that is heard by this.
+        self._executor.create_task(self._wake)
 
     def close(self) -> None:
         """Give up the executor."""
         self._executor.shutdown(0)
+
+    def _wake(self) -> None:
+        self._waker.wake(None)
 
     def _post_pump(self) -> None:
         self._has_posted_pump = True

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import mujoco
 import pytest
+from jsonschema import Draft202012Validator
 from simulated_node import WORLD, SimulatedNode, imu
 
 from neuros.errors import ModelError
+from neuros.project.model import Node, Port
+from neuros.project.validate import schema
 from neuros.simulators.mujoco import MuJoCo
+from neuros.simulators.mujoco.declarations import SENSOR_KINDS, Problems, read_sensors
 
 IMU, CLOCK = "sensor_msgs/msg/Imu", "rosgraph_msgs/msg/Clock"
 STRING, FLOAT = "std_msgs/msg/String", "std_msgs/msg/Float64"
@@ -102,6 +106,34 @@ def test_faulty_actuators(type_, keys, says):
     (problem,) = problems_of(inputs={"go": (type_, keys)})
     assert problem.startswith("/nowhere/robot.json: /inputs/0/mujoco")
     assert says in problem
+
+
+def declarations():
+    """Every kind of sensor with every message type, with no element, one, and a list."""
+    for kind, sensor in SENSOR_KINDS.items():
+        for type_ in sensor.types:
+            for element in ({}, {"element": "box"}, {"element": ["box", "arm"]}):
+                yield type_, {"sensor": kind, "rate": 50, **element}
+                yield type_, {"sensor": kind, "rate": 50, **element, "width": 64, "height": 48}
+
+
+def is_accepted(type_, keys):
+    problems = Problems("robot.json")
+    port = Port("out", type_, mujoco=keys)
+    node = Node("robot", "neuros_mujoco", SimulatedNode().description.plugin, outputs=(port,))
+    return bool(read_sensors(node, problems))
+
+
+@pytest.mark.parametrize("kind", SENSOR_KINDS)
+def test_the_schema_takes_what_the_simulator_takes_for_some_type(kind):
+    validator = Draft202012Validator(schema("node")["$defs"]["mujoco_sensor"])
+    verdicts = {}
+    for type_, keys in declarations():
+        if keys["sensor"] == kind:
+            verdict = verdicts.setdefault(str(keys), [keys, False])
+            verdict[1] |= is_accepted(type_, keys)
+    for keys, is_taken in verdicts.values():
+        assert validator.is_valid(keys) == is_taken, keys
 
 
 def test_all_problems_come_at_once():

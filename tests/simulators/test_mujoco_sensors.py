@@ -59,6 +59,23 @@ def test_on_a_turntable_a_gyroscope_measures_the_rate_and_the_accelerometer_the_
     assert felt == pytest.approx([-(rate**2) * 0.5, G, 0], abs=1e-2)
 
 
+@pytest.mark.parametrize("element", ["hub", "hub_site"])
+def test_in_a_model_without_any_sensor_a_gyroscope_is_not_silent(element):
+    """MuJoCo leaves out what no sensor of the model asks for; the declared one is not in it."""
+    model = """<mujoco><option timestep="0.002"/><worldbody><body name="hub">
+               <joint name="spin" axis="0 0 1"/><geom size=".1"/><site name="hub_site"/>
+               </body></worldbody></mujoco>"""
+    sim = MuJoCo(SimulatedNode({"imu": imu(element)}), model)
+    assert sim.model.nsensor == 0
+    with sim.paused():
+        sim.data.joint("spin").qvel[0] = 1.25
+    for _ in range(3):
+        sim.step_to_next()
+        packet = sim.read("imu")
+        assert vector(packet.angular_velocity) == pytest.approx([0, 0, 1.25])
+        assert vector(packet.linear_acceleration) == pytest.approx([0, 0, G])
+
+
 def test_values_are_those_of_mujocos_own_sensors_bit_for_bit():
     spec = mujoco.MjSpec.from_string(WORLD)
     reference = mujoco.MjSpec.from_string(WORLD)

@@ -1,0 +1,52 @@
+"""What the user sees of a run: the launcher's own records, and the lines that nodes log."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from neuros.launch.console import LAYOUT, LogTail, format_record, wants_colours
+from neuros.launch.screen import Screen
+
+
+class Console:
+    """Standard output of the launcher; nothing here waits for a reader but :meth:`finish`.
+
+    Args:
+        logs: the log files to show, by name.
+        is_enough: whether the user wants no more of it (asked while it waits).
+    """
+
+    def __init__(self, logs: Mapping[str, Path], is_enough: Callable[[], bool]) -> None:
+        self._screen = Screen(sys.stdout)
+        self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
+        colours = sys.stdout is not None and wants_colours(sys.stdout, os.environ)
+        self._tail = LogTail(logs, self.write, colours)
+        self._is_enough = is_enough
+        self._is_finishing = False
+        self._patience_s: float | None = None
+
+    def write(self, text: str) -> None:
+        """Write as it is."""
+        self._screen.write(text)
+        if self._is_finishing:
+            self._screen.finish(self._is_enough, self._patience_s)
+
+    def log(self, severity: str, text: str) -> None:
+        """Write a record of the launcher itself, after what nodes have logged so far."""
+        self.poll()
+        self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
+
+    def poll(self) -> object:
+        """Show what nodes have logged since; it stays in their files while the reader is behind."""
+        self._screen.flush()
+        return None if self._screen.is_behind or self._is_finishing else self._tail.poll()
+
+    def finish(self, patience_s: float | None) -> None:
+        """Show the rest; from now on wait for the reader, or lose ``patience_s`` seconds."""
+        self._is_finishing = True
+        self._patience_s = patience_s
+        self.write("")
+        self._tail.drain()

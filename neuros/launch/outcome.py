@@ -1,0 +1,53 @@
+"""How a run ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass
+class Outcome:
+    """How a run ended, and what its nodes said last.
+
+    Attributes:
+        exit_code: 0 ended normally, 1 a node failed or deadlock, 130 and 143 by signal.
+        reason: one line for the user.
+        reports: the last report of every node that made one.
+        report_times_s: when that was, on the monotonic clock.
+        started_s: when the first hook started, ``None`` if none did.
+        ending_s: when the end was asked for first: what comes after is draining and finalising.
+        ended_s: when all processes had ended.
+        failures: one line for each, in the order in which they became known.
+    """
+
+    exit_code: int = 0
+    reason: str = ""
+    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    report_times_s: dict[str, float] = field(default_factory=dict)
+    started_s: float | None = None
+    ending_s: float | None = None
+    ended_s: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+    def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
+        """Keep a report, unless the node has made its final one."""
+        if not self.has_final_report(name):
+            self.reports[name] = report
+            self.report_times_s[name] = now_s
+
+    def begin_to_end(self, now_s: float) -> None:
+        """The end has been asked for; the first time counts."""
+        if self.ending_s is None:
+            self.ending_s = now_s
+
+    def has_final_report(self, name: str) -> bool:
+        """Whether a node has come to its end."""
+        return bool(self.reports.get(name, {}).get("is_final"))
+
+    def fail(self, reason: str) -> None:
+        """Note a failure; the first one decides, unless the user had ended the run before."""
+        self.failures.append(reason)
+        if self.exit_code == 0:
+            self.exit_code, self.reason = 1, reason

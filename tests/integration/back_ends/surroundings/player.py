@@ -1,0 +1,58 @@
+"""Plays ball, and looks at its surroundings at every stroke."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import shared
+
+from neuros.hooks import Optional, neuros_finalise, neuros_function, neuros_initialise
+
+NAME = os.environ["WHO"]
+STROKES = 0
+
+os.environ["SET_ON_IMPORT"] = NAME
+print(f"print on import: {NAME}")
+
+
+@neuros_initialise(outputs=Optional("ball"))
+def serve(node):
+    note(node, "initialise")
+    look(node)
+    return node.make_packet("ball") if "SERVES" in os.environ else None
+
+
+@neuros_function(inputs="ball", outputs=Optional("ball"))
+def hit(node, ball):
+    global STROKES
+    STROKES += 1
+    shared.calls.append(node.name)
+    look(node)
+    os.environ["SET_IN_HOOK"] = NAME
+    print(f"print in hook: {NAME}")
+    subprocess.run(["sh", "-c", 'echo "child of $WHO, home $HOME"'], check=True)
+    node.get_logger().info(f"log in hook: {NAME}")
+    if STROKES == 5 and "SERVES" in os.environ:
+        node.shutdown("enough")
+        return None
+    return ball
+
+
+@neuros_finalise()
+def end(node):
+    look(node)
+    note(node, f"finalise after {STROKES} strokes and {len(shared.calls)} calls")
+    print(f"print at the end: {NAME}")
+
+
+def look(node):
+    assert node.name == NAME == os.environ["WHO"] == os.environ["SET_ON_IMPORT"]
+    assert os.environ.get("SET_IN_HOOK", NAME) == NAME
+    assert set(shared.calls) <= {NAME}
+    assert Path.cwd() == node.run_dir.parent
+    assert node.run_dir == Path(os.environ["NEUROS_RUN_DIR"])
+
+
+def note(node, text):
+    with open(node.run_dir / "notes", "a") as file:
+        file.write(text + "\n")

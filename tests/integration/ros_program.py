@@ -1,0 +1,73 @@
+"""An ordinary ROS program in the process of the tests: it knows nothing of NeuROS."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from neuros.transport.messages import message_class
+
+message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
+
+
+class RosProgram:
+    """A node in a context of its own."""
+
+    def __init__(self, name: str = "ros_program", domain_id: int | None = None) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(
+            context=self._context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.node = rclpy.create_node(name, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def listen(self, topic: str, type_name: str) -> list[Any]:
+        """What is heard on a topic from now on; grows."""
+        heard: list[Any] = []
+        self.node.create_subscription(message_class(type_name), topic, heard.append, 10)
+        return heard
+
+    def call(self, service: type, name: str, request: Any, timeout_s: float = 20.0) -> Any:
+        """Call a service and wait for its answer."""
+        client = self.node.create_client(service, name)
+        self.spin_until(client.service_is_ready, timeout_s)
+        future = client.call_async(request)
+        self.spin_until(future.done, timeout_s)
+        return future.result()
+
+    def spin(self, timeout_s: float = 0.0) -> None:
+        """Handle one event, if there is one."""
+        self._executor.spin_once(timeout_sec=timeout_s)
+
+    def spin_until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        """Handle events until a condition holds."""
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline_s, f"not within {timeout_s:g} s"
+            self.spin(0.01)
+
+    def close(self) -> None:
+        """End it."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def __enter__(self) -> RosProgram:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,64 @@
+"""Projects in the style of the published NeuROS 1.0 run as they are.
+
+Message types with dots, numbers in the environment, no ``$schema``, ``gazebo_type`` on ports, the
+logger of the ROS node, and no way to end by themselves.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from launching import BACKENDS, Finished, launch, start
+
+HERE = Path(__file__).resolve().parent
+
+pytestmark = pytest.mark.parametrize("backend", BACKENDS)
+
+
+def run_until(name: str, text: str, backend: str, cwd: Path) -> Finished:
+    """Run until ``text`` was printed and then to Ctrl+C, as these projects do not end."""
+    with start(HERE / name, "--backend", backend, cwd=cwd) as running:
+        running.wait_for(text)
+        running.signal(signal.SIGINT)
+        run = running.finish()
+    assert run.exit_code == 130, run.output
+    for connection in run.record["connections"]:
+        assert 0 <= connection["sent"] - connection["received"] <= 1
+        if connection["discard_limit"] == 0:
+            assert connection["discarded"] == 0
+    return run
+
+
+def test_the_clock_strikes(backend: str, tmp_path: Path) -> None:
+    run = launch(HERE / "clock", "--backend", backend, "--duration", "1", cwd=tmp_path)
+    assert run.exit_code == 0, run.output
+    strokes = run.said("clock")
+    assert 2 <= len(strokes) <= 6
+    assert all(re.fullmatch(r"d[io]ng at \d\d:\d\d:\d\d", stroke) for stroke in strokes)
+
+
+def test_the_ball_goes_to_and_fro(backend: str, tmp_path: Path) -> None:
+    run = run_until("tennis", "right plays pong\n", backend, tmp_path)
+    left, right = run.said("left_player"), run.said("right_player")
+    assert left == ["left plays ping"] * len(left)
+    assert right == ["right plays pong"] * len(right)
+    assert right
+    assert 0 <= len(left) - len(right) <= 1
+
+
+def test_every_vote_is_counted_in_every_election(backend: str, tmp_path: Path) -> None:
+    said = run_until("voting", "counted", backend, tmp_path).said("station")
+    assert "the polls are open" in said
+    counted = [text for text in said if text.startswith("counted")]
+    assert set(counted) == {"counted ['blue', 'green', 'red']"}
+
+
+def test_a_gazebo_type_gives_one_warning_and_no_more(backend: str, tmp_path: Path) -> None:
+    run = run_until("thermostat", "[thermostat]: off", backend, tmp_path)
+    assert run.output.count("Gazebo itself is not supported") == 1
+    switched = run.said("thermostat")
+    assert switched[:2] == ["on", "off"]
+    assert run.connection("room.temperature -> thermostat.temperature")["longest_discard"] <= 2
