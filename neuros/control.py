@@ -102,8 +102,12 @@ def _short_path(path: Path) -> Iterator[str]:
 def listen(run_folder: Path) -> socket.socket:
     """The supervisor's end: a listening socket in the run folder."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    with _short_path(run_folder / SOCKET_NAME) as name:
-        listening.bind(name)
+    try:
+        with _short_path(run_folder / SOCKET_NAME) as name:
+            listening.bind(name)
+    except OSError:
+        listening.close()
+        raise
     listening.listen(256)
     return listening
 
@@ -111,6 +115,10 @@ def listen(run_folder: Path) -> socket.socket:
 def connect(run_folder: Path) -> Lines:
     """A node's end; raises ``OSError`` where no supervisor listens."""
     connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    with _short_path(run_folder / SOCKET_NAME) as name:
-        connected.connect(name)
+    try:
+        with _short_path(run_folder / SOCKET_NAME) as name:
+            connected.connect(name)
+    except OSError:
+        connected.close()
+        raise
     return Lines(connected)

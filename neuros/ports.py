@@ -83,9 +83,7 @@ class EventLoop(Protocol):
     def post_from_thread(self, event: Callable[[], None]) -> None:
         """Like :meth:`post`, from any thread; wakes the loop."""
 
-    def add_timer(
-        self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]
-    ) -> None:
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
         """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
 
     def run(self) -> None:
@@ -107,8 +105,12 @@ class Middleware(Protocol):
     def ros_node(self, file: NodeFile) -> Any:
         """The real ``rclpy.node.Node`` of a node that has a transport."""
 
-    def mark_own_entities(self, file: NodeFile) -> None:
-        """Remember what exists on a ROS node before its plugin gets hold of it."""
+    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it.
+
+        Where nodes share a process, ``enter`` is called before each callback of subscriptions,
+        timers and services that the plugin creates there.
+        """
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has subscriptions, timers, services or clients on its ROS node."""

@@ -14,6 +14,7 @@ DEADLOCK_AFTER_S = 1.0
 
 _DRAINING_PAUSE_S = 0.01
 _RUNNING_PAUSE_S = DEADLOCK_AFTER_S / 2
+_BUSY_S = 0.1
 
 
 class Verdict(Enum):
@@ -46,6 +47,7 @@ class Probing:
         self._number = 0
         self._asked_s = 0.0
         self._probes: dict[str, Mapping[str, Any]] = {}
+        self._answers: Mapping[str, Mapping[str, Any]] = {}  # of the last whole round
         self._last_round: tuple[Any, ...] | None = None
         self.verdict = Verdict.UNDECIDED
 
@@ -85,13 +87,14 @@ class Probing:
             " hook, or omit discard_limit on one connection of the loop"
         )
 
-    def what_is_left(self) -> list[str]:
-        """Why it is not drained: who has not answered, and where packets are or wait."""
+    def what_is_left(self, now_s: float) -> list[str]:
+        """Why it is not drained: who does not answer, or else where packets are or wait."""
         silent = sorted(self._names - self._probes.keys())
-        if silent:
+        if silent and now_s - self._asked_s >= _BUSY_S:
             return [f"{name} is busy" for name in silent]
-        under_way = quiescence.under_way(self._probes, self._connections)
-        waiting = [name for name, probe in sorted(self._probes.items()) if probe["is_startable"]]
+        probes = self._probes if not silent else self._answers
+        under_way = quiescence.under_way(probes, self._connections)
+        waiting = [name for name, probe in sorted(probes.items()) if probe["is_startable"]]
         return [
             *(f"a packet is under way on `{key}`" for key in under_way),
             *(f"{name} has a packet to work on" for name in waiting),
@@ -105,6 +108,7 @@ class Probing:
 
     def _judge(self) -> None:
         probes, connections = self._probes, self._connections
+        self._answers = probes
         if any(probe["ledger"] is None for probe in probes.values()):
             return
         if self._is_draining:

@@ -131,7 +131,10 @@ class Supervisor:
     # ------------------------------------------------------------------ what arrives
 
     def _hear(self) -> None:
-        for lines, message in self._channels.receive():
+        messages = list(self._channels.receive())
+        # Who ends the project may have been set going by a node whose report was read later.
+        messages.sort(key=lambda pair: pair[1]["kind"] in ("shutdown", "failed"))
+        for lines, message in messages:
             self._handlers[message["kind"]](lines, message)
 
     def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
@@ -270,7 +273,7 @@ class Supervisor:
             if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
                 self._stop()
             elif now_s >= self._deadline_s:
-                why = "; ".join(self._probing.what_is_left()) or "packets keep coming"
+                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
                 self._output.log("WARN", f"not drained in time, so packets may be lost: {why}")
                 self._stop()
         elif self._phase is Phase.RUNNING:

@@ -72,6 +72,11 @@ class NodeRuntime:
         """The node's own folder."""
         return self.file.folders.run / self.name
 
+    @property
+    def is_on_stage(self) -> bool:
+        """Whether the process has the surroundings of this node now."""
+        return self._stage.has(self._scope)
+
     # ------------------------------------------------------------------ life
 
     def load(self) -> None:
@@ -82,7 +87,7 @@ class NodeRuntime:
         """
         self._stage.enter(self._scope)
         self._transport.open(self)
-        self._middleware.mark_own_entities(self.file)
+        self._middleware.mark_own_entities(self.file, lambda: self._stage.enter(self._scope))
         self._specs = load_plugin(self.file.node.plugin, self.name)
         types = {
             port.name: self._middleware.message_class(port.type) for port in self.file.node.outputs

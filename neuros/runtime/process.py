@@ -197,8 +197,9 @@ class NodeProcess:
         if not self._nodes:
             self._fail(self._files[0].node.name, _as_neuros_error(error))
             return
-        files = {str(node.file.node.plugin): node for node in self._nodes}
-        node = next((files[name] for name in _filenames(error) if name in files), self._nodes[0])
+        names = set(_filenames(error))
+        suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
+        node = next((node for node in suspects if node.is_on_stage), (suspects or self._nodes)[0])
         if not isinstance(error, NeurosError):
             text = plugin_traceback(error, node.file.node.plugin)
             error = NodeError(f"failed outside its hooks: {describe(error)}\n{text}")

@@ -107,6 +107,10 @@ class Stage:
             os.dup2(scope.log_fd, 1)
             os.dup2(scope.log_fd, 2)
 
+    def has(self, scope: Scope) -> bool:
+        """Whether the surroundings are those of ``scope``."""
+        return self._current is scope
+
     def leave(self) -> None:
         """Give the process its own surroundings back (but for its output, if a node has a log)."""
         self.enter(self._process)

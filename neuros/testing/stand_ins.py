@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
@@ -142,7 +142,7 @@ class Workbench:
         """A stand-in."""
         return self._ros_nodes[file.node.name]
 
-    def mark_own_entities(self, file: NodeFile) -> None:
+    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
         """There are none."""
 
     def has_foreign_entities(self, file: NodeFile) -> bool:

@@ -9,121 +9,12 @@ A transport is checked by deriving a class for pytest and telling it how nodes a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any
 
-from neuros.ports import Transport
-from neuros.project.model import Connection, Folders, Node, NodeFile, Port
-from neuros.testing.wiring import numbered, wire
-
-NUMBER, SERIES = "std_msgs/msg/Int32", "std_msgs/msg/Float64MultiArray"
-TOPIC = "/transport_checks/said"
-TIMEOUT_S = 20.0
-
-
-class Network(Protocol):
-    """Some nodes joined by the transport under test, each with its transport still closed."""
-
-    def transport(self, node: str) -> Transport:
-        """The transport of a node."""
-
-    def run_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Handle events until ``condition()``; returns False if that took too long."""
-
-    def settle(self) -> None:
-        """Handle events until what is under way has certainly arrived."""
-
-    def listen(self, topic: str, type_name: str) -> list[Any] | None:
-        """What a plain ROS subscription of another process hears from now on; grows.
-
-        ``None`` where the nodes are not on a ROS graph.
-        """
-
-    def close(self) -> None:
-        """Close all transports, and end everything."""
-
-
-class Ear:
-    """Writes down what a transport tells (:class:`neuros.ports.Inbox`), in tests.
-
-    ``answers`` are called with each packet, after it has been written down.
-    """
-
-    def __init__(self) -> None:
-        self.packets: dict[Connection, list[Any]] = {}
-        self.external: list[Any] = []
-        self.acknowledged: dict[Connection, list[int]] = {}
-        self.registered: list[Connection] = []
-        self.on_arrival: Callable[[Connection, Any], object] = lambda *_: None
-        self.on_credit: Callable[[Connection], object] = lambda _: None
-        self.on_meeting: Callable[[Connection], object] = lambda _: None
-
-    def on_packet(self, connection: Connection, packet: Any) -> None:
-        self.packets.setdefault(connection, []).append(packet)
-        self.on_arrival(connection, packet)
-
-    def on_external_packet(self, port: Port, packet: Any) -> None:
-        self.external.append(packet)
-
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        self.acknowledged.setdefault(connection, []).append(position)
-        self.on_credit(connection)
-
-    def on_registered(self, connection: Connection) -> None:
-        self.registered.append(connection)
-        self.on_meeting(connection)
-
-    def numbers(self, connection: Connection) -> list[int]:
-        """The ``data`` of all packets of a connection."""
-        return [packet.data for packet in self.packets.get(connection, ())]
-
-
-class Bench:
-    """The nodes ``a``, ``b`` and ``c`` of a check, with the connections that it needs."""
-
-    def __init__(
-        self, network: Callable[[Sequence[NodeFile]], Network], *connections: Connection
-    ) -> None:
-        self.connections = numbered(connections)
-        files = [_file(name, self.connections) for name in ("a", "b", "c")]
-        self.network = network(files)
-        self.ears = {file.node.name: Ear() for file in files}
-
-    def __enter__(self) -> Bench:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.network.close()
-
-    def open(self, *nodes: str) -> None:
-        """Open transports."""
-        for node in nodes:
-            self.network.transport(node).open(self.ears[node])
-
-    def meet(self) -> None:
-        """Open all transports, and wait until all connections are registered."""
-        self.open("a", "b", "c")
-        self.wait(lambda: not self.missing())
-
-    def missing(self) -> set[Connection]:
-        """Connections that their sender does not know to be registered."""
-        return set(self.connections) - {c for ear in self.ears.values() for c in ear.registered}
-
-    def wait(self, condition: Callable[[], bool]) -> None:
-        """Until something holds; fails after a while."""
-        assert self.network.run_until(condition, TIMEOUT_S), f"not within {TIMEOUT_S:g} s"
-
-    def send(self, value: int, *connections: Connection) -> None:
-        """Send a number on connections of one output."""
-        transport = self.network.transport(connections[0].source_node)
-        packet = transport.make_packet(NUMBER)
-        packet.data = value
-        transport.send(connections, packet)
-
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Acknowledge as the receiver."""
-        self.network.transport(connection.destination_node).acknowledge(connection, position)
+from neuros.project.model import Connection, NodeFile, Port
+from neuros.testing.transport_bench import NUMBER, SERIES, TOPIC, Network, TransportBench
+from neuros.testing.wiring import wire
 
 
 class TransportChecks:
@@ -135,13 +26,16 @@ class TransportChecks:
 
     def test_lossless_packets_arrive_in_order_and_acknowledgements_come_back(self) -> None:
         count = 50
-        with Bench(self.network, wire("a.out -> b.in", 0)) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in", 0)) as bench:
             (connection,) = bench.connections
             a, b = bench.ears["a"], bench.ears["b"]
             b.on_arrival = lambda c, packet: bench.acknowledge(c, packet.data)
-            a.on_credit = lambda c: (
-                a.acknowledged[c][-1] < count and bench.send(a.acknowledged[c][-1] + 1, c)
-            )
+
+            def go_on(c: Connection) -> None:
+                if a.acknowledged[c][-1] < count:
+                    bench.send(a.acknowledged[c][-1] + 1, c)
+
+            a.on_credit = go_on
             bench.meet()
             bench.send(1, connection)
             bench.wait(lambda: a.acknowledged.get(connection, [0])[-1] == count)
@@ -150,7 +44,7 @@ class TransportChecks:
             assert a.acknowledged[connection] == list(range(1, count + 1))
 
     def test_a_whole_window_sent_at_once_arrives(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 5, queue_size=3)) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in", 5, queue_size=3)) as bench:
             (connection,) = bench.connections
             bench.meet()
             for first in (0, 8, 16):
@@ -162,7 +56,9 @@ class TransportChecks:
             bench.wait(lambda: bench.ears["a"].acknowledged.get(connection, [0])[-1] == 24)
 
     def test_the_first_packet_after_registration_arrives(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 0), wire("b.out -> a.in", 0)) as bench:
+        with TransportBench(
+            self.network, wire("a.out -> b.in", 0), wire("b.out -> a.in", 0)
+        ) as bench:
             for ear in bench.ears.values():
                 ear.on_meeting = lambda c: bench.send(7, c)
                 ear.on_arrival = lambda c, _: bench.acknowledge(c, 1)
@@ -173,7 +69,7 @@ class TransportChecks:
             bench.wait(lambda: a.acknowledged == {there: [1]} and b.acknowledged == {back: [1]})
 
     def test_a_connection_is_registered_once_and_only_when_the_receiver_is_there(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 0), wire("a.out -> c.in")) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in", 0), wire("a.out -> c.in")) as bench:
             late, early = bench.connections
             a = bench.ears["a"]
             bench.open("a", "c")
@@ -189,14 +85,14 @@ class TransportChecks:
             assert bench.network.transport("a").waiting_for() == []
 
     def test_a_receiver_knows_which_senders_are_missing(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 0)) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in", 0)) as bench:
             bench.open("b")
             bench.network.settle()
             assert bench.network.transport("b").waiting_for() == list(bench.connections)
 
     def test_every_receiver_of_an_output_gets_every_packet(self) -> None:
         wires = wire("a.out -> b.in", 0), wire("a.out -> b.other", 2), wire("a.out -> c.in", 0)
-        with Bench(self.network, *wires) as bench:
+        with TransportBench(self.network, *wires) as bench:
             bench.meet()
             b, c = bench.ears["b"], bench.ears["c"]
             for ear in (b, c):
@@ -215,7 +111,7 @@ class TransportChecks:
                 assert ear.numbers(each) == [1, 2, 3]
 
     def test_best_effort_never_holds_anybody_up(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in")) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in")) as bench:
             (connection,) = bench.connections
             b = bench.ears["b"]
             bench.meet()
@@ -227,7 +123,7 @@ class TransportChecks:
 
     def test_what_one_does_to_a_packet_nobody_else_sees(self) -> None:
         wires = wire("a.series -> b.series", 0), wire("a.series -> c.series", 0)
-        with Bench(self.network, *wires) as bench:
+        with TransportBench(self.network, *wires) as bench:
             bench.meet()
 
             def spoil(_: Connection, packet: Any) -> None:
@@ -248,7 +144,7 @@ class TransportChecks:
             assert packet.layout.data_offset == 0
 
     def test_a_large_packet_arrives(self) -> None:
-        with Bench(self.network, wire("a.series -> b.series", 0)) as bench:
+        with TransportBench(self.network, wire("a.series -> b.series", 0)) as bench:
             bench.meet()
             transport = bench.network.transport("a")
             packet = transport.make_packet(SERIES)
@@ -259,7 +155,9 @@ class TransportChecks:
             assert b.packets[bench.connections[0]] == [packet]
 
     def test_after_closing_nothing_is_sent_or_heard(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 0), wire("c.out -> b.other", 0)) as bench:
+        with TransportBench(
+            self.network, wire("a.out -> b.in", 0), wire("c.out -> b.other", 0)
+        ) as bench:
             first, second = bench.connections
             bench.meet()
             bench.network.transport("a").close()
@@ -277,7 +175,7 @@ class TransportChecks:
             assert bench.ears["c"].acknowledged == {}
 
     def test_ordinary_ros_tools_hear_every_connection(self) -> None:
-        with Bench(self.network, wire("a.out -> b.in", 0)) as bench:
+        with TransportBench(self.network, wire("a.out -> b.in", 0)) as bench:
             (connection,) = bench.connections
             bench.meet()
             heard = bench.network.listen(f"{connection.topic}/data", NUMBER)
@@ -296,7 +194,7 @@ class TransportChecks:
             assert first in bench.ears["b"].numbers(connection)
 
     def test_external_topics_reach_everybody(self) -> None:
-        with Bench(self.network) as bench:
+        with TransportBench(self.network) as bench:
             bench.open("a", "b")
             heard = bench.network.listen(TOPIC, NUMBER)
             if heard is None:
@@ -311,24 +209,3 @@ class TransportChecks:
 
             bench.wait(is_heard)
             assert bench.ears["b"].external[0].data == heard[0].data == 5
-
-
-def _file(name: str, connections: Sequence[Connection]) -> NodeFile:
-    node = Node(
-        name=name,
-        container="neuros_python",
-        plugin=Path("plugin.py"),
-        inputs=(
-            Port("in", NUMBER),
-            Port("other", NUMBER),
-            Port("series", SERIES),
-            *([Port("heard", NUMBER, TOPIC)] if name == "b" else []),
-        ),
-        outputs=(
-            Port("out", NUMBER),
-            Port("series", SERIES),
-            *([Port("said", NUMBER, TOPIC)] if name == "a" else []),
-        ),
-    )
-    own = tuple(c for c in connections if name in (c.source_node, c.destination_node))
-    return NodeFile(node, own, Folders(Path(), Path(), Path()))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,6 +20,8 @@ from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 
 _LINGER_S = 0.05
+# What takes a callback, and at which place of its arguments.
+_CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service", 2))
 
 
 class RosProcess:
@@ -70,9 +74,16 @@ class RosProcess:
         """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
-    def mark_own_entities(self, file: NodeFile) -> None:
-        """Remember what exists on a ROS node before its plugin gets hold of it."""
-        self._own_entities[file.node.name] = _entities(self.ros_node(file))
+    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it.
+
+        In memory, ``enter`` is called before each callback of what the plugin creates there.
+        """
+        ros_node = self.ros_node(file)
+        self._own_entities[file.node.name] = _entities(ros_node)
+        if self._hub is not None:
+            for name, place in _CREATORS:
+                setattr(ros_node, name, _creating(getattr(ros_node, name), place, enter))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has created something on its ROS node that may call back."""
@@ -96,6 +107,33 @@ class RosProcess:
         for ros_node in self._ros_nodes.values():
             ros_node.destroy_node()
         rclpy.shutdown(context=self._context)
+
+
+def _creating(create: Callable[..., Any], place: int, enter: Callable[[], None]) -> Any:
+    """``create`` with ``enter`` called before its callback."""
+
+    @functools.wraps(create)
+    def creating(*arguments: Any, **keywords: Any) -> Any:
+        if len(arguments) > place:
+            callback = _entering(arguments[place], enter)
+            arguments = (*arguments[:place], callback, *arguments[place + 1 :])
+        elif "callback" in keywords:
+            keywords["callback"] = _entering(keywords["callback"], enter)
+        return create(*arguments, **keywords)
+
+    return creating
+
+
+def _entering(callback: Any, enter: Callable[[], None]) -> Any:
+    if not callable(callback) or inspect.iscoroutinefunction(callback):
+        return callback
+
+    @functools.wraps(callback)  # rclpy asks for its signature
+    def entering(*arguments: Any) -> Any:
+        enter()
+        return callback(*arguments)
+
+    return entering
 
 
 def _entities(ros_node: RosNode) -> set[int]:

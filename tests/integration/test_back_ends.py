@@ -194,6 +194,7 @@ def test_what_a_node_says_is_in_its_own_log_up_to_the_end(surroundings):
         log = read(surroundings, f"{node}/node.log")
         assert log.count(f"print on import: {node}\n") == 1
         assert log.count(f"print in hook: {node}\n") == 5
+        assert log.count(f"print in a callback: {node}\n") == 1
         assert log.count(f"child of {node}, ") == 5
         assert len(re.findall(rf"\[INFO\] \[[\d.]+\] \[{node}\]: log in hook: {node}\n", log)) == 5
         assert log.count(f"print at the end: {node}\n") == 1

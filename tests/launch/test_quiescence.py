@@ -337,9 +337,11 @@ def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:
     probing = Probing("ab", [AB], lambda kind, number: asked.append(number))
     probing.drain(without=(), now_s=0.0)
     probing.take("a", sender(AB, 2, 1) | {"probe": 1})
-    assert probing.what_is_left() == ["b is busy"]
+    assert probing.what_is_left(1.0) == ["b is busy"]
     probing.take("b", receiver(AB, 1, 1, is_startable=True) | {"probe": 1})
-    assert probing.what_is_left() == [
-        "a packet is under way on `a.o -> b.x`",
-        "b has a packet to work on",
-    ]
+    left = ["a packet is under way on `a.o -> b.x`", "b has a packet to work on"]
+    assert probing.what_is_left(1.0) == left
+    probing.look(2.0, 0.0)
+    assert asked == [1, 2]
+    assert probing.what_is_left(2.01) == left, "the next answers are on their way"
+    assert probing.what_is_left(3.0) == ["a is busy", "b is busy"]

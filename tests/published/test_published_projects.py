@@ -41,7 +41,7 @@ def test_the_clock_strikes(backend: str, tmp_path: Path) -> None:
 
 
 def test_the_ball_goes_to_and_fro(backend: str, tmp_path: Path) -> None:
-    run = run_until("tennis", "right plays pong\n", backend, tmp_path)
+    run = run_until("tennis", ": right plays pong", backend, tmp_path)
     left, right = run.said("left_player"), run.said("right_player")
     assert left == ["left plays ping"] * len(left)
     assert right == ["right plays pong"] * len(right)
@@ -50,7 +50,7 @@ def test_the_ball_goes_to_and_fro(backend: str, tmp_path: Path) -> None:
 
 
 def test_every_vote_is_counted_in_every_election(backend: str, tmp_path: Path) -> None:
-    said = run_until("voting", "counted", backend, tmp_path).said("station")
+    said = run_until("voting", ": counted [", backend, tmp_path).said("station")
     assert "the polls are open" in said
     counted = [text for text in said if text.startswith("counted")]
     assert set(counted) == {"counted ['blue', 'green', 'red']"}

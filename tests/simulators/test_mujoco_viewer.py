@@ -33,21 +33,27 @@ class Simulation:
         )
         self._output = b""
 
-    def wait_for(self, *lines: str) -> None:
-        """Until these are the next lines that it prints."""
+    def wait_for(self, line: str) -> None:
+        """Until it prints this line."""
         assert self._process.stdout is not None
         end_s = time.monotonic() + DEADLINE_S
         with selectors.DefaultSelector() as selector:
             selector.register(self._process.stdout, selectors.EVENT_READ)
-            for line in lines:
-                while b"\n" not in self._output:
-                    left_s = max(0.0, end_s - time.monotonic())
-                    assert selector.select(left_s), f"'{line}' was not printed"
-                    new = os.read(self._process.stdout.fileno(), 4096)
-                    assert new, f"ended without '{line}': {self._output.decode()}"
-                    self._output += new
-                first, _, self._output = self._output.partition(b"\n")
-                assert first.decode() == line
+            while True:
+                *whole, self._output = self._output.split(b"\n")
+                if line.encode() in whole:
+                    return
+                left_s = max(0.0, end_s - time.monotonic())
+                assert selector.select(left_s), f"'{line}' was not printed"
+                new = os.read(self._process.stdout.fileno(), 4096)
+                assert new, f"ended without '{line}': {self._output.decode()}"
+                self._output += new
+
+    def spawn(self, name: str) -> None:
+        """Have it add an entity to its world."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{name}\n".encode())
+        self._process.stdin.flush()
 
     def end(self) -> int:
         """Have it close the simulation; its exit code."""
@@ -60,8 +66,8 @@ class Simulation:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.communicate()
+        with self._process:
+            self._process.kill()
 
 
 def test_it_opens_pauses_resumes_and_closes():
@@ -84,6 +90,17 @@ def test_a_simulation_that_was_paused_goes_on_when_its_window_is_closed():
         user.close(window)
         simulation.wait_for("moving")
         assert simulation.end() == 0
+
+
+def test_another_world_is_shown_in_another_window_of_which_nothing_is_left_at_the_end():
+    with virtual_display() as user, Simulation(user.display) as simulation:
+        first = user.find("MuJoCo")
+        simulation.wait_for("moving")
+        simulation.spawn("wall")
+        simulation.wait_for("spawned wall")
+        second = user.find("MuJoCo")
+        assert second != first
+        assert simulation.end() == 0  # and not by a signal: GLFW and its threads end in order
 
 
 def test_without_a_display_there_is_one_warning_and_no_window(monkeypatch):

@@ -4,5 +4,5 @@ from neuros.hooks import neuros_function
 
 
 @neuros_function(inputs="time")
-def show(node, time):
-    node.get_ros_node().get_logger().info(f"It is {time.data}")
+def show(node, packet):
+    node.get_logger().info(f"It is {packet.data}")

@@ -7,7 +7,7 @@ from neuros.hooks import neuros_function
 
 @neuros_function(inputs="question", outputs="vote")
 def choose(node, question):
-    taste = Random(f"{node.name}: {question.data}")  # the same in every run
+    taste = Random(f"{question.data} {node.name}")  # the same in every run
     vote = node.make_packet("vote")
     vote.data = taste.choice(question.data.split(" or "))
     node.get_logger().info(vote.data)

@@ -1,6 +1,6 @@
 """The figure of the experiment: estimated and true heading over time, and the error below.
 
-A window where there is a display, otherwise the same figure on the Agg canvas.
+A window where there is a display and a toolkit, otherwise the same figure on the Agg canvas.
 """
 
 from __future__ import annotations
@@ -19,6 +19,12 @@ from matplotlib.figure import Figure
 
 REDRAW_PERIOD_S = 0.2
 SIZE_INCHES = (7.0, 4.5)
+TOOLKITS = ("QtAgg", "TkAgg", "macosx")
+NO_WINDOW = "the plot has no window and is saved at the end: "
+NO_DISPLAY = NO_WINDOW + "NEUROS_GUI is set, but there is no display"
+NO_TOOLKIT = NO_WINDOW + (
+    "this Python has no toolkit for one (apt install python3-tk, or PySide6 in the environment)"
+)
 
 
 class HeadingPlot:
@@ -26,13 +32,17 @@ class HeadingPlot:
 
     Args:
         every_time: redraw at every call of :meth:`redraw_if_due`, not at most 5 times per second.
+
+    Attributes:
+        remark: what the user should know about the window, empty if there is nothing to say.
     """
 
     def __init__(self, every_time: bool = False) -> None:
         self.redraws = 0
         self._every_time = every_time
         self._next_redraw = time.monotonic()
-        self._figure, self.is_window = _new_figure()
+        self._figure, self.is_window, self.remark = _new_figure()
+        self._figure.canvas.mpl_connect("close_event", self._on_closed)
         self._heading_axes, self._error_axes = self._figure.subplots(
             2, 1, sharex=True, gridspec_kw={"height_ratios": (2, 1)}
         )
@@ -55,7 +65,7 @@ class HeadingPlot:
         self._fit_axes(max([0, *estimates, *truths]) * 1e-9, error_deg)
         self._figure.canvas.draw()
         if self.is_window:
-            self._figure.canvas.flush_events()
+            self._figure.canvas.flush_events()  # here the user's clicks are heeded
         self.redraws += 1
         return comparison
 
@@ -70,6 +80,12 @@ class HeadingPlot:
             from matplotlib import pyplot
 
             pyplot.close(self._figure)
+
+    def _on_closed(self, event: Any) -> None:
+        """The user has closed the window: go on without."""
+        if self.is_window:
+            self.is_window = False
+            FigureCanvasAgg(self._figure)
 
     def _label(self) -> None:
         above, below = self._heading_axes, self._error_axes
@@ -95,21 +111,26 @@ class HeadingPlot:
         self._error_axes.set_ylim(-bound, bound)
 
 
-def _new_figure() -> tuple[Figure, bool]:
-    if _has_display():
+def _new_figure() -> tuple[Figure, bool, str]:
+    """A figure, whether it is a window, and a remark for the user."""
+    wish, remark = os.environ.get("NEUROS_GUI", ""), ""
+    if wish != "0" and _has_display():
         window = _window()
         if window is not None:
-            return window, True
+            return window, True, ""
+        remark = NO_TOOLKIT
+    elif wish not in ("", "0"):
+        remark = NO_DISPLAY
     figure = Figure(figsize=SIZE_INCHES)
     FigureCanvasAgg(figure)
-    return figure, False
+    return figure, False, remark
 
 
 def _window() -> Any:
     """A figure in a window, or ``None`` where no window toolkit is installed."""
     from matplotlib import pyplot
 
-    for toolkit in ("QtAgg", "TkAgg", "macosx"):
+    for toolkit in TOOLKITS:
         try:
             pyplot.switch_backend(toolkit)
             figure = pyplot.figure("WhiskEye: head direction", figsize=SIZE_INCHES)
@@ -121,9 +142,6 @@ def _window() -> Any:
 
 
 def _has_display() -> bool:
-    wish = os.environ.get("NEUROS_GUI", "")
-    if wish:
-        return wish != "0"
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or (
         sys.platform == "darwin"
     )

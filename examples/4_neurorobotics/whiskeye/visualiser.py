@@ -30,7 +30,10 @@ class Headings:
 @neuros_initialise()
 def start(node):
     every_packet = os.environ.get("REDRAW_EVERY_PACKET", "0") != "0"
-    node.set_user_data(Headings(HeadingPlot(every_time=every_packet)))
+    plot = HeadingPlot(every_time=every_packet)
+    if plot.remark:
+        node.get_logger().warning(plot.remark)
+    node.set_user_data(Headings(plot))
 
 
 @neuros_function(inputs="estimate")

@@ -10,6 +10,7 @@ from neuros.simulators.mujoco.gate import Gate
 from neuros.simulators.mujoco.pacing import Pacer
 
 _JOIN_S = 5.0
+_LOOK_S = 0.1
 
 
 class FreeRun:
@@ -22,6 +23,7 @@ class FreeRun:
         advance: runs one bout and returns the packets that are due after it, by output.
         sim_time: simulated seconds.
         finish: called in the thread at its end.
+        look: called now and then while stepping is paused, ``None`` for nothing.
         clock: wall seconds; ``wait`` sleeps that many, by default until :meth:`stop` at the latest.
     """
 
@@ -32,12 +34,14 @@ class FreeRun:
         advance: Callable[[], Mapping[str, Packet]],
         sim_time: Callable[[], float],
         finish: Callable[[], None],
+        look: Callable[[], None] | None,
         factor: float | None,
         clock: Callable[[], float],
         wait: Callable[[float], object] | None = None,
     ) -> None:
         self._node, self._gate = node, gate
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
+        self._look = look
         self._stopped = threading.Event()
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
         self._thread = threading.Thread(
@@ -72,8 +76,11 @@ class FreeRun:
 
     def _bout(self) -> bool:
         cancelled = self._stopped.is_set
-        if not self._gate.enter(cancelled):
-            return False
+        while not self._gate.enter(cancelled, None if self._look is None else _LOOK_S):
+            if cancelled():
+                return False
+            if self._look is not None:
+                self._look()
         try:
             packets = self._advance()
         finally:

@@ -59,14 +59,16 @@ class Gate:
             if self._is_closed:
                 self._changed.wait(seconds)
 
-    def enter(self, cancelled: Callable[[], bool]) -> bool:
+    def enter(self, cancelled: Callable[[], bool], seconds: float | None = None) -> bool:
         """Begin a bout of steps as soon as nobody visits and the gate is open.
 
-        Returns False, without having begun, once ``cancelled()``.
+        Returns False, without having begun, once ``cancelled()``, or after ``seconds`` of waiting.
         """
         with self._changed:
-            self._changed.wait_for(lambda: cancelled() or not (self._is_closed or self._visitors))
-            if cancelled():
+            may_try = self._changed.wait_for(
+                lambda: cancelled() or not (self._is_closed or self._visitors), seconds
+            )
+            if cancelled() or not may_try:
                 return False
             self._is_stepping = True
             return True

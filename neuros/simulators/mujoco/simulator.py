@@ -141,6 +141,7 @@ class MuJoCo:
             lambda: self._bout(steps),
             lambda: self.sim_time,
             lambda: self._world.cameras.close(),
+            None if self._viewer is None else self._look_at_viewer,
             real_time_factor,
             self._clock,
             self._wait,
@@ -260,9 +261,14 @@ class MuJoCo:
         if self._gate.is_closed and (self._viewer is None or not self._viewer.is_open):
             raise ModelError("the simulation is paused: resume() it before it is stepped")
         while not self._is_over and self._gate.is_closed:
-            if self._viewer is not None:
-                self._viewer.sync()  # notices that the window has been closed
+            self._look_at_viewer()
             self._gate.wait_open(_PAUSE_LOOK_S)
+
+    def _look_at_viewer(self) -> None:
+        """During a pause nothing else notices that the user has closed the window."""
+        with self.paused():
+            if self._viewer is not None:
+                self._viewer.sync()
 
     def _toggle_pause(self) -> None:
         if self._gate.is_closed:

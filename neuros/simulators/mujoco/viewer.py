@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from neuros.ports import NodeContext
 
 _PERIOD_S = 1 / 60
 _SPACE = 32
+_CLOSE_S = 2.0
 
 
 class Viewer:
@@ -34,6 +36,7 @@ class Viewer:
         self._launch, self._toggle, self._closed, self._clock = launch, toggle, closed, clock
         self._next = 0.0
         self._handle: Any = None
+        self._threads: set[threading.Thread] = set()
         self.show(model, data)
 
     @property
@@ -43,7 +46,9 @@ class Viewer:
     def show(self, model: Any, data: Any) -> None:
         """Open the window for another model."""
         self.close()
+        others = set(threading.enumerate())
         self._handle = self._launch(model, data, key_callback=self._on_key)
+        self._threads = {thread for thread in threading.enumerate() if _draws(thread)} - others
 
     def sync(self) -> None:
         """Show the data as they are, at most 60 times per wall second; not during a step."""
@@ -57,13 +62,25 @@ class Viewer:
             self._closed()
 
     def close(self) -> None:
+        """Close the window; returns when it is gone.
+
+        GLFW is given up at the end of the process, and must not be while a window is still drawn.
+        """
         handle, self._handle = self._handle, None
         if handle is not None:
             handle.close()
+        for thread in self._threads:
+            thread.join(_CLOSE_S)
+        self._threads = set()
 
     def _on_key(self, key: int) -> None:
         if key == _SPACE:
             self._toggle()
+
+
+def _draws(thread: threading.Thread) -> bool:
+    """Whether it is the one that ``launch_passive`` has started: its name has the function's."""
+    return "_launch_internal" in thread.name
 
 
 def open_viewer(

@@ -19,6 +19,13 @@ print(f"print on import: {NAME}")
 def serve(node):
     note(node, "initialise")
     look(node)
+
+    def on_timer():
+        timer.cancel()
+        look(node)
+        print(f"print in a callback: {NAME}")
+
+    timer = node.get_ros_node().create_timer(0.001, on_timer)
     return node.make_packet("ball") if "SERVES" in os.environ else None
 
 

@@ -1,0 +1,102 @@
+"""WhiskEye as a user launches it, for two simulated seconds; the long rows are in acceptance."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from launching import BACKENDS, EXAMPLES, Finished, launch
+
+for needed in ("mujoco", "nest", "matplotlib"):
+    pytest.importorskip(needed)
+
+WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
+SECONDS = 2
+PACKETS = SECONDS * 50
+TIMEOUT_S = 60.0
+
+IMU = "robot.imu -> snn.imu"
+TRUTH = "robot.pose -> visualiser.truth"
+ESTIMATE = "snn.estimate -> visualiser.estimate"
+
+
+def whiskeye(variant: str, backend: str, cwd: Path, *settings: str) -> Finished:
+    """Run a variant to its end, without windows."""
+    values = [f"nodes.robot.environment.DURATION={SECONDS}", *settings]
+    arguments = [argument for value in values for argument in ("--set", value)]
+    project = WHISKEYE / f"{variant}.json"
+    options = {"cwd": cwd, "timeout_s": TIMEOUT_S, "NEUROS_GUI": "0"}
+    run = launch(project, "--backend", backend, *arguments, **options)
+    assert run.exit_code == 0, run.output
+    return run
+
+
+def results(run: Finished) -> dict[str, float]:
+    return dict(json.loads((run.run_folder / "visualiser/head_direction.json").read_text()))
+
+
+def counts(run: Finished, connection: str) -> tuple[int, ...]:
+    found = run.connection(connection)
+    return tuple(found[key] for key in ("sent", "received", "consumed", "discarded", "lost"))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_hybrid_loses_no_imu_packet_and_tracks_the_heading(backend, tmp_path):
+    run = whiskeye("project", backend, tmp_path)
+    assert counts(run, IMU) == (PACKETS, PACKETS, PACKETS, 0, 0)
+    assert run.connection(TRUTH)["sent"] == run.connection(ESTIMATE)["sent"] == PACKETS
+    found = results(run)
+    assert found["rms_deg"] <= 5
+    assert found["max_deg"] <= 12
+    assert found["samples"] > PACKETS / 4
+    assert run.record["sim_s"] == pytest.approx(SECONDS)
+    assert any(line.startswith("head-direction error: RMS") for line in run.said("visualiser"))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_visualiser_writes_a_picture_a_table_and_the_error(backend, tmp_path):
+    run = whiskeye("project", backend, tmp_path)
+    folder = run.run_folder / "visualiser"
+    assert (folder / "head_direction.png").read_bytes().startswith(b"\x89PNG")
+    with (folder / "head_direction.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    found = results(run)
+    for column, count in (("estimate_rad", "estimates"), ("truth_rad", "truths")):
+        assert sum(bool(row[column]) for row in rows) == found[count]
+    for connection, count in ((ESTIMATE, "estimates"), (TRUTH, "truths")):
+        assert run.connection(connection)["consumed"] == found[count]
+
+
+def test_the_strict_variant_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
+    tables = []
+    for backend in BACKENDS:
+        run = whiskeye("strict", backend, tmp_path / backend)
+        for connection in (IMU, TRUTH, ESTIMATE):
+            assert counts(run, connection) == (PACKETS, PACKETS, PACKETS, 0, 0)
+        tables.append((run.run_folder / "visualiser/head_direction.csv").read_bytes())
+    assert tables[0] == tables[1]
+    assert tables[0].count(b"\n") == 1 + PACKETS
+
+
+@pytest.mark.parametrize(
+    ("variant", "setting"),
+    [
+        ("no_discard_limit", "nodes.robot.environment.RATE=1.0"),
+        ("tick_20ms", "nodes.robot.environment.TICK_SECONDS=0.01"),
+        ("asynchronous", "nodes.robot.environment.REAL_TIME_FACTOR=4"),
+        ("asynchronous", "nodes.robot.environment.REAL_TIME_FACTOR=max"),
+    ],
+    ids=["no_discard_limit", "tick", "asynchronous", "asynchronous_max"],
+)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_variants_that_may_lose_packets_end_properly(backend, variant, setting, tmp_path):
+    run = whiskeye(variant, backend, tmp_path, setting)
+    assert run.record["sim_s"] == pytest.approx(SECONDS, abs=0.5)
+    imu = run.connection(IMU)
+    assert imu["sent"] == pytest.approx(PACKETS, abs=25)
+    assert imu["sent"] == imu["received"] + imu["lost"]
+    assert imu["received"] == imu["consumed"] + imu["discarded"] + imu["unread"]
+    assert imu["consumed"] > 0
+    assert (run.run_folder / "visualiser/head_direction.png").exists()

@@ -1,0 +1,85 @@
+"""A host that holds no nodes but keeps to the control channel as its test says.
+
+Standard library only, so that it is there in a moment. The environment variable ``ACT`` holds what
+it does, in Python, with the functions below; the folder is the run folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+NAMES = [Path(argument).parent.name for argument in sys.argv[1:]]
+
+
+class Host:
+    """The node's end of the control channel."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.lines = self.socket.makefile("r")
+        self.is_idle = True
+        self.connections: dict[str, dict[str, Any]] = {"outgoing": {}, "incoming": {}}
+
+    def hello(self) -> None:
+        self.socket.connect("control.sock")
+        self.tell("hello", nodes=NAMES, pid=os.getpid())
+
+    def tell(self, kind: str, **fields: Any) -> None:
+        self.socket.sendall(json.dumps({"kind": kind, "node": NAMES[0], **fields}).encode() + b"\n")
+
+    def report(self, **fields: Any) -> None:
+        """A report of a node that has been loaded."""
+        for name in NAMES:
+            ledger = {"hooks": {}, "executing": None, "state": {"state": "idle", "cause": ""}}
+            common = {"waiting_for": [], "sim_time": None, "ledger": ledger | self.connections}
+            self.tell("report", **{**common, "node": name, **fields})
+
+    def up(self) -> None:
+        """Hello, loaded, and the first hook has begun."""
+        self.hello()
+        self.report()
+        self.tell("first_hook")
+        for name in NAMES:
+            Path(f"{name}.up").touch()
+
+    def up_last(self) -> None:
+        """The same, once all others are up."""
+        others = set(os.environ["ALL"].split()) - set(NAMES)
+        while not all(os.path.exists(f"{name}.up") for name in others):
+            time.sleep(0.005)
+        self.up()
+
+    def hear(self) -> dict[str, Any] | None:
+        """The next that the supervisor says, ``None`` when it has hung up."""
+        line = self.lines.readline()
+        return json.loads(line) if line else None
+
+    def wait_for(self, kind: str) -> None:
+        while (message := self.hear()) and message["kind"] != kind:
+            self.answer(message)
+
+    def answer(self, message: dict[str, Any]) -> None:
+        if message["kind"] == "probe":
+            self.report(
+                probe=message["number"],
+                is_startable=False,
+                is_wakeable=not self.is_idle,
+                is_running=True,
+                is_idle=self.is_idle,
+            )
+
+    def serve(self) -> None:
+        """Do as asked, to a proper end."""
+        self.wait_for("stop")
+        self.report(is_final=True)
+
+
+if __name__ == "__main__":
+    host = Host()
+    exec(os.environ["ACT"])
