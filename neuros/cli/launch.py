@@ -117,7 +117,7 @@ class _Run:
         finally:
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
-            self._console.finish(_PATIENCE_S if outcome.exit_code in _ENDED_BY_SIGNAL else None)
+            self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._project, self._files, outcome, wall_s)
             record |= {"backend": self._backend, "domain_id": self._domain.id, "started": started}

@@ -121,7 +121,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         choices=("auto", "docker", "process", "in-process"),
         default="auto",
         help="where nodes run: each in a container, each in a process, or all in one process"
-        " (default: auto, which is docker where an engine and the images are there, else process)",
+        " (default: auto; docker is not built in yet, so auto is process)",
     )
     launch.add_argument(
         "--duration",
@@ -204,7 +204,8 @@ def _validate(options: argparse.Namespace) -> int:
 
     project = load(options)
     print(
-        f"{project.file}: valid: {len(project.nodes)} nodes, {len(project.connections)} connections"
+        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
+        f" {_count(len(project.connections), 'connection')}"
     )
     return 0
 
@@ -222,6 +223,10 @@ def _node(options: argparse.Namespace) -> int:
     from neuros.cli.node import run_node
 
     return run_node(options)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _complain(text: str) -> None:

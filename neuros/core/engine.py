@@ -215,7 +215,8 @@ class Engine:
     def is_wakeable(self) -> bool:
         """Whether a hook is ready, or something other than its connections could make one so.
 
-        That is a receiver that has still to appear, a timer, a source, or an external topic.
+        That is a receiver that has still to appear, a timer, or an external topic. A thread that
+        may offer packets is known to the runtime only.
         """
         if self.is_stopped:
             return False
@@ -431,7 +432,7 @@ class Engine:
 def _could_wake(hook: Hook) -> bool:
     """Whether it is ready, or could become so with no packet or acknowledgement of a neighbour."""
     if isinstance(hook, Source) and not hook.is_due:
-        return True
+        return False
     return hook.can_send() and all(slot.could_be_filled_from_outside() for slot in hook.slots)
 
 

@@ -116,7 +116,10 @@ def _valid(text: str, source: str) -> int:
     # Nothing but ASCII digits: int() would also take "1_0", "+1" and other scripts' digits.
     if text.isascii() and text.isdigit() and int(text) <= _HIGHEST:
         return int(text)
-    raise UsageError(f"{source}: {text!r} is no ROS domain id: use a whole number from 0 to 101")
+    raise UsageError(
+        f"{source}: {text!r} is no ROS domain id: use a whole number from 0 to 101 (up to"
+        f" {_HIGHEST} where the machine's ephemeral ports allow it)"
+    )
 
 
 def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:

@@ -19,6 +19,7 @@ class Outcome:
         started_s: when the first hook started, ``None`` if none did.
         ending_s: when the end was asked for first: what comes after is draining and finalising.
         ended_s: when all processes had ended.
+        is_signalled: whether the user has asked for the end by a signal, be it after another cause.
         failures: one line for each, in the order in which they became known.
     """
 
@@ -30,6 +31,7 @@ class Outcome:
     ending_s: float | None = None
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)
+    is_signalled: bool = False
 
     def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""

@@ -92,7 +92,6 @@ class Supervisor:
         self._processes: list[RunningNode] = []
         self._killed: set[str] = set()
         self._has_told_failure: set[str] = set()
-        self._has_been_signalled = False
         self._channels = Channels(run_folder)
         self._watch = Watch(names, time.monotonic())
         self._probing = Probing(names, _connections_among(files), self._channels.send)
@@ -224,12 +223,12 @@ class Supervisor:
                 self.outcome.reason = f"ended by {name}"
                 self._output.log("INFO", f"{name}: stopping (once more kills at once)")
                 self._stop()
-                self._has_been_signalled = True
-            elif self._phase is Phase.STOPPING and self._has_been_signalled:
+                self.outcome.is_signalled = True
+            elif self._phase is Phase.STOPPING and self.outcome.is_signalled:
                 self._output.log("WARN", f"{name} again: killing what is left")
                 self._kill_all()
             elif self._phase is Phase.STOPPING:
-                self._has_been_signalled = True
+                self.outcome.is_signalled = True
                 self._output.log("INFO", f"{name}: already ending (once more kills at once)")
 
     # ------------------------------------------------------------------ processes

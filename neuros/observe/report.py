@@ -7,7 +7,6 @@ from typing import Any, Protocol
 
 from neuros.project.model import Connection, NodeFile, Project
 
-
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -31,6 +32,9 @@ class NodeRuntime:
         fail: called with an error that ends the project.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
         clock: monotonic clock in nanoseconds.
+
+    Attributes:
+        waiting_threads: those that wait until packets that they have offered are sent.
     """
 
     def __init__(
@@ -48,6 +52,7 @@ class NodeRuntime:
         self.file = file
         self.name = file.node.name
         self.is_ending = False
+        self.waiting_threads: set[threading.Thread] = set()
         self._middleware = middleware
         self._stage = stage
         self._tell = tell
@@ -233,14 +238,21 @@ class NodeRuntime:
     ) -> Callable[[Callable[[], None]], None]:
         """Offer packets from another thread; returns a function that withdraws them."""
         withdrawals: list[Callable[[], None]] = []
+        thread = threading.current_thread()
+
+        def accept() -> None:
+            self.waiting_threads.discard(thread)
+            accepted()
 
         def offer() -> None:
-            withdrawals.append(self._loaded.offer(packets, accepted))
+            self.waiting_threads.add(thread)
+            withdrawals.append(self._loaded.offer(packets, accept))
             if self._duration_sim_s is not None:
                 self._check_duration()
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:
+                self.waiting_threads.discard(thread)
                 for each in withdrawals:
                     each()
                 done()

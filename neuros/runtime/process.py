@@ -101,10 +101,11 @@ class NodeProcess:
         """Report the state of all nodes at one moment. Loop thread only."""
         assert self._middleware is not None
         is_idle = not self._middleware.loop.has_waiting_events
+        has_free_threads = self._has_free_threads()
         for node in self._nodes:
             fields = node.probe()
             # A thread of a plugin may submit packets, or end the project, at any time.
-            fields["is_wakeable"] = fields["is_wakeable"] or _has_other_threads()
+            fields["is_wakeable"] = fields["is_wakeable"] or has_free_threads
             self._tell("report", **fields, probe=number, is_idle=is_idle)
 
     def report(self, *, is_final: bool = False) -> None:
@@ -171,6 +172,15 @@ class NodeProcess:
             )
         )
 
+    def _has_free_threads(self) -> bool:
+        """Whether there is a thread, besides NeuROS's own, that does not wait for a connection."""
+        bound = {threading.main_thread(), threading.current_thread()}
+        bound.update(*(node.waiting_threads for node in self._nodes))
+        return any(
+            thread not in bound and not isinstance(thread, ControlThread)
+            for thread in threading.enumerate()
+        )
+
     def _tell(self, kind: str, **fields: Any) -> None:
         assert self._lines is not None
         with self._tell_lock:
@@ -219,15 +229,6 @@ def _filenames(error: BaseException) -> Iterator[str]:
     while trace is not None:
         yield trace.tb_frame.f_code.co_filename
         trace = trace.tb_next
-
-
-def _has_other_threads() -> bool:
-    """Whether there are threads besides the loop's and NeuROS's own."""
-    own = (threading.main_thread(), threading.current_thread())
-    return any(
-        thread not in own and not isinstance(thread, ControlThread)
-        for thread in threading.enumerate()
-    )
 
 
 def _log_file(file: NodeFile) -> Path:

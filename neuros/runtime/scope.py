@@ -8,15 +8,21 @@ two: whole dictionaries are exchanged rather than filled.
 
 from __future__ import annotations
 
+import importlib.abc
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 # Below a project's folder there may be a virtual environment, or NeuROS itself: all share those.
 _SHARED = (str(Path(sys.prefix)) + os.sep, str(Path(__file__).resolve().parents[1]) + os.sep)
+
+
+# Libraries whose state belongs to the whole process, so that one node at most can use them.
+_FOR_ONE_NODE = {"nest": "NEST has one kernel per process"}
 
 
 class Scope:
@@ -52,8 +58,10 @@ class Scope:
 
     def hides(self, module: ModuleType) -> bool:
         """Whether a module is private to this node."""
+        if not self.project:
+            return False
         file = str(getattr(module, "__file__", None) or "")
-        return bool(self.project) and file.startswith(self.project) and not _is_shared(file)
+        return file.startswith(self.project) and not file.startswith(_SHARED)
 
 
 class Stage:
@@ -63,6 +71,7 @@ class Stage:
         self._process = Scope({}, _environ_data(), sys.path)
         self._current = self._process
         self._known_modules = len(sys.modules)
+        self._owned: dict[str, _Owned] = {}
 
     def scope(
         self,
@@ -102,6 +111,8 @@ class Stage:
         current.path, sys.path = sys.path, scope.path
         if scope.modules:
             sys.modules.update(scope.modules)
+        for owned in self._owned.values():
+            owned.show(is_visible=scope is owned.owner or scope is self._process)
         self._known_modules = len(sys.modules)
         if scope.log_fd is not None:
             os.dup2(scope.log_fd, 1)
@@ -126,12 +137,46 @@ class Stage:
             for name, module in tuple(sys.modules.items()):
                 if scope.hides(module):
                     scope.modules[name] = module
+            self._note_owned(scope)
         for name in scope.modules:
             sys.modules.pop(name, None)
 
+    def _note_owned(self, scope: Scope) -> None:
+        for name in _FOR_ONE_NODE:
+            module = sys.modules.get(name)
+            if module is not None and name not in self._owned and scope is not self._process:
+                self._owned[name] = _Owned(name, module, scope)
 
-def _is_shared(file: str) -> bool:
-    return file.startswith(_SHARED)
+
+class _Owned(importlib.abc.MetaPathFinder):
+    """A library that one node has imported, hidden from and refused to the others."""
+
+    def __init__(self, name: str, module: ModuleType, owner: Scope) -> None:
+        self.name, self.module, self.owner = name, module, owner
+
+    def show(self, *, is_visible: bool) -> None:
+        """Let it be imported now, or not."""
+        if is_visible:
+            sys.modules[self.name] = self.module
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
+        else:
+            sys.modules.pop(self.name, None)
+            if self not in sys.meta_path:
+                sys.meta_path.insert(0, self)
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None,
+        target: ModuleType | None = None,
+    ) -> ModuleSpec | None:
+        if fullname != self.name:
+            return None
+        raise ImportError(
+            f"{_FOR_ONE_NODE[fullname]}, and another node of this process uses it: run the project"
+            " with --backend process"
+        )
 
 
 def _open_log(path: Path) -> int:

@@ -31,6 +31,13 @@ LATCHED = QoSProfile(
 )
 """QoS of ``/reg`` and ``/ack``: the last message also reaches who comes later."""
 
+HEARD = QoSProfile(
+    depth=10,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""QoS of the reader of ``/reg``: both ends speak there, so it keeps more than the last word."""
+
 _READY = "ready"
 _CONFIRMED = "confirmed"
 
@@ -62,7 +69,7 @@ class Registration:
         self._peer_is_ready = False
         topic = f"{connection.topic}/reg"
         self._voice = ros_node.create_publisher(String, topic, LATCHED)
-        self._ear = ros_node.create_subscription(String, topic, self._hear, 10)
+        self._ear = ros_node.create_subscription(String, topic, self._hear, HEARD)
 
     def advance(self) -> bool:
         """Look again, announce or confirm where it is time; returns whether all is done."""

@@ -16,14 +16,12 @@ from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from std_msgs.msg import UInt64
 
+from neuros.core.engine import EXTERNAL_DEPTH
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.messages import message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop
-
-EXTERNAL_DEPTH = 10
-"""``depth`` of external topics: ROS's default."""
 
 _ANNOUNCE_S = 0.02
 

@@ -150,9 +150,9 @@ def test_a_packet_of_a_wrong_type_is_an_error_and_is_not_accepted():
     assert accepted == [False]
 
 
-def test_a_source_between_two_offers_could_wake_the_node_and_a_blocked_one_cannot():
+def test_a_source_cannot_wake_the_node_since_threads_are_the_runtimes_business():
     bench, accepted = Bench(connections=[wire(OUT, 0)]), []
     offer(bench, accepted, o=1)
-    assert bench.engine.is_wakeable
+    assert not bench.engine.is_wakeable
     offer(bench, accepted, o=2)
     assert not bench.engine.is_wakeable

@@ -42,36 +42,39 @@ def counts(run: Finished, connection: str) -> tuple[int, ...]:
     return tuple(found[key] for key in ("sent", "received", "consumed", "discarded", "lost"))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_hybrid_loses_no_imu_packet_and_tracks_the_heading(backend, tmp_path):
-    run = whiskeye("project", backend, tmp_path)
-    assert counts(run, IMU) == (PACKETS, PACKETS, PACKETS, 0, 0)
-    assert run.connection(TRUTH)["sent"] == run.connection(ESTIMATE)["sent"] == PACKETS
-    found = results(run)
+@pytest.fixture(scope="module", params=BACKENDS)
+def hybrid(request, tmp_path_factory):
+    """One run of project.json on each back end."""
+    return whiskeye("project", request.param, tmp_path_factory.mktemp("hybrid"))
+
+
+def test_the_hybrid_loses_no_imu_packet_and_tracks_the_heading(hybrid):
+    assert counts(hybrid, IMU) == (PACKETS, PACKETS, PACKETS, 0, 0)
+    assert hybrid.connection(TRUTH)["sent"] == hybrid.connection(ESTIMATE)["sent"] == PACKETS
+    found = results(hybrid)
     assert found["rms_deg"] <= 5
     assert found["max_deg"] <= 12
     assert found["samples"] > PACKETS / 4
-    assert run.record["sim_s"] == pytest.approx(SECONDS)
-    assert any(line.startswith("head-direction error: RMS") for line in run.said("visualiser"))
+    assert hybrid.record["sim_s"] == pytest.approx(SECONDS)
+    assert any(line.startswith("head-direction error: RMS") for line in hybrid.said("visualiser"))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_visualiser_writes_a_picture_a_table_and_the_error(backend, tmp_path):
-    run = whiskeye("project", backend, tmp_path)
-    folder = run.run_folder / "visualiser"
+def test_the_visualiser_writes_a_picture_a_table_and_the_error(hybrid):
+    folder = hybrid.run_folder / "visualiser"
     assert (folder / "head_direction.png").read_bytes().startswith(b"\x89PNG")
     with (folder / "head_direction.csv").open() as file:
         rows = list(csv.DictReader(file))
-    found = results(run)
+    found = results(hybrid)
     for column, count in (("estimate_rad", "estimates"), ("truth_rad", "truths")):
         assert sum(bool(row[column]) for row in rows) == found[count]
     for connection, count in ((ESTIMATE, "estimates"), (TRUTH, "truths")):
-        assert run.connection(connection)["consumed"] == found[count]
+        assert hybrid.connection(connection)["consumed"] == found[count]
 
 
 def test_the_strict_variant_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
     tables = []
     for backend in BACKENDS:
+        (tmp_path / backend).mkdir()
         run = whiskeye("strict", backend, tmp_path / backend)
         for connection in (IMU, TRUTH, ESTIMATE):
             assert counts(run, connection) == (PACKETS, PACKETS, PACKETS, 0, 0)
@@ -83,19 +86,18 @@ def test_the_strict_variant_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
 @pytest.mark.parametrize(
     ("variant", "setting"),
     [
-        ("no_discard_limit", "nodes.robot.environment.RATE=1.0"),
         ("tick_20ms", "nodes.robot.environment.TICK_SECONDS=0.01"),
         ("asynchronous", "nodes.robot.environment.REAL_TIME_FACTOR=4"),
-        ("asynchronous", "nodes.robot.environment.REAL_TIME_FACTOR=max"),
     ],
-    ids=["no_discard_limit", "tick", "asynchronous", "asynchronous_max"],
+    ids=["tick", "asynchronous"],
 )
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_variants_that_may_lose_packets_end_properly(backend, variant, setting, tmp_path):
     run = whiskeye(variant, backend, tmp_path, setting)
-    assert run.record["sim_s"] == pytest.approx(SECONDS, abs=0.5)
+    sim_s = run.record["sim_s"]
+    assert SECONDS <= sim_s + 1e-6 < SECONDS + 2  # a free simulation notices a little later
     imu = run.connection(IMU)
-    assert imu["sent"] == pytest.approx(PACKETS, abs=25)
+    assert imu["sent"] == pytest.approx(50 * sim_s, abs=2)
     assert imu["sent"] == imu["received"] + imu["lost"]
     assert imu["received"] == imu["consumed"] + imu["discarded"] + imu["unread"]
     assert imu["consumed"] > 0

@@ -1,4 +1,4 @@
-"""WhiskEye with windows, on a display without a screen: they open, and may be closed at any time."""
+"""WhiskEye with windows, on a display without a screen: they open, and may be closed early."""
 
 from __future__ import annotations
 

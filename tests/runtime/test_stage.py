@@ -103,6 +103,27 @@ def test_modules_beside_the_plugin_are_loaded_per_node_and_others_shared(stage, 
     assert "stage_sibling" not in sys.modules
 
 
+def test_nest_belongs_to_the_first_node_that_imports_it(stage, scope, tmp_path, monkeypatch):
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "nest.py").write_text("KERNEL = object()\n")
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.delitem(sys.modules, "nest", raising=False)
+    stage = Stage()
+    ann, bob = (
+        stage.scope({}, tmp_path / "project" / "plugin.py", tmp_path / "project") for _ in "ab"
+    )
+    stage.enter(ann)
+    kernel = importlib.import_module("nest").KERNEL
+    stage.enter(bob)
+    with pytest.raises(ImportError, match=r"one kernel per process.*--backend process"):
+        importlib.import_module("nest")
+    stage.enter(ann)
+    assert importlib.import_module("nest").KERNEL is kernel
+    stage.leave()
+    assert importlib.import_module("nest").KERNEL is kernel
+
+
 def test_a_virtual_environment_below_the_project_is_shared(stage, tmp_path, monkeypatch):
     project = Path(sys.prefix).parent
     each = stage.scope({}, project / "plugin.py", project)

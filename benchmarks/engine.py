@@ -1,0 +1,116 @@
+"""What one execution of a hook costs that does nothing: scheduling, bookkeeping, loop-back.
+
+Once on the engine alone (no ROS, no event loop), and once in a real run on either back end.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from benchmarks.launching import PLUGINS, launch, project_of_plugins
+from benchmarks.measure import Row, Target, in_rounds
+from neuros.core.engine import Engine
+from neuros.core.hook import Hook
+from neuros.hooks import hook_specs_of, neuros_function
+from neuros.project.model import Connection, Node, Port
+
+
+def measure(is_quick: bool, say: Callable[[str], None]) -> list[Row]:
+    """All rows of this module."""
+    count, rounds = (20_000, 2) if is_quick else (100_000, 9)
+    values = in_rounds(
+        {
+            "engine alone, loop-back": functools.partial(loop_back_us, count),
+            "engine alone, packet and acknowledgement": functools.partial(relay_us, count),
+            "in process": functools.partial(real_run_us, "in-process", count),
+            "process": functools.partial(real_run_us, "process", count),
+        },
+        rounds,
+        say,
+    )
+    return [
+        Row(f"execution of a hook, {name}", "us", each, target=Target(15))
+        for name, each in values.items()
+    ]
+
+
+class Surroundings:
+    """Effects that have none: hooks are called, everything else goes nowhere."""
+
+    def __init__(self) -> None:
+        self.events: deque[Callable[[], None]] = deque()
+        self.post = self.post_loop_back = self.events.append
+
+    def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
+        return hook.spec.function(self, *arguments)
+
+    def send(self, connections: Sequence[Connection], packet: Any) -> None: ...
+    def send_external(self, port: Port, packet: Any) -> None: ...
+    def acknowledge(self, connection: Connection, position: int) -> None: ...
+
+    def copy(self, packet: Any) -> Any:
+        return packet
+
+
+def loop_back_us(count: int) -> float:
+    """Microseconds per execution of a hook without inputs and outputs."""
+
+    def idle(node: Any) -> None: ...
+
+    surroundings = Surroundings()
+    _engine([], neuros_function()(idle), surroundings).start()
+    start_ns = time.perf_counter_ns()
+    for _ in range(count):
+        surroundings.events.popleft()()
+    return (time.perf_counter_ns() - start_ns) / count / 1e3
+
+
+def relay_us(count: int) -> float:
+    """The same for a hook that sends on what arrives, losslessly: two events per execution."""
+
+    def relay(node: Any, packet: Any) -> Any:
+        return packet
+
+    arriving = Connection("before", "out", "node", "in_", 0)
+    leaving = Connection("node", "out", "after", "in_", 0)
+    engine = _engine([arriving, leaving], neuros_function("in_", "out")(relay), Surroundings())
+    engine.on_registered(leaving)
+    engine.start()
+    start_ns = time.perf_counter_ns()
+    for position in range(1, count + 1):
+        engine.on_packet(arriving, "packet")
+        engine.on_acknowledgement(leaving, position)
+    return (time.perf_counter_ns() - start_ns) / count / 1e3
+
+
+def real_run_us(backend: str, count: int) -> float:
+    """Microseconds per execution in a run as users start it."""
+    node = {
+        "name": "idler",
+        "container": "neuros_python",
+        "plugin": "idler.py",
+        "environment": {"EXECUTIONS": str(count)},
+    }
+    with project_of_plugins({"nodes": [node], "connections": []}) as folder:
+        launch(folder, folder / "run", backend)
+        return float(json.loads((folder / "run" / "idler" / "result.json").read_text()))
+
+
+def _engine(
+    connections: Sequence[Connection], hook: Callable[..., Any], surroundings: Surroundings
+) -> Engine:
+    port = "std_msgs/msg/String"
+    node = Node(
+        "node",
+        "neuros_python",
+        PLUGINS / "echo.py",
+        inputs=tuple(Port("in_", port) for c in connections if c.destination_node == "node"),
+        outputs=tuple(Port("out", port) for c in connections if c.source_node == "node"),
+    )
+    specs = hook_specs_of({hook.__name__: hook})
+    return Engine(node, connections, specs, surroundings, time.monotonic_ns)

@@ -1,0 +1,272 @@
+"""What the command line takes, refuses and answers; runs as such are in tests/integration."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from neuros.cli.launch import Duration, make_run_folder, parse_duration
+from neuros.cli.main import main
+from neuros.errors import UsageError
+
+PORT = "std_msgs/msg/Int32"
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """Two connected nodes, ``a`` and ``b``."""
+    (tmp_path / "plugin.py").write_text("")
+    nodes = [
+        {
+            "name": name,
+            "container": "neuros_python",
+            "plugin": "plugin.py",
+            side: [{"name": port, "type": PORT}],
+        }
+        for name, side, port in (("a", "outputs", "o"), ("b", "inputs", "x"))
+    ]
+    connection = {
+        "source_node": "a",
+        "source_output": "o",
+        "destination_node": "b",
+        "destination_input": "x",
+    }
+    file = tmp_path / "project.json"
+    file.write_text(json.dumps({"nodes": nodes, "connections": [connection]}))
+    return file
+
+
+# ------------------------------------------------------------------ help
+
+
+def test_help_needs_nothing_that_takes_long_to_import() -> None:
+    program = (
+        "import sys\n"
+        "from neuros.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'rclpy', 'jsonschema', 'numpy', 'mujoco', 'tabulate', 'neuros.cli.launch'}\n"
+        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", program], check=True, stdout=subprocess.DEVNULL, timeout=30
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["launch", "--help"]])
+def test_help_documents_the_exit_codes(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    for code in ("0", "1", "2", "3", "4", "130", "143"):
+        assert f"\n  {code:<4} " in text
+
+
+def test_what_does_not_work_yet_is_not_offered(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["launch", "--help"])
+    text = capsys.readouterr().out
+    for option in ("--record", "--monitor-system-load", "--node-graph", "--visualisations"):
+        assert option not in text
+
+
+# ------------------------------------------------------------------ usage: exit code 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ([], "name a project"),
+        ([".", "-p", "other"], "two projects are named"),
+        ([".", "-n", "c"], "-n c: no such node; the project has a, b"),
+        ([".", "--duration", "soon"], "--duration soon: give seconds"),
+        ([".", "--duration", "0"], "--duration 0: give seconds"),
+        ([".", "-d", "300"], "-d/--domain-id: '300' is no ROS domain id"),
+        ([".", "--backend", "docker"], "--backend docker: not there yet"),
+        ([".", "--backend", "in-process", "-n", "a"], "-n leaves out one end of a.o -> b.x"),
+        ([".", "-o", "plugin.py"], "-o plugin.py: is not an empty folder"),
+        ([".", "-o", "."], "-o .: is not an empty folder"),
+    ],
+)
+def test_wrong_usage_is_one_sentence(
+    project: Path, arguments: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", *arguments]) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"neuros: {reason}")
+    assert output.err.count("\n") == 1
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["launch", ".", "-d", "x"], ["launch", "--x"]])
+def test_wrong_options_end_with_2_as_well(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_to_is_one_sentence(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sealed").mkdir(mode=0o500)
+    os.chdir(tmp_path / "sealed")
+    assert main(["launch", str(project)]) == 2
+    assert "cannot be made (Permission denied): name one with -o" in capsys.readouterr().err
+
+
+def test_nor_one_that_is_no_folder(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", ".", "-o", "/proc/1/no/such/folder"]) == 2
+    assert "cannot be made (" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------ projects: exit code 3
+
+
+def test_simulated_time_needs_a_node_that_owns_it(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", ".", "--duration", "3sim"]) == 3
+    assert "needs exactly one node that owns time: none" in capsys.readouterr().err
+
+
+def test_a_project_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", "nowhere"]) == 3
+    output = capsys.readouterr()
+    assert "nowhere" in output.err
+    assert "Traceback" not in output.err
+
+
+# ------------------------------------------------------------------ machine: exit code 4
+
+
+def test_a_machine_without_rclpy_is_one_sentence(
+    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("neuros.cli.launch.find_spec", lambda name: None)
+    assert main(["launch", "."]) == 4
+    output = capsys.readouterr()
+    assert output.err.startswith("neuros: rclpy, the Python library of ROS 2, is not installed")
+    assert not Path("runs").exists()
+
+
+# ------------------------------------------------------------------ without running
+
+
+def test_a_dry_run_starts_nothing_and_writes_nothing(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(project.parent.rglob("*"))
+    assert main(["launch", ".", "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("back end process; ROS domain ")
+    assert [line.split(":")[0] for line in lines[1:]] == ["process a", "process b"]
+    assert sorted(project.parent.rglob("*")) == before
+
+
+def test_a_dry_run_in_process_is_one_process(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", ".", "--dry-run", "--backend", "in-process"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("one process for a, b: ")
+
+
+def test_validate_says_that_all_is_well(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "."]) == 0
+    assert capsys.readouterr().out.endswith("valid: 2 nodes, 1 connections\n")
+
+
+@pytest.mark.parametrize("form", ["text", "mermaid"])
+def test_graph_names_every_node(
+    project: Path, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["graph", ".", "--format", form]) == 0
+    text = capsys.readouterr().out
+    assert "a" in text
+    assert "b" in text
+
+
+# ------------------------------------------------------------------ streams
+
+
+def test_a_reader_that_has_gone_is_no_traceback(project: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    process = subprocess.run(
+        [sys.executable, "-m", "neuros.cli", "graph", str(project)],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    os.close(writer)
+    assert process.stderr == ""
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_standard_streams_may_be_closed(project: Path, closed: str) -> None:
+    command = f'"{sys.executable}" -m neuros.cli launch . --dry-run {closed}'
+    assert subprocess.call(["/bin/sh", "-c", command], timeout=30) == 0
+
+
+def test_ctrl_c_without_a_run_is_no_traceback(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(options: object) -> int:
+        os.kill(os.getpid(), signal.SIGINT)
+        return 0
+
+    monkeypatch.setattr("neuros.cli.main._validate", interrupted)
+    assert main(["validate", "."]) == 130
+
+
+# ------------------------------------------------------------------ parts
+
+
+@pytest.mark.parametrize(
+    ("text", "duration"),
+    [
+        (None, Duration()),
+        ("30", Duration(wall_s=30.0)),
+        ("0.5", Duration(wall_s=0.5)),
+        (".5", Duration(wall_s=0.5)),
+        ("30sim", Duration(sim_s=30.0)),
+        (" 1.sim ", Duration(sim_s=1.0)),
+    ],
+)
+def test_durations(text: str | None, duration: Duration) -> None:
+    assert parse_duration(text) == duration
+
+
+@pytest.mark.parametrize("text", ["", "-1", "0sim", "1e3", "nan", "30 s", "sim", "1,5"])
+def test_what_is_no_duration(text: str) -> None:
+    with pytest.raises(UsageError, match="give seconds, as 30, or 30sim"):
+        parse_duration(text)
+
+
+def test_run_folders_are_named_by_project_and_time(tmp_path: Path) -> None:
+    first, second = make_run_folder(None, "tennis"), make_run_folder(None, "tennis")
+    assert first != second
+    assert first.parent == tmp_path / "runs" / "tennis"
+    assert first < second
+
+
+def test_a_given_run_folder_is_taken_exactly(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    assert make_run_folder("empty", "tennis") == tmp_path / "empty"
+    assert make_run_folder("deep/er", "tennis") == tmp_path / "deep" / "er"
