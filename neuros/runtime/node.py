@@ -219,8 +219,9 @@ class NodeRuntime:
         self._tell("shutdown", node=self.name, reason=reason, drain_s=drain_s)
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
-        """Take simulated time from a simulator."""
+        """Take simulated time from a simulator, rather than from a clock that it publishes."""
         self._read_time_s = read_s
+        self._clock_ports.clear()
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call back when the node ends."""

@@ -11,9 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from neuros.cli.launch import Duration, make_run_folder, parse_duration
 from neuros.cli.main import main
-from neuros.errors import UsageError
+from neuros.cli.plan import (
+    MOST_LOCAL_PROCESSES,
+    Duration,
+    Plan,
+    check_machine,
+    parse_duration,
+)
+from neuros.cli.run_folder import make_run_folder
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.model import Node, Project
 
 PORT = "std_msgs/msg/Int32"
 
@@ -157,7 +165,7 @@ def test_a_project_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None
 def test_a_machine_without_rclpy_is_one_sentence(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("neuros.cli.launch.find_spec", lambda name: None)
+    monkeypatch.setattr("neuros.cli.plan.find_spec", lambda name: None)
     assert main(["launch", "."]) == 4
     output = capsys.readouterr()
     assert output.err.startswith("neuros: rclpy, the Python library of ROS 2, is not installed")
@@ -187,7 +195,7 @@ def test_a_dry_run_in_process_is_one_process(
 
 def test_validate_says_that_all_is_well(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["validate", "."]) == 0
-    assert capsys.readouterr().out.endswith("valid: 2 nodes, 1 connections\n")
+    assert capsys.readouterr().out.endswith("valid: 2 nodes, 1 connection\n")
 
 
 @pytest.mark.parametrize("form", ["text", "mermaid"])
@@ -270,3 +278,18 @@ def test_a_given_run_folder_is_taken_exactly(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert make_run_folder("empty", "tennis") == tmp_path / "empty"
     assert make_run_folder("deep/er", "tennis") == tmp_path / "deep" / "er"
+
+
+def plan_of(count: int, backend: str) -> Plan:
+    nodes = tuple(Node(f"node{i}", "neuros_python", Path("plugin.py")) for i in range(count))
+    project = Project("many", nodes, (), Path("project.json"))
+    return Plan(project, tuple(n.name for n in nodes), backend, Duration(), False)
+
+
+def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_named() -> None:
+    too_many = MOST_LOCAL_PROCESSES + 1
+    with pytest.raises(EnvironmentFault, match="--backend in-process, or set ROS_AUTOMATIC"):
+        check_machine(plan_of(too_many, "process"), {})
+    check_machine(plan_of(MOST_LOCAL_PROCESSES, "process"), {})
+    check_machine(plan_of(too_many, "in-process"), {})
+    check_machine(plan_of(too_many, "process"), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})

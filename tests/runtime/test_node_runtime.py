@@ -234,6 +234,20 @@ def test_a_published_clock_is_the_simulated_time_of_the_node(plugin):
     assert bench.sim_time_s == 3.25
 
 
+def test_the_time_of_a_simulator_counts_more_than_the_clock_that_it_publishes(plugin):
+    text = """
+        @neuros_tick(seconds=0.5, outputs="clock")
+        def step(node):
+            node.own_simulated_time(lambda: 3.26)
+            clock = node.make_packet("clock")
+            clock.clock.sec, clock.clock.nanosec = 3, 250_000_000
+            return clock
+    """
+    bench = PluginHarness(plugin(text), outputs={"clock": "rosgraph_msgs/msg/Clock"})
+    bench.advance(0.5)
+    assert bench.sim_time_s == 3.26
+
+
 def test_a_simulator_may_own_the_time(plugin):
     bench = echo(plugin)
     bench.node.own_simulated_time(lambda: 1.5)

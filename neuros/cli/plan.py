@@ -1,0 +1,178 @@
+"""What is to be run: the choices of the command line, put together and checked before a start."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from neuros.cli.projects import load
+from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
+from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.process import ProcessLauncher
+from neuros.ports import Launcher
+from neuros.project.model import Folders, NodeFile, Project
+from neuros.project.split import split
+from neuros.project.validate import nest_conflicts
+
+MOST_LOCAL_PROCESSES = 30
+"""ROS processes that surely find each other with LOCALHOST discovery (measured: about 33)."""
+
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+
+
+@dataclass(frozen=True)
+class Duration:
+    """What ``--duration`` says: wall seconds, or simulated seconds."""
+
+    wall_s: float | None = None
+    sim_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A project, which of its nodes to start, where, and for how long."""
+
+    project: Project
+    names: tuple[str, ...]
+    backend: str
+    duration: Duration
+    is_verbose: bool
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether some nodes are left out: they may be running elsewhere."""
+        return len(self.names) < len(self.project.nodes)
+
+    @property
+    def needs_known_domain(self) -> bool:
+        """Whether others have to find this run, so that it cannot hide in a domain of its own."""
+        nodes = self.project.nodes
+        ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
+        return self.is_partial or any(port.external_topic is not None for port in ports)
+
+    def node_files(self, folders: Folders) -> list[NodeFile]:
+        """One ``node.json`` per node that is to be started."""
+        files = split(self.project, lambda _: folders)
+        return [file for file in files if file.node.name in self.names]
+
+    def launcher(self, on_started: Callable[[int], None] | None = None) -> Launcher:
+        """The launcher of the back end; ``on_started`` hears of every process."""
+        command = [sys.executable, "-m", "neuros.cli", "node"]
+        if self.duration.sim_s is not None:
+            command += ["--duration-sim", repr(self.duration.sim_s)]
+        if self.is_verbose:
+            command.append("--debug")
+        if self.backend == "in-process":
+            return InProcessLauncher([*command, "--in-memory"], on_started)
+        return ProcessLauncher(command, on_started)
+
+
+def make_plan(options: argparse.Namespace) -> Plan:
+    """Put together what the command line asks for.
+
+    Raises:
+        UsageError, ProjectError, EnvironmentFault: if that cannot be run.
+    """
+    duration = parse_duration(options.duration)
+    project = load(options)
+    backend = choose_backend(options.backend)
+    names = _chosen_names(project, options.node, backend)
+    plan = Plan(project, names, backend, duration, options.verbose)
+    problems = [*_nest_problems(plan), *_time_problems(plan)]
+    if problems:
+        raise ProjectError(problems)
+    if not options.dry_run:
+        check_machine(plan, os.environ)
+    return plan
+
+
+def parse_duration(text: str | None) -> Duration:
+    """``30``, ``0.5``, or ``30sim``.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    if text is None:
+        return Duration()
+    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(sim)?", text.strip())
+    if match is None or float(match[1]) <= 0:
+        raise UsageError(f"--duration {text}: give seconds, as 30, or 30sim for simulated time")
+    seconds = float(match[1])
+    return Duration(sim_s=seconds) if match[2] else Duration(wall_s=seconds)
+
+
+def choose_backend(wanted: str) -> str:
+    """The back end for ``--backend``.
+
+    Raises:
+        UsageError: for one that does not exist yet.
+    """
+    if wanted == "docker":
+        raise UsageError("--backend docker: not there yet; use process or in-process")
+    return "process" if wanted == "auto" else wanted
+
+
+def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
+    """Check that this machine can run the plan.
+
+    Raises:
+        EnvironmentFault: if ROS is missing, or cannot join so many processes.
+    """
+    if find_spec("rclpy") is None:
+        raise EnvironmentFault(
+            f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
+            " install.py"
+        )
+    is_local = environ.get(_RANGE, "LOCALHOST") == "LOCALHOST"
+    if plan.backend == "process" and is_local and len(plan.names) > MOST_LOCAL_PROCESSES:
+        raise EnvironmentFault(
+            f"{len(plan.names)} processes are more than find each other with discovery on this"
+            f" machine only ({MOST_LOCAL_PROCESSES}): use --backend in-process, or set"
+            f" {_RANGE}=SUBNET"
+        )
+
+
+def _chosen_names(project: Project, wanted: Sequence[str], backend: str) -> tuple[str, ...]:
+    known = [node.name for node in project.nodes]
+    for name in wanted:
+        if name not in known:
+            raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
+    chosen = tuple(name for name in known if not wanted or name in wanted)
+    if backend == "in-process":
+        for connection in project.connections:
+            ends = {connection.source_node, connection.destination_node}
+            if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
+                raise UsageError(
+                    f"-n leaves out one end of {connection}, which the in-process back end"
+                    " cannot reach; use --backend process"
+                )
+    return chosen
+
+
+def _nest_problems(plan: Plan) -> Sequence[Problem]:
+    return nest_conflicts(plan.project) if plan.backend == "in-process" else ()
+
+
+def _time_problems(plan: Plan) -> Sequence[Problem]:
+    if plan.duration.sim_s is None:
+        return ()
+    nodes = plan.project.nodes
+    owners = [node.name for node in nodes if node.owns_time and node.name in plan.names]
+    if len(owners) == 1:
+        return ()
+    return [
+        Problem(
+            str(plan.project.file),
+            1,
+            1,
+            "/nodes",
+            "--duration in simulated time needs exactly one node that owns time:"
+            f" {', '.join(owners) or 'none'}",
+            "a node owns time if a port of it has mujoco, or its output is a Clock",
+        )
+    ]

@@ -1,0 +1,95 @@
+"""The folder that a run leaves behind.
+
+::
+
+    runs/<project>/<utc time>/     or exactly what -o names
+        project.json               the expanded project
+        run.json                   how the run went
+        <node>/node.json           what the node was told
+        <node>/node.log            what it printed and logged
+        <node>/...                 what its plugin wrote to node.run_dir
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from neuros.cli.plan import Plan
+from neuros.cli.projects import WORKSPACE
+from neuros.errors import UsageError
+from neuros.project.model import Folders, NodeFile
+from neuros.project.split import node_file_to_json, project_to_json
+
+
+def run_folder_path(output: str | None, project_name: str, time: str | None = None) -> Path:
+    """Where a run goes: ``output``, else a folder of the project and ``time`` (now, in UTC)."""
+    if output is not None:
+        return Path(output).absolute()
+    stamp = time or datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%S.%fZ")
+    return Path.cwd() / "runs" / project_name / stamp
+
+
+def make_run_folder(output: str | None, project_name: str) -> Path:
+    """Create the folder of a run.
+
+    Raises:
+        UsageError: if it exists and is not empty, or cannot be created.
+    """
+    folder = run_folder_path(output, project_name)
+    try:
+        if output is not None and _is_taken(folder):
+            raise UsageError(f"-o {output}: is not an empty folder; name a new one")
+        folder.mkdir(parents=True, exist_ok=output is not None)
+    except OSError as error:
+        raise UsageError(
+            f"the run folder {folder} cannot be made ({error.strerror}): name one with -o"
+        ) from error
+    return folder
+
+
+def _is_taken(folder: Path) -> bool:
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+
+
+def folders_of(plan: Plan, run_folder: Path) -> Folders:
+    """What the nodes may read and write."""
+    return Folders(plan.project.folder, WORKSPACE, run_folder)
+
+
+def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
+    """Write the expanded project and one ``node.json`` per node.
+
+    Raises:
+        UsageError: if the folder cannot be written to, or another run has just begun there.
+    """
+    files = plan.node_files(folders_of(plan, run_folder))
+    try:
+        # Two runs that were given the same empty folder: only one of them gets it.
+        with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
+            expanded.write(_text(project_to_json(plan.project)))
+        for file in files:
+            (run_folder / file.node.name).mkdir(exist_ok=True)
+            path = run_folder / file.node.name / "node.json"
+            path.write_text(_text(node_file_to_json(file)), "utf-8")
+    except FileExistsError as error:
+        raise UsageError(
+            f"{run_folder}: another run has just begun there; name a new one"
+        ) from error
+    except OSError as error:
+        raise UsageError(
+            f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
+        ) from error
+    return files
+
+
+def write_record(record: Mapping[str, Any], run_folder: Path) -> None:
+    """Write ``run.json``. Raises ``OSError``."""
+    (run_folder / "run.json").write_text(_text(record), "utf-8")
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, indent=2) + "\n"
