@@ -6,6 +6,7 @@ need not be the one in .venv.
 """
 
 import os
+import signal
 import sys
 
 ROOT = os.path.dirname(os.path.realpath(__file__))
@@ -43,6 +44,9 @@ def lacks():
 
 
 if __name__ == "__main__":
+    # Ctrl+C during the imports waits, also across execve, until `neuros launch` can heed it.
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     python = os.path.join(VENV, "bin", "python")
     is_inside = os.path.realpath(sys.prefix) == os.path.realpath(VENV)
     if not is_inside and os.path.exists(python) and os.path.exists(VENV + "/pyvenv.cfg"):

@@ -21,6 +21,7 @@ from neuros.cli.run_folder import (
     write_record,
 )
 from neuros.control import SOCKET_NAME
+from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.outcome import Outcome
@@ -77,10 +78,14 @@ class _Run:
             supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
             supervisor.run()
+        except BaseException as error:  # for run.json; the command line knows what to say
+            outcome.exit_code = 4 if isinstance(error, EnvironmentFault) else 1
+            outcome.reason = f"not started: {error}"
+            raise
         finally:
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
-            self._console.finish(_PATIENCE_S if outcome.exit_code in _ENDED_BY_SIGNAL else None)
+            self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s)
             record |= {
@@ -142,6 +147,7 @@ def _signals_noted() -> Iterator[list[int]]:
     previous = {
         number: signal.signal(number, lambda number, _: noted.append(number)) for number in numbers
     }
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py had them wait
     try:
         yield noted
     finally:

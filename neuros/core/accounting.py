@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from neuros.core.hook import Hook
@@ -26,20 +26,14 @@ class State(str, Enum):
     IDLE = "idle"
     SCHEDULING = "scheduling"
 
+    __hash__ = str.__hash__  # time is booked at every event, and Enum's own is ten times slower
 
-@dataclass(frozen=True)
-class Rest:
+
+class Rest(NamedTuple):
     """Why a node does nothing: a state, and the input or connection behind it."""
 
     state: State
     cause: str = ""
-
-    def __post_init__(self) -> None:
-        # Time is booked at every event, so the hash is not computed anew each time.
-        object.__setattr__(self, "_hash", hash((self.state, self.cause)))
-
-    def __hash__(self) -> int:
-        return self._hash  # type: ignore[attr-defined,no-any-return]
 
 
 REGISTERING = Rest(State.REGISTERING)
@@ -69,10 +63,11 @@ def cause_of_rest(hooks: Iterable[Hook]) -> Rest:
     for hook in hooks:
         if not (hook.is_enabled and hook.is_due):
             continue
-        if hook.is_missing_input():
+        slot = hook.missing_slot()
+        if slot is not None:
             if waiting is None:
-                waiting = next(slot.rest for slot in hook.slots if slot.missing)
-        elif hook.is_ready():
+                waiting = slot.rest
+        elif hook.can_send():
             return SCHEDULING
         elif blocked is None:
             blocked = hook.blocking_outlets()[0].rest

@@ -307,9 +307,8 @@ class Engine:
             hook.executions += 1
             hook.busy_ns += end_ns - start_ns
             self.rest_since_ns = end_ns
-        for output, packet in zip(hook.outputs, hook.packets_of(result), strict=True):
-            if packet is not None:
-                self._send(output, packet)
+        for output, packet in hook.packets_of(result):
+            self._send(output, packet)
         if isinstance(hook, Source):
             hook.accept()
         elif hook.spec.kind is HookKind.INITIALISE:

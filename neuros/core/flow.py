@@ -63,7 +63,11 @@ class Outlet:
     def spend(self) -> None:
         """Count a packet that is sent now."""
         self.sent += 1
-        if self.is_reliable and not self.is_blocked and self.outstanding >= self.window:
+        if (
+            self.is_reliable
+            and self.sent - self.acknowledged >= self.window
+            and not self.is_blocked
+        ):
             self.is_blocked = True
             for hook in self.hooks:
                 hook.blocked += 1
@@ -83,7 +87,7 @@ class Outlet:
             return
         self.acknowledged = position
         self.acknowledged_ns = now_ns
-        if self.is_blocked and self.outstanding < self.window:
+        if self.is_blocked and self.sent - position < self.window:
             self.is_blocked = False
             for hook in self.hooks:
                 hook.blocked -= 1

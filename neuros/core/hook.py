@@ -40,6 +40,7 @@ class Hook:
     """
 
     __slots__ = (
+        "_results",
         "blocked",
         "busy_ns",
         "due_ns",
@@ -49,7 +50,6 @@ class Hook:
         "loops",
         "missed_ticks",
         "name",
-        "optional_outputs",
         "outputs",
         "period_ns",
         "slots",
@@ -63,7 +63,7 @@ class Hook:
         self.name = spec.name
         self.slots = tuple(slots)
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
-        self.optional_outputs = tuple(port.is_optional for port in spec.outputs)
+        self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
         self.blocked = 0
         self.is_due = spec.period_s is None
         self.is_enabled = False
@@ -83,25 +83,28 @@ class Hook:
 
     def is_ready(self) -> bool:
         """Whether it may start now: input, output and timer condition, and the node's phase."""
-        if not (self.is_enabled and self.is_due) or self.is_missing_input():
+        if not (self.is_enabled and self.is_due) or self.missing_slot() is not None:
             return False
-        return self.can_send()
+        return not self.blocked or self.can_send()
 
     def can_send(self) -> bool:
         """Whether none of its outlets is blocked, but for packets that its own start would take."""
         return not self.blocked or len(self._freed_outlets()) == self.blocked
 
-    def is_missing_input(self) -> bool:
-        """Whether a required input has no packet."""
-        for slot in self.slots:  # noqa: SIM110 - any() over a generator takes thrice as long
+    def missing_slot(self) -> InputSlot | None:
+        """The first of its required inputs that has no packet."""
+        for slot in self.slots:  # a loop, since next() over a generator takes thrice as long
             if slot.missing:
-                return True
-        return False
+                return slot
+        return None
 
     def is_blocked(self) -> bool:
         """Whether it has all inputs, and only its receivers hold it up."""
         return (
-            self.is_enabled and self.is_due and not self.is_missing_input() and not self.can_send()
+            self.is_enabled
+            and self.is_due
+            and self.missing_slot() is None
+            and not self.can_send()
         )
 
     def blocking_outlets(self) -> list[Outlet]:
@@ -121,32 +124,31 @@ class Hook:
         self.due_ns = start_ns + (ticks_passed + 1) * self.period_ns
         self.is_due = False
 
-    def packets_of(self, result: Any) -> Sequence[Any]:
-        """What the hook returned, one entry per declared output.
+    def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
+        """What the hook returned: the packets, each with its output.
 
         Raises:
             HookError: if the count, a type, or a missing packet is not what was declared.
         """
-        outputs = self.outputs
-        if not outputs:
+        results = self._results
+        if not results:
             if result is not None:
                 raise self.error(f"returned {_kind(result)}, but declares no outputs")
             return ()
         if result is None:
-            packets: Sequence[Any] = (None,) * len(outputs)
+            packets: Sequence[Any] = (None,) * len(results)
         elif isinstance(result, tuple | list):
             packets = result
         else:
             packets = (result,)
-        if len(packets) != len(outputs):
-            names = ", ".join(output.port.name for output in outputs)
+        if len(packets) != len(results):
+            names = ", ".join(output.port.name for output in self.outputs)
             raise self.error(
                 f"returned {_count(len(packets), 'packet')}, but declares"
-                f" {_count(len(outputs), 'output')} ({names})"
+                f" {_count(len(results), 'output')} ({names})"
             )
-        for output, is_optional, packet in zip(
-            outputs, self.optional_outputs, packets, strict=True
-        ):
+        found = []
+        for (output, is_optional), packet in zip(results, packets, strict=True):
             if packet is None:
                 if not is_optional:
                     raise self.error(
@@ -158,7 +160,9 @@ class Hook:
                     f"returned {_kind(packet)} for output '{output.port.name}', which carries"
                     f' {output.port.type}: use node.make_packet("{output.port.name}")'
                 )
-        return packets
+            else:
+                found.append((output, packet))
+        return found
 
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the address of this hook."""

@@ -143,7 +143,10 @@ class Inlet:
 
     def position_if_taken(self, mailbox: Mailbox | None = None) -> int:
         """Smallest position over all takers, if ``mailbox`` had started on its oldest packet."""
-        if not self.mailboxes:
+        mailboxes = self.mailboxes
+        if len(mailboxes) == 1 and mailbox is None:  # as nearly always
+            return mailboxes[0].position
+        if not mailboxes:
             return self.received
         return min(
             other.packets[0][1] if other is mailbox else other.position for other in self.mailboxes

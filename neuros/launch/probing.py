@@ -7,7 +7,7 @@ from enum import Enum
 from typing import Any
 
 from neuros.launch import quiescence
-from neuros.project.model import Connection
+from neuros.project.model import Connection, NodeFile
 
 DEADLOCK_AFTER_S = 1.0
 """Nothing must have moved for this long before nodes are asked whether anything ever will."""
@@ -120,3 +120,15 @@ class Probing:
         is_stable, self._last_round = this_round == self._last_round, this_round
         if is_over and is_stable:
             self.verdict = verdict
+
+
+def connections_among(files: Sequence[NodeFile]) -> list[Connection]:
+    """Connections with both ends in these nodes, each once, in the order of the project."""
+    names = {file.node.name for file in files}
+    found = {
+        connection
+        for file in files
+        for connection in file.connections
+        if {connection.source_node, connection.destination_node} <= names
+    }
+    return sorted(found, key=lambda connection: connection.index)

@@ -10,37 +10,21 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
 
 from neuros.control import Lines
 from neuros.launch.channels import Channels
-from neuros.launch.outcome import Outcome
-from neuros.launch.probing import Probing, Verdict
+from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Phase
+from neuros.launch.probing import Probing, Verdict, connections_among
 from neuros.launch.watch import Watch
 from neuros.ports import Launcher, RunningNode
-from neuros.project.model import Connection, NodeFile
+from neuros.project.model import NodeFile
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
 
 _TICK_S = 0.02
-_EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}
-_SIGNAL_NAMES = {
-    signal.SIGINT: "Ctrl+C",
-    signal.SIGTERM: "SIGTERM",
-    signal.SIGHUP: "SIGHUP (the terminal was closed)",
-}
-
-
-class Phase(Enum):
-    """Where a run is in its life."""
-
-    RUNNING = "running"
-    DRAINING = "draining"
-    STOPPING = "stopping"
-    KILLED = "killed"
 
 
 class Output(Protocol):
@@ -94,7 +78,7 @@ class Supervisor:
         self._has_told_failure: set[str] = set()
         self._channels = Channels(run_folder)
         self._watch = Watch(names, time.monotonic())
-        self._probing = Probing(names, _connections_among(files), self._channels.send)
+        self._probing = Probing(names, connections_among(files), self._channels.send)
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
             "report": self._on_report,
@@ -217,9 +201,9 @@ class Supervisor:
     def _heed_signals(self) -> None:
         while self._signals:
             number = signal.Signals(self._signals.pop(0))
-            name = _SIGNAL_NAMES[number]
+            name = SIGNAL_NAMES[number]
             if self._phase in (Phase.RUNNING, Phase.DRAINING):
-                self.outcome.exit_code = _EXIT_CODES[number]
+                self.outcome.exit_code = EXIT_CODES[number]
                 self.outcome.reason = f"ended by {name}"
                 self._output.log("INFO", f"{name}: stopping (once more kills at once)")
                 self._stop()
@@ -291,18 +275,6 @@ class Supervisor:
             return
         if self._probing.look(now_s, self._watch.rested_s(now_s)) is Verdict.DEAD:
             self._fail(self._probing.why_dead())
-
-
-def _connections_among(files: Sequence[NodeFile]) -> list[Connection]:
-    """Connections with both ends in these nodes, each once, in the order of the project."""
-    names = {file.node.name for file in files}
-    found = {
-        connection
-        for file in files
-        for connection in file.connections
-        if {connection.source_node, connection.destination_node} <= names
-    }
-    return sorted(found, key=lambda connection: connection.index)
 
 
 def _names(process: RunningNode) -> str:

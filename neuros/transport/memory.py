@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 from neuros.ports import Inbox
@@ -50,6 +51,10 @@ class MemoryHub:
             if connection.destination_node in self.inboxes:
                 self._waiting.remove(connection)
                 self._register(connection)
+
+    def acknowledge(self, connection: Connection, position: int) -> None:
+        """Tell the sender of a connection how far its receiver has come."""
+        self.inboxes[connection.source_node].on_acknowledgement(connection, position)
 
     def leave(self, name: str) -> None:
         """Let what is under way to a node go nowhere."""
@@ -97,8 +102,7 @@ class MemoryTransport:
         """Tell the sender which position every taker has reached."""
         if not self._is_open:
             return
-        inboxes, sender = self._hub.inboxes, connection.source_node
-        self._hub.post(lambda: inboxes[sender].on_acknowledgement(connection, position))
+        self._hub.post(partial(self._hub.acknowledge, connection, position))
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not joined yet."""

@@ -7,6 +7,7 @@ A connection has three topics below ``/neuros/<source>/<output>/<destination>/<i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node as RosNode
@@ -121,7 +122,7 @@ class RosTransport:
             kind,
             f"{connection.topic}/data",
             data_qos(connection),
-            lambda packet: inbox.on_packet(connection, packet),
+            partial(inbox.on_packet, connection),
         )
         self._register(connection, publishers, [data], False, lambda: None)
 
@@ -142,7 +143,7 @@ class RosTransport:
             message_class(port.type),
             str(port.external_topic),
             qos,
-            lambda packet: inbox.on_external_packet(port, packet),
+            partial(inbox.on_external_packet, port),
         )
 
     def _subscribe(

@@ -293,3 +293,14 @@ def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_na
     check_machine(plan_of(MOST_LOCAL_PROCESSES, "process"), {})
     check_machine(plan_of(too_many, "in-process"), {})
     check_machine(plan_of(too_many, "process"), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
+
+
+def test_what_could_not_be_started_is_recorded_and_leaves_nothing(
+    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    assert main(["launch", ".", "-o", "out"]) == 4
+    output = capsys.readouterr()
+    assert "Traceback" not in output.err
+    assert output.err.startswith("neuros: the guardian process cannot be started: ")
+    assert not Path("out/control.sock").exists()

@@ -49,14 +49,14 @@ def image_from(backend: str, **environment: str) -> bytes:
 
 
 def needs(backend: str) -> None:
-    """Skip where a library is not installed; in CI it is."""
+    """Skip where a library is not installed; in CI EGL is (Mesa 25.1 and later has no OSMesa)."""
     for name in opengl._LIBRARIES[backend]:
         try:
             ctypes.CDLL(name)
         except OSError:
             continue
         return
-    if "CI" in os.environ:
+    if "CI" in os.environ and backend == "egl":
         pytest.fail(f"{backend} is not installed, but CI has to test it")
     pytest.skip(f"{backend} is not installed")
 
