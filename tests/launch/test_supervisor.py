@@ -5,6 +5,7 @@ The nodes are stand-ins: real processes that keep to the control channel, withou
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -276,15 +277,24 @@ def test_the_last_words_of_a_process_are_heard_however_fast_it_ends(run: Run) ->
         run.clear()
 
 
-def test_a_forked_child_that_keeps_the_socket_open_holds_up_nobody(run: Run) -> None:
-    forks = """
+def test_a_forked_child_that_keeps_the_socket_open_holds_up_nobody(
+    run: Run, tmp_path: Path
+) -> None:
+    pid_file = tmp_path / "child.pid"
+    forks = f"""
 import os, time
 host.up()
-if os.fork() == 0:
+child = os.fork()
+if child == 0:
     time.sleep(60)
+with open({str(pid_file)!r}, "w") as file:
+    file.write(str(child))
 os._exit(0)
 """
-    outcome = run(a=forks)
+    try:
+        outcome = run(a=forks)
+    finally:
+        os.kill(int(pid_file.read_text()), signal.SIGKILL)
     assert outcome.reason == "node 'a' ended unexpectedly: exit code 0"
     assert run.lasted_s < 4
 
