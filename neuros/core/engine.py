@@ -9,7 +9,7 @@ All that leaves the engine goes through :class:`Effects`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from neuros.core.accounting import (
@@ -21,15 +21,12 @@ from neuros.core.accounting import (
     State,
     cause_of_rest,
 )
-from neuros.core.flow import Outlet
 from neuros.core.hook import Hook, Output, Source
-from neuros.core.inputs import Inlet, InputSlot
+from neuros.core.inputs import Inlet
+from neuros.core.node_ports import NodePorts, undeclared
 from neuros.errors import HookError
-from neuros.hooks import HookKind, HookSpec, InputSpec
+from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node, Port
-
-EXTERNAL_DEPTH = 10
-"""Packets that the mailbox of an external topic holds: ``depth`` of ROS's default QoS profile."""
 
 
 class Effects(Protocol):
@@ -84,20 +81,10 @@ class Engine:
         self._effects = effects
         self._clock = clock
         self._arrivals = 0
-        self.inlets: dict[Connection | str, Inlet] = _inlets(node, connections)
-        self.outlets = {c: Outlet(c) for c in connections if c.source_node == node.name}
-        self.outputs = {
-            port.name: Output(
-                port,
-                [o for c, o in self.outlets.items() if c.source_output == port.name],
-                (packet_types or {}).get(port.name),
-            )
-            for port in node.outputs
-        }
-        for connection, outlet in self.outlets.items():
-            outlet.is_registered = connection.destination_node == node.name
+        ports = NodePorts(node, connections, packet_types or {})
+        self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
         self._unregistered = sum(not outlet.is_registered for outlet in self.outlets.values())
-        hooks = [self._hook(spec) for spec in specs if spec.kind is not HookKind.FINALISE]
+        hooks = [ports.hook(spec) for spec in specs if spec.kind is not HookKind.FINALISE]
         self._order: dict[Hook, None] = dict.fromkeys(hooks)
         self.all_hooks: list[Hook] = hooks
         self._sources: dict[tuple[str, ...], Source] = {}
@@ -385,39 +372,11 @@ class Engine:
     def _goes_on(self, hook: Hook) -> bool:
         return not (self.is_draining and hook.spec.sends_unasked)
 
-    def _hook(self, spec: HookSpec) -> Hook:
-        inputs = {port.name for port in self.node.inputs}
-        outputs = {port.name for port in self.node.outputs}
-        for side, names, known in (
-            ("input", [port.name for port in spec.inputs], inputs),
-            ("output", [port.name for port in spec.outputs], outputs),
-        ):
-            for name in names:
-                if name not in known:
-                    raise HookError(
-                        _undeclared(side, name, known, self.node), hook=spec.name, where=spec.where
-                    )
-        return Hook(spec, [self._slot(spec, port) for port in spec.inputs], self.outputs)
-
-    def _slot(self, spec: HookSpec, port: InputSpec) -> InputSlot:
-        inlets = [inlet for inlet in self.inlets.values() if inlet.input_name == port.name]
-        if not inlets and not port.is_optional:
-            raise HookError(
-                f"needs input '{port.name}', but nothing is connected to"
-                f" {self.node.name}.{port.name}: connect it, or declare it Optional",
-                hook=spec.name,
-                where=spec.where,
-            )
-        return InputSlot(port, inlets)
-
     def _add_source(self, names: tuple[str, ...]) -> Source:
         for name in names:
             if name not in self.outputs:
-                raise HookError(
-                    _undeclared("output", name, self.outputs, self.node),
-                    hook="submit",
-                    where=str(self.node.plugin),
-                )
+                text = undeclared("output", name, self.outputs, self.node)
+                raise HookError(text, hook="submit", where=str(self.node.plugin))
         source = self._sources[names] = Source(names, self.outputs)
         source.is_enabled = self.is_running and not self.is_draining
         # It has never been executed, and so goes before all that have.
@@ -433,27 +392,3 @@ def _could_wake(hook: Hook) -> bool:
     if isinstance(hook, Source) and not hook.is_due:
         return False
     return hook.can_send() and all(slot.could_be_filled_from_outside() for slot in hook.slots)
-
-
-def _inlets(node: Node, connections: Sequence[Connection]) -> dict[Connection | str, Inlet]:
-    inlets: dict[Connection | str, Inlet] = {
-        c: Inlet(
-            c,
-            str(c),
-            c.destination_input,
-            c.queue_size,
-            is_lossless=c.discard_limit == 0,
-            is_acknowledged=c.is_reliable,
-        )
-        for c in connections
-        if c.destination_node == node.name
-    }
-    for port in node.inputs:
-        if port.external_topic is not None:
-            inlets[port.name] = Inlet(port.name, port.external_topic, port.name, EXTERNAL_DEPTH)
-    return inlets
-
-
-def _undeclared(side: str, name: str, known: Iterable[str], node: Node) -> str:
-    has = ", ".join(sorted(known)) or "none"
-    return f"node '{node.name}' declares no {side} '{name}' (it has {has})"

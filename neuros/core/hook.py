@@ -101,10 +101,7 @@ class Hook:
     def is_blocked(self) -> bool:
         """Whether it has all inputs, and only its receivers hold it up."""
         return (
-            self.is_enabled
-            and self.is_due
-            and self.missing_slot() is None
-            and not self.can_send()
+            self.is_enabled and self.is_due and self.missing_slot() is None and not self.can_send()
         )
 
     def blocking_outlets(self) -> list[Outlet]:

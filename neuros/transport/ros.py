@@ -17,7 +17,7 @@ from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from std_msgs.msg import UInt64
 
-from neuros.core.engine import EXTERNAL_DEPTH
+from neuros.core.node_ports import EXTERNAL_DEPTH
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.messages import message_class
