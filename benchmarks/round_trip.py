@@ -1,7 +1,8 @@
 """How long a packet needs there and back: hook to hook, acknowledged, nothing ever lost.
 
 Between two processes it is compared with a ping-pong of bare ``rclpy.spin`` (same message, same
-depth and reliability, no acknowledgements). In one process a *hop* is half a round trip: from one
+depth and reliability, no acknowledgements), once as it comes and once with NeuROS's settings of
+Fast DDS. In one process a *hop* is half a round trip: from one
 hook to the next, with the acknowledgement, scheduling, and the change from node to node.
 """
 
@@ -13,13 +14,14 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.launching import cores, launch, on_cores, project_of_plugins
 from benchmarks.measure import Measurement, Row, Target, in_rounds
 from neuros.launch.domain import choose_domain
+from neuros.transport.ros_process import PROFILES, PROFILES_VARIABLE
 
 ROOT = Path(__file__).resolve().parents[1]
 STRING, IMU = "std_msgs/msg/String", "sensor_msgs/msg/Imu"
@@ -36,25 +38,35 @@ def measure(is_quick: bool, say: Callable[[str], None]) -> list[Row]:
         "Imu": lambda: neuros_us(IMU, "in-process", count) / 2,
     }
     if len(cores()) > 1:
-        candidates["rclpy, a core each"] = functools.partial(bare_us, count, is_pinned=True)
-        candidates["process, a core each"] = functools.partial(
-            neuros_us, STRING, "process", count, own_core="echo"
-        )
+        candidates |= {
+            "rclpy, a core each": functools.partial(bare_us, count, is_pinned=True),
+            "rclpy, a core each, tuned": functools.partial(
+                bare_us, count, is_pinned=True, is_tuned=True
+            ),
+            "process, a core each": functools.partial(
+                neuros_us, STRING, "process", count, own_core="echo"
+            ),
+        }
     values = in_rounds(candidates, rounds, say)
     rows = [
-        Row(
-            f"round trip of a String, {name}",
-            "us",
-            values[name],
-            (name.replace("process", "rclpy.spin"), values[name.replace("process", "rclpy")]),
-            Target(1.0),
-        )
-        for name in values
-        if name.startswith("process")
+        _round_trip(values, "process", "rclpy", Target(1.0)),
+        _round_trip(values, "process, a core each", "rclpy, a core each", Target(1.0)),
+        _round_trip(values, "process, a core each", "rclpy, a core each, tuned"),
     ]
-    rows.append(Row("hop of a String in process", "us", values["String"], target=Target(25)))
-    rows.append(Row("hop of an Imu in process", "us", values["Imu"], target=Target(45)))
-    return rows
+    return [
+        *(row for row in rows if row is not None),
+        Row("hop of a String in process", "us", values["String"], target=Target(25)),
+        Row("hop of an Imu in process", "us", values["Imu"], target=Target(45)),
+    ]
+
+
+def _round_trip(
+    values: Mapping[str, tuple[float, ...]], name: str, bare: str, target: Target | None = None
+) -> Row | None:
+    if name not in values:
+        return None
+    reference = (bare.replace("rclpy", "rclpy.spin"), values[bare])
+    return Row(f"round trip of a String, {name}", "us", values[name], reference, target)
 
 
 def neuros_us(kind: str, backend: str, count: int, own_core: str | None = None) -> float:
@@ -64,20 +76,32 @@ def neuros_us(kind: str, backend: str, count: int, own_core: str | None = None) 
         return _median(json.loads((folder / "run" / "ping" / "result.json").read_text()))
 
 
-def bare_us(count: int, *, is_pinned: bool = False) -> float:
-    """The same between two processes that use nothing but rclpy."""
+def bare_us(count: int, *, is_pinned: bool = False, is_tuned: bool = False) -> float:
+    """The same between two processes that use nothing but rclpy.
+
+    ``is_tuned``: with NeuROS's settings of Fast DDS instead of the default ones.
+    """
     first, *others = [[core] for core in cores()] if is_pinned else [cores(), cores()]
     with choose_domain(None, {}, False) as domain:
-        echo = _bare(["echo"], first, domain.id)
+        environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(domain.id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        if is_tuned:
+            environment[PROFILES_VARIABLE] = str(PROFILES)
+        echo = _bare(["echo"], first, environment)
         try:
-            ping = _bare(["ping", str(count + WARM_UP)], others[0], domain.id)
+            ping = _bare(["ping", str(count + WARM_UP)], others[0], environment)
             output, _ = ping.communicate(timeout=60)
         finally:
             echo.communicate(timeout=10)  # closes its input
     return _median(json.loads(output))
 
 
-def _bare(arguments: Sequence[str], chosen: Sequence[int], domain: int) -> subprocess.Popen[str]:
+def _bare(
+    arguments: Sequence[str], chosen: Sequence[int], environment: Mapping[str, str]
+) -> subprocess.Popen[str]:
     with on_cores(chosen):
         return subprocess.Popen(
             [sys.executable, "-m", "benchmarks.bare_rclpy", *arguments],
@@ -85,11 +109,7 @@ def _bare(arguments: Sequence[str], chosen: Sequence[int], domain: int) -> subpr
             stdout=subprocess.PIPE,
             text=True,
             cwd=ROOT,
-            env={
-                **os.environ,
-                "ROS_DOMAIN_ID": str(domain),
-                "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            },
+            env=environment,
         )
 
 

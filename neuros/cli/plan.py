@@ -155,7 +155,7 @@ def _chosen_names(project: Project, wanted: Sequence[str], backend: str) -> tupl
 
 
 def _nest_problems(plan: Plan) -> Sequence[Problem]:
-    return nest_conflicts(plan.project) if plan.backend == "in-process" else ()
+    return nest_conflicts(plan.project, plan.names) if plan.backend == "in-process" else ()
 
 
 def _time_problems(plan: Plan) -> Sequence[Problem]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -28,12 +29,13 @@ _DEFAULTS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-# Runs the scripts one after another; the shell passes SIGTERM on to them, and a script that fails
-# ends it. ``exec`` then makes the host of it: same process id, nothing in between.
+# Runs the scripts one after another, each with the log of its node for output; the shell passes
+# SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the host of it: same
+# process id, nothing in between.
 _SCRIPTS = """\
 run() {
-  name=$1 script=$2; shift 2
-  "$@" & wait "$!"; code=$?
+  name=$1 script=$2 log=$3; shift 3
+  "$@" >>"$log" 2>&1 & wait "$!"; code=$?
   if [ "$code" -ne 0 ]; then
     echo "[FATAL] [$(date +%s.%N)] [$name]: script $script failed: exit code $code"
     exit 1
@@ -41,6 +43,11 @@ run() {
 }
 trap 'trap - TERM; kill -TERM 0' TERM
 """
+_SCRIPT_FAILED = re.compile(
+    r"\[FATAL\] \[\d+\.\d+\] \[(?P<node>\w+)\]: "
+    r"script (?P<script>.*) failed: (?P<how>exit code \d+)"
+)
+_TAIL_BYTES = 8192
 
 
 class HostProcess:
@@ -60,6 +67,7 @@ class HostProcess:
         Raises ``EnvironmentFault`` if that is impossible.
         """
         self._names = tuple(names)
+        self._log = log
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             with open(log, "ab") as output:
@@ -88,7 +96,9 @@ class HostProcess:
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended, in words."""
         code = self._process.poll()
-        return None if code is None else _in_words(code)
+        if code is None:
+            return None
+        return (_script_failure(self._log) if code == 1 else None) or _in_words(code)
 
     def wait(self, timeout_s: float) -> str | None:
         """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
@@ -194,7 +204,7 @@ def host_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[st
     """What to execute for these nodes: their scripts, one after another, and then the host.
 
     A script runs in a process of its own in its node's environment; what it changes there does
-    not reach the node.
+    not reach the node. What it prints goes to the log of its node.
     """
     host = host_command(command, nodes)
     scripts = [_script_line(node, node.node.script) for node in nodes if node.node.script]
@@ -215,11 +225,24 @@ def end_now(hosts: Sequence[HostProcess]) -> None:
 def _script_line(node: NodeFile, script: Path) -> str:
     variables = [f"{key}={value}" for key, value in node_environment(node).items()]
     start = [str(script)] if os.access(script, os.X_OK) else ["/bin/sh", str(script)]
-    return shlex.join(["run", node.node.name, str(script), "env", *variables, *start])
+    return shlex.join(
+        ["run", node.node.name, str(script), str(log_file(node)), "env", *variables, *start]
+    )
 
 
 def _is_inside(path: str, folder: str) -> bool:
     return path == folder or path.startswith(f"{folder}{os.sep}")
+
+
+def _script_failure(log: Path) -> str | None:
+    """What the last line of a host's log says of a script that failed, if that is what it says."""
+    with contextlib.suppress(OSError), open(log, "rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        lines = file.read().decode(errors="replace").splitlines()
+        match = _SCRIPT_FAILED.fullmatch(lines[-1]) if lines else None
+        if match:
+            return f"script {match['script']} of '{match['node']}' failed: {match['how']}"
+    return None
 
 
 def _in_words(code: int) -> str:

@@ -224,13 +224,15 @@ class Supervisor:
         for process, how in ended:
             self._processes.remove(process)
             if not self._is_expected_to_end(process):
-                self._fail(f"node {_names(process)} {self._unexpectedly(process)}: {how}")
+                noun = "node" if len(process.names) == 1 else "nodes"
+                self._fail(f"{noun} {_names(process)} {self._unexpectedly(process)}: {how}")
 
     def _unexpectedly(self, process: RunningNode) -> str:
         if self._phase is Phase.STOPPING:
-            return "ended while it was finalising"
+            return "ended while finalising"
         if not any(map(self._watch.is_greeted, process.names)):
-            return "ended before it was up (what it wrote is above)"
+            were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
+            return f"ended before {were} wrote is above)"
         seen = "".join(self._watch.last_seen(name) for name in process.names)
         return f"ended unexpectedly{seen}"
 

@@ -50,6 +50,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         [[c["connection"], *(c[key] for key in _COUNTS)] for c in record["connections"]],
         headers=["connection", *_COUNTS],
         missingval="?",
+        disable_numparse=True,
+        colalign=("left", *("right" for _ in _COUNTS)) if record["connections"] else None,
     )
     nodes = tabulate(
         [[name, *_shares(node)] for name, node in record["nodes"].items()],

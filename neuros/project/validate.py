@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,13 +50,14 @@ def schema(name: str) -> dict[str, Any]:
     return content
 
 
-def nest_conflicts(project: Project) -> tuple[Problem, ...]:
-    """The NEST nodes that would have to share a process with another one.
+def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tuple[Problem, ...]:
+    """The NEST nodes, among those of ``names`` (``None``: all), that would have to share a process.
 
     NEST has one kernel per process, so that this matters to back ends that put all nodes into
     one. Nodes that use NEST are known by their container here.
     """
-    nest = [n for n in project.nodes if n.container.partition(":")[0] == "neuros_nest"]
+    chosen = [node for node in project.nodes if names is None or node.name in names]
+    nest = [node for node in chosen if node.container.partition(":")[0] == "neuros_nest"]
     return tuple(
         Problem(
             display_name(node.file),

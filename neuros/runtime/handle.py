@@ -94,17 +94,24 @@ class NodeHandle:
         """An existing file: absolute, or relative to plugin, node file or project folder.
 
         Raises:
-            ModelError: if there is none, naming all places that were looked at.
+            ModelError: if there is none, naming all places that were looked at, or if it lies
+                outside of project, workspace and run folder.
         """
         node, folders = self._file.node, self._file.folders
         if path.startswith("@"):
-            places = [folders.workspace / path[1:]]
+            places = [folders.workspace / path[1:].lstrip("/")]
         else:
-            wanted = path.removeprefix("#")
+            wanted = path[1:].lstrip("/") if path.startswith("#") else path
             bases = dict.fromkeys((node.plugin.parent, node.file.parent, folders.project))
             places = [base / wanted for base in bases]
         for place in places:
             if place.exists():
+                roots = (folders.project, folders.workspace, folders.run)
+                if not any(place.resolve().is_relative_to(root.resolve()) for root in roots):
+                    raise ModelError(
+                        f"'{path}' leaves the project's folder: files may be in the folder of the"
+                        " project file, in the run folder, and with '@' in the workspace"
+                    )
                 return place
         raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
 

@@ -12,7 +12,7 @@ from neuros.core.engine import Engine
 from neuros.core.explain import explain
 from neuros.core.hook import Hook
 from neuros.core.ledger import snapshot
-from neuros.errors import HookError, NeurosError, NodeError
+from neuros.errors import HookError, NeurosError, NodeError, PluginError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Logger, Middleware
 from neuros.project.model import Connection, NodeFile, Port
@@ -325,7 +325,8 @@ class NodeRuntime:
         """Write an error to the node's log, with the plugin's traceback if it is the plugin's."""
         self._stage.enter(self._scope)
         cause = error.__cause__
-        if isinstance(error, NodeError) and cause is not None:
+        is_shown = isinstance(error, PluginError)  # its text has the traceback already
+        if isinstance(error, NodeError) and cause is not None and not is_shown:
             self.logger.error(f"{error}\n{plugin_traceback(cause, self.file.node.plugin)}")
         else:
             self.logger.error(str(error))

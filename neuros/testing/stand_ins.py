@@ -10,6 +10,7 @@ from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.testing.step_loop import StepLoop
+from neuros.transport.copying import copy_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 
@@ -129,7 +130,7 @@ class Workbench:
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
         self.loop = loop
         self.topics = topics
-        self.hub = MemoryHub(loop.post, encode, decode)
+        self.hub = MemoryHub(loop.post, copy_packet)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 

@@ -28,18 +28,16 @@ class Outside(Protocol):
 class MemoryHub:
     """Joins the nodes of one process.
 
-    ``post`` queues an event; ``decode(encode(packet))`` must share nothing with ``packet``.
+    ``post`` queues an event; ``copy(packet)`` must share nothing with ``packet``.
     """
 
     def __init__(
         self,
         post: Callable[[Callable[[], None]], None],
-        encode: Callable[[Any], Any],
-        decode: Callable[[Any], Any],
+        copy: Callable[[Any], Any],
     ) -> None:
         self.post = post
-        self.encode = encode
-        self.decode = decode
+        self.copy = copy
         self.inboxes: dict[str, Inbox] = {}
         self._waiting: list[Connection] = []
 
@@ -88,10 +86,8 @@ class MemoryTransport:
         """Hand a packet over; each receiver gets its own copy."""
         if not self._is_open:
             return
-        hub = self._hub
-        parcel = hub.encode(packet)
         for connection in connections:
-            self._channels[connection].send(parcel)
+            self._channels[connection].send(self._hub.copy(packet))
         self._outside.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
@@ -140,19 +136,18 @@ class _Channel:
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 
-    __slots__ = ("_connection", "_hub", "_parcels")
+    __slots__ = ("_connection", "_hub", "_packets")
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
         self._connection = connection
-        self._parcels: deque[Any] = deque(maxlen=connection.window)
+        self._packets: deque[Any] = deque(maxlen=connection.window)
 
-    def send(self, parcel: Any) -> None:
-        if len(self._parcels) < self._connection.window:
+    def send(self, packet: Any) -> None:
+        if len(self._packets) < self._connection.window:
             self._hub.post(self._deliver)  # else an event is on its way for the one that is lost
-        self._parcels.append(parcel)
+        self._packets.append(packet)
 
     def _deliver(self) -> None:
-        hub, connection = self._hub, self._connection
-        packet = hub.decode(self._parcels.popleft())
-        hub.inboxes[connection.destination_node].on_packet(connection, packet)
+        inbox = self._hub.inboxes[self._connection.destination_node]
+        inbox.on_packet(self._connection, self._packets.popleft())

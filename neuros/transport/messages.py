@@ -42,10 +42,6 @@ def encode(packet: Any) -> tuple[type, bytes]:
 
 
 def decode(parcel: tuple[type, bytes]) -> Any:
-    """The packet in a parcel; it shares nothing with the one that was sent.
-
-    Within one process, too, packets go through ROS's own serialisation, so that every back end
-    rounds and checks fields alike (a Python float in a ``float32`` field, for instance).
-    """
+    """The packet in a parcel; it shares nothing with the one that was sent."""
     kind, data = parcel
     return deserialize_message(data, kind)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -13,11 +15,18 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
+from neuros.transport.copying import copy_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
+
+PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+"""Where Fast DDS 2 looks for its settings when the first ROS node of a process is created."""
+
+PROFILES = Path(__file__).with_name("fast_dds.xml")
+"""NeuROS's settings of Fast DDS."""
 
 _LINGER_S = 0.05
 # What takes a callback, and at which place of its arguments.
@@ -35,6 +44,7 @@ class RosProcess:
         in_memory: bool,
         debug: bool = False,
     ) -> None:
+        os.environ.setdefault(PROFILES_VARIABLE, str(PROFILES))  # a user's own file wins
         self._context = rclpy.Context()
         # rcl would write each record to a second log file, which costs as much as a packet.
         arguments = ["--ros-args", "--disable-external-lib-logs"]
@@ -46,7 +56,7 @@ class RosProcess:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._loop = RosLoop(self._context, on_failure)
-        self._hub = MemoryHub(self._loop.post, encode, decode) if in_memory else None
+        self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
         self._ros_nodes: dict[str, RosNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._transports: list[Transport] = []
@@ -92,7 +102,7 @@ class RosProcess:
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""
-        return decode(encode(packet))
+        return copy_packet(packet)
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""

@@ -290,7 +290,7 @@ def test_a_node_whose_process_ends_is_a_failure(bench: Bench, act: str, how: str
     bench.project("a.o -> b.x", a=f"{go}    print('last words')\n    {act}\n", b=SINK)
     finished = bench.launch()
     assert finished.exit_code == 1
-    assert re.fullmatch(f"node 'a'( and 'b')? ended unexpectedly.*: {how}", last_line(finished))
+    assert re.fullmatch(f"nodes? 'a'( and 'b')? ended unexpectedly.*: {how}", last_line(finished))
     assert "last words" in finished.output
     if how == "killed by SIGSEGV":
         assert "in go" in finished.output, "the Python stack is in the log"
@@ -575,7 +575,7 @@ def test_when_a_node_is_killed_the_others_end_and_its_last_report_is_shown(bench
     os.kill(bench.pid_of("a"), signal.SIGKILL)
     finished = running.finish(GONE_WITHIN_S)
     assert finished.exit_code == 1
-    assert re.fullmatch("node 'a'.* ended unexpectedly.*: killed by SIGKILL", last_line(finished))
+    assert re.fullmatch("nodes? 'a'.* ended unexpectedly.*: killed by SIGKILL", last_line(finished))
     assert re.search(r"last report \d\.\d s before the end", finished.output)
     if bench.back_end == "process":
         assert bench.saved("b")

@@ -215,7 +215,8 @@ def test_an_executable_script_chooses_its_own_interpreter(run: Run) -> None:
 
 def test_a_script_that_fails_ends_the_node_and_is_named(run: Run) -> None:
     script = run.script("bad.sh", "echo no such device >&2; exit 7")
-    assert run.end("print('never')", [run.node("snn", script)]) == ["exit code 1"]
+    how = f"script {script} of 'snn' failed: exit code 7"
+    assert run.end("print('never')", [run.node("snn", script)]) == [how]
     output, last = run.log("snn/node.log").splitlines()
     assert output == "no such device"
     assert last.startswith("[FATAL] [")
@@ -226,7 +227,16 @@ def test_in_process_all_scripts_run_each_in_its_environment(run: Run) -> None:
     script = run.script("say.sh", 'echo "$WHO $SHARED"')
     nodes = [run.node("a", script, WHO="x"), run.node("b"), run.node("c", script, WHO="y")]
     assert run.end("print('host')", nodes, in_process=True) == ["exit code 0"]
-    assert run.log("host.log") == "x run\ny run\nhost\n"
+    assert run.log("host.log") == "host\n"
+    assert run.log("a/node.log") == "x run\n"
+    assert run.log("c/node.log") == "y run\n"
+
+
+def test_in_process_a_script_that_fails_is_named_with_its_node(run: Run) -> None:
+    script = run.script("bad.sh", "echo no such device >&2; exit 7")
+    (how,) = run.end("print('never')", [run.node("a"), run.node("b", script)], in_process=True)
+    assert how == f"script {script} of 'b' failed: exit code 7"
+    assert run.log("b/node.log") == "no such device\n"
 
 
 def test_terminate_during_a_script_ends_both(run: Run) -> None:

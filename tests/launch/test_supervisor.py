@@ -317,7 +317,7 @@ def test_and_one_that_crashes_while_it_finalises(run: Run) -> None:
     )
     outcome = run(a=SHUTS_DOWN, b=crashes_last)
     assert outcome.exit_code == 1
-    assert outcome.reason == "node 'b' ended while it was finalising: killed by SIGABRT"
+    assert outcome.reason == "node 'b' ended while finalising: killed by SIGABRT"
 
 
 def test_how_a_process_ends_after_its_final_report_is_of_no_importance(run: Run) -> None:
@@ -489,7 +489,7 @@ def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
 
 def test_all_nodes_of_one_process_are_named_if_it_dies(run: Run) -> None:
     outcome = run(in_process=True, a="", b="", all="host.up(); import os; os._exit(1)")
-    assert outcome.reason == "node 'a' and 'b' and 'all' ended unexpectedly: exit code 1"
+    assert outcome.reason == "nodes 'a' and 'b' and 'all' ended unexpectedly: exit code 1"
 
 
 def test_and_report_one_by_one(run: Run) -> None:

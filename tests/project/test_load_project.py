@@ -200,3 +200,4 @@ def test_two_nest_nodes_do_not_fit_into_one_process(folder: Folder) -> None:
     column = file.read_text().index('"neuros_nest:2"') + 1
     assert (problem.line, problem.column, problem.pointer) == (1, column, "/nodes/2/container")
     assert "nodes 'a' and 'c' both use NEST" in problem.text
+    assert not nest_conflicts(folder.load().project, ["a", "b"]), "c is not started"

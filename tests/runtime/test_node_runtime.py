@@ -117,6 +117,8 @@ def test_files_are_found_beside_the_plugin(plugin, tmp_path):
         node.resolve_path("nothing.xml")
     with pytest.raises(ModelError, match="workspace"):
         node.resolve_path("@nothing.xml")
+    with pytest.raises(ModelError, match="leaves the project's folder"):
+        node.resolve_path("/etc/passwd")
 
 
 def test_what_is_to_be_closed_is_closed_last_opened_first_after_the_finalise_hooks(plugin):

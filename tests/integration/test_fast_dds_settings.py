@@ -1,0 +1,41 @@
+"""The file with NeuROS's settings of Fast DDS, as Fast DDS itself reads it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from neuros.transport.ros_process import PROFILES, PROFILES_VARIABLE
+
+READER_WAITS_NS = 5_000_000  # before it asks for what it missed: heartbeatResponseDelay
+CREATE_A_NODE = "import rclpy; rclpy.init(); rclpy.create_node('reader_of_settings')"
+
+
+def what_fast_dds_says_to(file: Path) -> str:
+    environment = {
+        **os.environ,
+        PROFILES_VARIABLE: str(file),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    command = [sys.executable, "-c", CREATE_A_NODE]
+    result = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True, timeout=30
+    )
+    return result.stdout + result.stderr
+
+
+def test_fast_dds_reads_the_file_and_finds_nothing_wrong(tmp_path: Path) -> None:
+    misspelt = tmp_path / "misspelt.xml"
+    misspelt.write_text(PROFILES.read_text().replace("nackSup", "nackSupp"))
+    assert "XMLPARSER" in what_fast_dds_says_to(misspelt)
+    assert "XMLPARSER" not in what_fast_dds_says_to(PROFILES)
+
+
+def test_no_request_to_send_again_comes_while_requests_are_ignored() -> None:
+    (nanoseconds,) = ElementTree.parse(PROFILES).iter(
+        "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}nanosec"
+    )
+    assert 0 < int(str(nanoseconds.text)) < READER_WAITS_NS
