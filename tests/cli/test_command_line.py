@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -127,14 +128,13 @@ def test_wrong_options_end_with_2_as_well(arguments: list[str]) -> None:
     assert end.value.code == 2
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
 def test_a_folder_that_cannot_be_written_to_is_one_sentence(
-    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "sealed").mkdir(mode=0o500)
-    os.chdir(tmp_path / "sealed")
+    os.chdir("/proc")  # where even root can make no folder
     assert main(["launch", str(project)]) == 2
-    assert "cannot be made (Permission denied): name one with -o" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert re.search(r"cannot be made \(.+\): name one with -o", error)
 
 
 def test_nor_one_that_is_no_folder(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
