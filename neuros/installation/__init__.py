@@ -21,7 +21,7 @@ from neuros.installation.packages import explain_failure
 from neuros.installation.progress import Progress
 
 STANDARD_EXTRAS = ("mujoco", "nest", "plot")
-DEVELOPER_EXTRAS = ("dev", "docs")
+DEVELOPER_EXTRAS = ("dev",)
 
 
 def main(arguments: Sequence[str], root: str) -> int:
@@ -67,7 +67,7 @@ def _options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespa
     parser.add_argument(
         "--extras", metavar="A,B", default="", help=f"install more: {', '.join(further)}"
     )
-    parser.add_argument("--dev", action="store_true", help="the same as --extras dev,docs")
+    parser.add_argument("--dev", action="store_true", help="the same as --extras dev")
     parser.add_argument("--test", action="store_true", help="then run all checks and tests")
     options = parser.parse_args(arguments)
     extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
