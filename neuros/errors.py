@@ -6,12 +6,11 @@
     ├── ProjectError        the project files are wrong        exit code 3
     ├── UsageError          the command line is wrong          exit code 2
     ├── EnvironmentFault    something is missing on this machine   exit code 4
-    ├── NodeError           a node failed                      exit code 1
-    │   ├── HookError       ... in a hook of its plugin
-    │   ├── PluginError     ... while its plugin was loaded
-    │   ├── ModelError      ... since its simulator cannot be set up as declared
-    │   └── ProtocolError   ... since a neighbour broke the rules of a connection
-    └── DeadlockError       no node can ever run again         exit code 1
+    └── NodeError           a node failed                      exit code 1
+        ├── HookError       ... in a hook of its plugin
+        ├── PluginError     ... while its plugin was loaded
+        ├── ModelError      ... since its simulator cannot be set up as declared
+        └── ProtocolError   ... since a neighbour broke the rules of a connection
 """
 
 from __future__ import annotations
@@ -86,7 +85,3 @@ class ModelError(NodeError):
 
 class ProtocolError(NodeError):
     """A neighbour broke the rules of a connection (for instance a lossless one lost a packet)."""
-
-
-class DeadlockError(NeurosError):
-    """Nothing runs, nothing is under way, and nothing could wake a node any more."""

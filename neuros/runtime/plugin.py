@@ -62,4 +62,4 @@ def plugin_traceback(error: BaseException, plugin: Path) -> str:
         if str(plugin) in names:
             del each.stack[: names.index(str(plugin))]
         each = each.__cause__ or each.__context__
-    return "".join(shown.format())
+    return "".join(shown.format()).rstrip()

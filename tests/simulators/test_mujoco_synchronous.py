@@ -14,6 +14,7 @@ from simulated_node import WORLD, SimulatedNode, imu, stamp_ns
 from std_msgs.msg import Float64, Float64MultiArray
 
 from neuros.errors import ModelError
+from neuros.ports import Simulator
 from neuros.simulators.mujoco import MuJoCo
 
 POSE = ("geometry_msgs/msg/PoseStamped", {"sensor": "pose", "element": "box", "rate": 20})
@@ -344,3 +345,9 @@ def test_meshes_of_an_entity_are_found_beside_its_own_file(tmp_path):
     sim.spawn_entity("toys/tetra.xml", (1, -2, 1), "other")
     assert sim.model.nmesh == 2
     sim.step_synchronous(10)
+
+
+def test_it_offers_all_that_a_simulator_has_to() -> None:
+    promised = {name for name in vars(Simulator) if not name.startswith("_")}
+    assert promised
+    assert promised <= set(dir(MuJoCo))
