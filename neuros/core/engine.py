@@ -28,6 +28,9 @@ from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node, Port
 
+_MANY = 2**62
+"""More hooks and executions than there will be."""
+
 
 class Effects(Protocol):
     """What an engine does to the world."""
@@ -86,6 +89,11 @@ class Engine:
         self._unregistered = sum(not outlet.is_registered for outlet in self.outlets.values())
         hooks = [ports.hook(spec) for spec in specs if spec.kind is not HookKind.FINALISE]
         self._order: dict[Hook, None] = dict.fromkeys(hooks)
+        self._candidates: set[Hook] = set()
+        self._turn = 0
+        self._first_turn = -_MANY
+        for hook in hooks:
+            self._line_up(hook)
         self.all_hooks: list[Hook] = hooks
         self._sources: dict[tuple[str, ...], Source] = {}
         self._initialisers = [h for h in hooks if h.spec.kind is HookKind.INITIALISE]
@@ -259,24 +267,68 @@ class Engine:
             return
         if not self.is_started or self._unregistered:
             return
-        self._is_passing = True
-        try:
-            for hook in tuple(self._order):
-                if self.is_stopped:
-                    return
-                if hook.is_ready():
-                    self._run(hook)
-        finally:
-            self._is_passing = False
-        self._cause = cause_of_rest(self._order)
+        if self._candidates:
+            self._is_passing = True
+            try:
+                self._run_candidates()
+            finally:
+                self._is_passing = False
+        self._cause = self.rest() if self.is_stopped else self._cause_of_rest()
         if self._cause is SCHEDULING and not (self._has_posted_loop_back or self.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
+
+    def _run_candidates(self) -> None:
+        """Ask each hook at its turn, in the order of priority that holds now."""
+        last, first_new, place = self._turn, self._first_turn, -_MANY - 1
+        while self._candidates and not self.is_stopped:
+            hook = self._next(place, first_new, last)
+            if hook is None:
+                return
+            place = hook.turn
+            if not hook.blocked or hook.can_send():
+                self._run(hook)
+
+    def _next(self, place: int, first_new: int, last: int) -> Hook | None:
+        """The next candidate in the priority order behind ``place``.
+
+        Its turn is one that was given when the pass began: up to ``last`` to hooks that have been
+        executed, below ``first_new`` to the others.
+        """
+        found: Hook | None = None
+        for hook in self._candidates:
+            turn = hook.turn
+            is_in_pass = place < turn <= last and (turn > 0 or turn < first_new)
+            if is_in_pass and (found is None or turn < found.turn):
+                found = hook
+        return found
+
+    def _cause_of_rest(self) -> Rest:
+        """As :func:`cause_of_rest`, without a look at all the hooks that only wait."""
+        if not self._candidates:
+            for hook in self._order:
+                slot = hook.missing_slot()
+                if slot is not None and hook.is_enabled and hook.is_due:
+                    return slot.rest
+            return IDLE
+        for hook in self._candidates:
+            if not hook.blocked or hook.can_send():
+                return SCHEDULING
+        first = min(self._candidates, key=_turn)
+        return first.blocking_outlets()[0].rest
+
+    def _line_up(self, hook: Hook) -> None:
+        """Give a new hook its place: before all that have been executed, behind all others."""
+        hook.candidates = self._candidates
+        hook.turn = self._first_turn
+        self._first_turn += 1
 
     def _run(self, hook: Hook) -> None:
         """Start a hook: move it to the end of the order, take its packets, send what it returns."""
         del self._order[hook]
         self._order[hook] = None
+        self._turn += 1
+        hook.turn = self._turn
         start_ns = self._clock()
         if hook.period_ns:
             hook.set_due(self.tick_start_ns, start_ns)
@@ -353,6 +405,7 @@ class Engine:
 
     def _finish_initialiser(self, hook: Hook) -> None:
         self._initialisers.remove(hook)
+        hook.is_enabled = False
         del self._order[hook]
         for slot in hook.slots:
             for mailbox in slot.mailboxes:
@@ -378,6 +431,7 @@ class Engine:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
         source = self._sources[names] = Source(names, self.outputs)
+        self._line_up(source)
         source.is_enabled = self.is_running and not self.is_draining
         # It has never been executed, and so goes before all that have.
         self._order = dict.fromkeys(
@@ -385,6 +439,10 @@ class Engine:
         )
         self.all_hooks.append(source)
         return source
+
+
+def _turn(hook: Hook) -> int:
+    return hook.turn
 
 
 def _could_wake(hook: Hook) -> bool:

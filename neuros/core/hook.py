@@ -36,17 +36,22 @@ class Hook:
         blocked: number of its outlets that are blocked now.
         is_due: False only for a tick between two due times, and for a source with nothing to send.
         is_enabled: whether the node's phase of life lets it run at all.
+        turn: grows in the order of priority: least recently executed first.
+        candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
+            keeps itself in there, so that no event has to look at all the others.
         executions, busy_ns: how often it ran, and for how long in all.
     """
 
     __slots__ = (
+        "_is_due",
+        "_is_enabled",
+        "_lacking",
         "_results",
         "blocked",
         "busy_ns",
+        "candidates",
         "due_ns",
         "executions",
-        "is_due",
-        "is_enabled",
         "loops",
         "missed_ticks",
         "name",
@@ -54,6 +59,7 @@ class Hook:
         "period_ns",
         "slots",
         "spec",
+        "turn",
     )
 
     def __init__(
@@ -65,8 +71,13 @@ class Hook:
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
         self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
         self.blocked = 0
-        self.is_due = spec.period_s is None
-        self.is_enabled = False
+        self.turn = 0
+        self.candidates: set[Hook] = set()
+        self._is_due = spec.period_s is None
+        self._is_enabled = False
+        self._lacking = sum(slot.missing > 0 for slot in self.slots)
+        for slot in self.slots:
+            slot.hook = self
         self.executions = 0
         self.busy_ns = 0
         self.due_ns = 0
@@ -76,6 +87,37 @@ class Hook:
         for outlet in self.outlets():
             outlet.hooks.append(self)
             self.blocked += outlet.is_blocked
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the timer condition holds."""
+        return self._is_due
+
+    @is_due.setter
+    def is_due(self, is_due: bool) -> None:
+        self._is_due = is_due
+        self._note()
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether the phase of life lets it run."""
+        return self._is_enabled
+
+    @is_enabled.setter
+    def is_enabled(self, is_enabled: bool) -> None:
+        self._is_enabled = is_enabled
+        self._note()
+
+    def on_slot_complete(self) -> None:
+        """One of its inputs has now what it needs."""
+        self._lacking -= 1
+        if not self._lacking and self._is_enabled and self._is_due:
+            self.candidates.add(self)
+
+    def on_slot_incomplete(self) -> None:
+        """One of its inputs lacks something now."""
+        self._lacking += 1
+        self.candidates.discard(self)
 
     def outlets(self) -> list[Outlet]:
         """Every connection that the hook may send on."""
@@ -164,6 +206,12 @@ class Hook:
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the address of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
+
+    def _note(self) -> None:
+        if self._is_enabled and self._is_due and not self._lacking:
+            self.candidates.add(self)
+        else:
+            self.candidates.discard(self)
 
     def _loops(self) -> list[tuple[Outlet, InputSlot, Mailbox]]:
         """Connections from this hook to itself."""

@@ -9,12 +9,15 @@ input is fed by several connections.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.core.accounting import Rest, State
 from neuros.errors import ProtocolError
 from neuros.hooks import InputSpec
 from neuros.project.model import Connection
+
+if TYPE_CHECKING:
+    from neuros.core.hook import Hook
 
 
 class Mailbox:
@@ -183,10 +186,12 @@ class Inlet:
 class InputSlot:
     """One declared input of one hook.
 
-    ``missing`` is the number of packets that the slot still needs before its hook may start.
+    Attributes:
+        missing: number of packets that the slot still needs before its hook may start.
+        hook: the hook that it belongs to, told when the slot has all that it needs, or no longer.
     """
 
-    __slots__ = ("_filled", "is_all", "is_optional", "mailboxes", "missing", "name", "rest")
+    __slots__ = ("_filled", "hook", "is_all", "is_optional", "mailboxes", "missing", "name", "rest")
 
     def __init__(self, spec: InputSpec, inlets: list[Inlet]) -> None:
         self.name = spec.name
@@ -197,26 +202,30 @@ class InputSlot:
         for mailbox in self.mailboxes:
             mailbox.inlet.mailboxes.append(mailbox)
         self._filled = 0
-        self.missing = 0
-        self._count()
+        self.missing = self._count()
+        self.hook: Hook
 
     def on_filled(self) -> None:
         """One of the mailboxes is no longer empty."""
         self._filled += 1
-        self._count()
+        if self.missing:
+            self.missing = self._count()
+            if not self.missing:
+                self.hook.on_slot_complete()
 
     def on_emptied(self) -> None:
         """One of the mailboxes is empty now."""
         self._filled -= 1
-        self._count()
+        was_missing, self.missing = self.missing, self._count()
+        if self.missing and not was_missing:
+            self.hook.on_slot_incomplete()
 
-    def _count(self) -> None:
+    def _count(self) -> int:
         if self.is_optional:
-            self.missing = 0
-        elif self.is_all:
-            self.missing = len(self.mailboxes) - self._filled
-        else:
-            self.missing = 0 if self._filled else 1
+            return 0
+        if self.is_all:
+            return len(self.mailboxes) - self._filled
+        return 0 if self._filled else 1
 
     def has_reliable_packet(self) -> bool:
         """Whether a packet that must not be lost waits here."""
