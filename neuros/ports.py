@@ -48,6 +48,13 @@ class Transport(Protocol):
     def open(self, inbox: Inbox) -> None:
         """Create the endpoints and begin to announce this node to its neighbours."""
 
+    def note_result(self, box: Sequence[Any]) -> None:
+        """Look at what a hook has returned before it is sent.
+
+        It is the only element of ``box``, which is all that NeuROS holds of it: so one can tell
+        whether the plugin has kept a reference.
+        """
+
     def send(self, connections: Sequence[Connection], packet: Packet) -> None:
         """Send one packet on all these connections of one output."""
 

@@ -31,6 +31,7 @@ class NodeRuntime:
         tell: reports to the supervisor, ``tell(kind, **fields)``.
         fail: called with an error that ends the project.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
+        on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
 
     Attributes:
@@ -47,6 +48,7 @@ class NodeRuntime:
         fail: Callable[[str, NeurosError], None],
         log_file: Path | None,
         duration_sim_s: float | None,
+        on_initialised: Callable[[], None] = lambda: None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.file = file
@@ -58,6 +60,7 @@ class NodeRuntime:
         self._tell = tell
         self._fail = fail
         self._duration_sim_s = duration_sim_s if file.node.owns_time else None
+        self._on_initialised = on_initialised
         self._clock = clock
         self._has_run = False
         self._read_time_s: Callable[[], float] | None = None
@@ -173,10 +176,14 @@ class NodeRuntime:
         if not self._has_run:
             self._has_run = True
             self._tell("first_hook", node=self.name)
-        result = self._run_spec(hook.spec, arguments)
+        box = [self._run_spec(hook.spec, arguments)]
+        if hook.spec.kind is HookKind.INITIALISE:
+            self._on_initialised()
+        if hook.outputs:
+            self._transport.note_result(box)
         if self._duration_sim_s is not None:
             self._check_duration()
-        return result
+        return box[0]
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         """Send on connections to other nodes."""

@@ -8,7 +8,6 @@ two: whole dictionaries are exchanged rather than filled.
 
 from __future__ import annotations
 
-import importlib.abc
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -72,6 +71,7 @@ class Stage:
         self._current = self._process
         self._known_modules = len(sys.modules)
         self._owned: dict[str, _Owned] = {}
+        self._changes: dict[tuple[Scope, Scope], _Changes] = {}
 
     def scope(
         self,
@@ -106,7 +106,7 @@ class Stage:
             return
         self._take_modules(current)
         self._current = scope
-        _set_variables(current.variables, scope)
+        self._set_variables(current, scope)
         _exchange_environ(scope.environ)
         current.path, sys.path = sys.path, scope.path
         if scope.modules:
@@ -141,6 +141,20 @@ class Stage:
         for name in scope.modules:
             sys.modules.pop(name, None)
 
+    def _set_variables(self, old: Scope, new: Scope) -> None:
+        """Let C libraries see the variables that differ (``getenv``)."""
+        changes = self._changes.get((old, new))
+        if changes is None:
+            changes = self._changes[old, new] = _Changes(old, new)
+        for key in changes.gone:
+            value = new.environ.get(key)
+            if value is None:
+                os.unsetenv(key)
+            else:
+                os.putenv(key, value)
+        for key, value in changes.new:
+            os.putenv(key, value)
+
     def _note_owned(self, scope: Scope) -> None:
         for name in _FOR_ONE_NODE:
             module = sys.modules.get(name)
@@ -148,8 +162,29 @@ class Stage:
                 self._owned[name] = _Owned(name, module, scope)
 
 
-class _Owned(importlib.abc.MetaPathFinder):
-    """A library that one node has imported, hidden from and refused to the others."""
+class _Changes:
+    """Which variables differ between two scopes, encoded: looked up once, needed at each switch.
+
+    Attributes:
+        gone: those that the new scope has not as a node, though perhaps as the process.
+        new: the values of those that it has, and that are other ones than before.
+    """
+
+    def __init__(self, old: Scope, new: Scope) -> None:
+        key, value = os.environ.encodekey, os.environ.encodevalue
+        self.gone = [key(name) for name in old.variables if name not in new.variables]
+        self.new = [
+            (key(name), value(text))
+            for name, text in new.variables.items()
+            if old.variables.get(name) != text
+        ]
+
+
+class _Owned:
+    """A library that one node has imported, hidden from and refused to the others.
+
+    It is a finder on ``sys.meta_path`` (``importlib.abc`` would cost 10 ms at the start).
+    """
 
     def __init__(self, name: str, module: ModuleType, owner: Scope) -> None:
         self.name, self.module, self.owner = name, module, owner
@@ -191,17 +226,3 @@ def _environ_data() -> dict[Any, Any]:
 def _exchange_environ(data: dict[Any, Any]) -> None:
     """Let ``os.environ`` itself show these variables, for those who hold a reference to it, too."""
     os.environ._data = data  # type: ignore[attr-defined]
-
-
-def _set_variables(old: Mapping[str, str], scope: Scope) -> None:
-    """Let C libraries see the variables that differ (``getenv``)."""
-    for name in old:
-        if name not in scope.variables:
-            value = scope.environ.get(os.environ.encodekey(name))
-            if value is None:
-                os.unsetenv(name)
-            else:
-                os.putenv(name, value)
-    for name, text in scope.variables.items():
-        if old.get(name) != text:
-            os.putenv(name, text)

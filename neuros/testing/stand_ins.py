@@ -11,6 +11,7 @@ from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.testing.step_loop import StepLoop
 from neuros.transport.copying import copy_packet
+from neuros.transport.making import make_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 
@@ -117,7 +118,7 @@ class Topics:
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""
-        return message_class(type_name)()
+        return make_packet(type_name)
 
     def close(self) -> None:
         """Take nothing any more."""

@@ -18,14 +18,14 @@ from neuros.transport.messages import decode, encode, message_class
 
 Copy: TypeAlias = Callable[[Any], Any]
 
-_INTEGERS = {
+INTEGERS = {
     f"{sign}int{bits}": range(2**bits) if sign else range(-(2 ** (bits - 1)), 2 ** (bits - 1))
     for sign in ("", "u")
     for bits in (8, 16, 32, 64)
 }
 
 
-class _Unusual(Exception):
+class Unusual(Exception):
     """A value that ROS would convert, or refuse."""
 
 
@@ -36,7 +36,7 @@ def copy_packet(packet: Any) -> Any:
     if copy is not None:
         try:
             return copy(packet)
-        except _Unusual:
+        except Unusual:
             pass
     return decode(encode(packet))
 
@@ -46,7 +46,7 @@ def _field_by_field(kind: type) -> Copy | None:
     """What copies messages of a class, ``None`` where only ROS itself can."""
     try:
         return _message(kind)
-    except _Unusual:
+    except Unusual:
         return None
 
 
@@ -62,7 +62,7 @@ def _message(kind: Any) -> Copy:
 
     def copy(message: Any) -> Any:
         if type(message) is not kind:
-            raise _Unusual
+            raise Unusual
         twin: Any = object.__new__(kind)
         for slot, copy_field in copies:
             setattr(twin, slot, copy_field(getattr(message, slot)))
@@ -76,7 +76,7 @@ def _message(kind: Any) -> Copy:
 def _field(type_name: str, default: Any) -> Copy:
     """For a field of a type in ROS's notation; ``default`` shows what Python makes of it."""
     if "," in type_name:  # no more than so many: ROS sees to that
-        raise _Unusual
+        raise Unusual
     if isinstance(default, array):
         return _sequence_of_numbers(default)
     if hasattr(default, "dtype"):
@@ -89,20 +89,20 @@ def _field(type_name: str, default: Any) -> Copy:
 def _single(type_name: str) -> Copy:
     if type_name in ("double", "boolean"):
         return _of_exactly(float if type_name == "double" else bool)
-    if type_name in _INTEGERS:
-        return _integer(_INTEGERS[type_name])
+    if type_name in INTEGERS:
+        return _integer(INTEGERS[type_name])
     if type_name == "string":
         return _text
     package, _, name = type_name.partition("/")
     if not name.isidentifier():
-        raise _Unusual
+        raise Unusual
     return _message(message_class(f"{package}/msg/{name}"))
 
 
 def _of_exactly(kind: type) -> Copy:
     def copy(value: Any) -> Any:
         if type(value) is not kind:
-            raise _Unusual
+            raise Unusual
         return value
 
     return copy
@@ -111,17 +111,21 @@ def _of_exactly(kind: type) -> Copy:
 def _integer(allowed: range) -> Copy:
     def copy(value: Any) -> Any:
         if type(value) is not int or value not in allowed:
-            raise _Unusual
+            raise Unusual
         return value
 
     return copy
 
 
 def _text(value: Any) -> Any:
-    """Of other text it takes a codec to say what arrives; after a NUL, nothing does."""
-    if type(value) is not str or not value.isascii() or "\0" in value:
-        raise _Unusual
+    if type(value) is not str or not is_plain_text(value):
+        raise Unusual
     return value
+
+
+def is_plain_text(value: str) -> bool:
+    """Of other text it takes a codec to say what arrives; after a NUL, nothing does."""
+    return value.isascii() and "\0" not in value
 
 
 def _sequence_of_numbers(default: array[Any]) -> Copy:
@@ -129,7 +133,7 @@ def _sequence_of_numbers(default: array[Any]) -> Copy:
 
     def copy(value: Any) -> Any:
         if type(value) is not array or value.typecode != code:
-            raise _Unusual
+            raise Unusual
         return value[:]
 
     return copy
@@ -140,7 +144,7 @@ def _array_of_numbers(default: Any) -> Copy:
 
     def copy(value: Any) -> Any:
         if type(value) is not kind or value.dtype != numbers or value.shape != shape:
-            raise _Unusual
+            raise Unusual
         return value.copy()
 
     return copy
@@ -149,7 +153,7 @@ def _array_of_numbers(default: Any) -> Copy:
 def _list_of(copy_item: Copy) -> Copy:
     def copy(value: Any) -> Any:
         if type(value) is not list:
-            raise _Unusual
+            raise Unusual
         return [copy_item(item) for item in value]
 
     return copy

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.ownership import is_unshared_inside, unheld
 
 
 class Outside(Protocol):
@@ -72,6 +73,7 @@ class MemoryTransport:
         self._hub = hub
         self._outside = outside
         self._is_open = False
+        self._given_up: list[Any] = []
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
         }
@@ -82,12 +84,19 @@ class MemoryTransport:
         self._outside.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
+    def note_result(self, box: Sequence[Any]) -> None:
+        """Remember which packets of a hook's result nobody but NeuROS holds any more."""
+        self._given_up = unheld(box)
+
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Hand a packet over; each receiver gets its own copy."""
+        """Give each receiver a copy, but the last one the packet itself if it is unshared."""
         if not self._is_open:
             return
-        for connection in connections:
+        *others, last = connections
+        for connection in others:
             self._channels[connection].send(self._hub.copy(packet))
+        own = packet if self._is_unshared(packet) else self._hub.copy(packet)
+        self._channels[last].send(own)
         self._outside.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
@@ -116,8 +125,17 @@ class MemoryTransport:
     def close(self) -> None:
         """Send and receive nothing any more."""
         self._is_open = False
+        self._given_up = []
         self._hub.leave(self._name)
         self._outside.close()
+
+    def _is_unshared(self, packet: Any) -> bool:
+        """Whether the hook gave the packet up, and no part of it is held anywhere."""
+        for place, given_up in enumerate(self._given_up):
+            if given_up is packet:
+                del self._given_up[place]  # it is the receiver's from now on
+                return is_unshared_inside(packet)
+        return False
 
 
 class _Nobody:

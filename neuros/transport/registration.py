@@ -45,7 +45,10 @@ _CONFIRMED = "confirmed"
 class Registration:
     """One connection, seen from one of its ends.
 
-    ``on_registered`` is called once, in the loop's thread, when this end is sure of the other.
+    Args:
+        note: what a receiver lets its sender know of itself, one line.
+        on_registered: called once, in the loop's thread, when this end is sure of the other;
+            a sender gets the receiver's note, a receiver an empty one.
     """
 
     def __init__(
@@ -56,7 +59,8 @@ class Registration:
         publishers: list[Publisher],
         subscriptions: list[Subscription],
         is_sender: bool,
-        on_registered: Callable[[], None],
+        note: str = "",
+        on_registered: Callable[[str], None],
     ) -> None:
         self.connection = connection
         self.is_done = False
@@ -66,7 +70,9 @@ class Registration:
         self._is_sender = is_sender
         self._peer = connection.destination_node if is_sender else connection.source_node
         self._on_registered = on_registered
+        self._announcement = f"{_READY} {note}"
         self._peer_is_ready = False
+        self._peer_note = ""
         topic = f"{connection.topic}/reg"
         self._voice = ros_node.create_publisher(String, topic, LATCHED)
         self._ear = ros_node.create_subscription(String, topic, self._hear, HEARD)
@@ -76,7 +82,7 @@ class Registration:
         if self.is_done or not self._has_found_peer():
             return self.is_done
         if not self._is_sender:
-            self._voice.publish(String(data=_READY))
+            self._voice.publish(String(data=self._announcement))
         elif self._peer_is_ready:
             self._voice.publish(String(data=_CONFIRMED))
             self._finish()
@@ -88,18 +94,20 @@ class Registration:
         self._ros_node.destroy_subscription(self._ear)
 
     def _hear(self, message: String) -> None:
-        if self._is_sender and message.data == _READY:
+        word, _, note = message.data.partition(" ")
+        if self._is_sender and word == _READY:
             self._peer_is_ready = True
+            self._peer_note = note
             if self.is_done:  # the confirmation may have been sent before the ear was there
                 self._voice.publish(String(data=_CONFIRMED))
             else:
                 self.advance()
-        elif not self._is_sender and message.data == _CONFIRMED and not self.is_done:
+        elif not self._is_sender and word == _CONFIRMED and not self.is_done:
             self._finish()
 
     def _finish(self) -> None:
         self.is_done = True
-        self._on_registered()
+        self._on_registered(self._peer_note)
 
     def _has_found_peer(self) -> bool:
         return all(self._reaches_peer(publisher) for publisher in self._publishers) and all(
@@ -107,14 +115,20 @@ class Registration:
         )
 
     def _reaches_peer(self, publisher: Publisher) -> bool:
+        matched = publisher.get_subscription_count()
+        if not matched:  # asked first: the graph is searched from end to end for each topic
+            return False
         listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
         compatible = [e for e in listed if _match(publisher.qos_profile, e.qos_profile)]
-        return self._is_among(compatible, publisher.get_subscription_count())
+        return self._is_among(compatible, matched)
 
     def _hears_peer(self, subscription: Subscription) -> bool:
+        matched = subscription.get_publisher_count()
+        if not matched:
+            return False
         listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
         compatible = [e for e in listed if _match(e.qos_profile, subscription.qos_profile)]
-        return self._is_among(compatible, subscription.get_publisher_count())
+        return self._is_among(compatible, matched)
 
     def _is_among(self, compatible: Sequence[TopicEndpointInfo], matched: int) -> bool:
         return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)

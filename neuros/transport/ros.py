@@ -7,24 +7,39 @@ A connection has three topics below ``/neuros/<source>/<output>/<destination>/<i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from rclpy.node import Node as RosNode
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from std_msgs.msg import UInt64
 
 from neuros.core.node_ports import EXTERNAL_DEPTH
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.messages import message_class
+from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.large_carriers import LargeCarriers
+from neuros.transport.making import make_packet
+from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
+
+
+@dataclass
+class _Way:
+    """How packets leave on one connection: bytes by ``publish``, made by ``carrier``.
+
+    ``count_readers`` says how many read the topic now, whoever they are.
+    """
+
+    publish: Callable[[bytes], None]
+    carrier: Encoder
+    count_readers: Callable[[], int]
 
 
 class RosTransport:
@@ -35,10 +50,11 @@ class RosTransport:
         self._connections = file.connections
         self._ros_node = ros_node
         self._loop = loop
-        self._data: dict[Connection, Publisher] = {}
-        self._acknowledgements: dict[Connection, tuple[Publisher, UInt64]] = {}
+        self._ways: dict[Connection, _Way] = {}
+        self._acknowledgements: dict[Connection, Callable[[bytes], None]] = {}
         self._external: dict[str, Publisher] = {}
         self._registrations: list[Registration] = []
+        self._large = LargeCarriers(file, ros_node.get_logger().warning)
         self._is_open = False
 
     def open(self, inbox: Inbox) -> None:
@@ -57,13 +73,20 @@ class RosTransport:
                 _ANNOUNCE_S, lambda: self._loop.guard(self._look_for_others)
             )
 
+    def note_result(self, box: Sequence[Any]) -> None:
+        """Nothing to do: what is sent leaves as bytes."""
+
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         """Publish a packet on the data topics of these connections, serialised once."""
         if not self._is_open:
             return
-        data = packet if len(connections) == 1 else serialize_message(packet)
+        encoded: dict[Encoder, bytes] = {}
         for connection in connections:
-            self._data[connection].publish(data)
+            way = self._ways[connection]
+            data = encoded.get(way.carrier)
+            if data is None:
+                data = encoded[way.carrier] = way.carrier.encode(packet)
+            way.publish(data)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
@@ -73,9 +96,9 @@ class RosTransport:
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Publish the position that every taker has reached."""
         if self._is_open:
-            publisher, message = self._acknowledgements[connection]
-            message.data = position
-            publisher.publish(message)
+            if self._large.inputs:
+                self._large.settle(connection, position)
+            self._acknowledgements[connection](encode_position(position))
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""
@@ -83,18 +106,21 @@ class RosTransport:
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""
-        return message_class(type_name)()
+        return make_packet(type_name)
 
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
+        self._large.close()
 
     def _open_sender(self, connection: Connection, inbox: Inbox) -> None:
         kind = message_class(self._node.output(connection.source_output).type)
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
-        self._data[connection] = data
+        self._ways[connection] = _Way(
+            data.handle.publish_raw, message_carrier(kind), data.get_subscription_count
+        )
         subscriptions = []
         if connection.is_reliable:
             subscriptions.append(
@@ -102,11 +128,21 @@ class RosTransport:
                     UInt64,
                     f"{connection.topic}/ack",
                     LATCHED,
-                    lambda message: inbox.on_acknowledgement(connection, message.data),
+                    lambda data: inbox.on_acknowledgement(connection, decode_position(data)),
+                    is_raw=True,
                 )
             )
-        self._register(
-            connection, [data], subscriptions, True, lambda: inbox.on_registered(connection)
+        self._registrations.append(
+            Registration(
+                self._ros_node,
+                connection,
+                publishers=[data],
+                subscriptions=subscriptions,
+                is_sender=True,
+                on_registered=lambda note: self._loop.post(
+                    partial(self._meet_receiver, connection, note, inbox)
+                ),
+            )
         )
 
     def _open_receiver(self, connection: Connection, inbox: Inbox) -> None:
@@ -116,15 +152,32 @@ class RosTransport:
             acknowledge = self._ros_node.create_publisher(
                 UInt64, f"{connection.topic}/ack", LATCHED
             )
-            self._acknowledgements[connection] = (acknowledge, UInt64())
+            self._acknowledgements[connection] = acknowledge.handle.publish_raw
             publishers.append(acknowledge)
         data = self._subscribe(
             kind,
             f"{connection.topic}/data",
             data_qos(connection),
-            partial(inbox.on_packet, connection),
+            _decoding(self._large.decoder(connection), partial(inbox.on_packet, connection)),
+            is_raw=True,
         )
-        self._register(connection, publishers, [data], False, lambda: None)
+        self._registrations.append(
+            Registration(
+                self._ros_node,
+                connection,
+                publishers=publishers,
+                subscriptions=[data],
+                is_sender=False,
+                note=self._large.note(connection),
+                on_registered=lambda _: None,
+            )
+        )
+
+    def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
+        """The receiver of a connection is there, and lets us know ``note`` of itself."""
+        way = self._ways[connection]
+        way.carrier = self._large.encoder(connection, note, way.count_readers) or way.carrier
+        inbox.on_registered(connection)
 
     def _open_external(self, inbox: Inbox) -> None:
         for port in self._node.outputs:
@@ -143,37 +196,27 @@ class RosTransport:
             message_class(port.type),
             str(port.external_topic),
             qos,
-            partial(inbox.on_external_packet, port),
+            _decoding(
+                message_carrier(message_class(port.type)), partial(inbox.on_external_packet, port)
+            ),
+            is_raw=True,
         )
 
     def _subscribe(
-        self, kind: type, topic: str, qos: QoSProfile, deliver: Callable[[Any], None]
+        self,
+        kind: type,
+        topic: str,
+        qos: QoSProfile,
+        deliver: Callable[[Any], None],
+        *,
+        is_raw: bool = False,
     ) -> Subscription:
-        guard = self._loop.guard
-
         def receive(message: Any) -> None:
             if self._is_open:
-                guard(deliver, message)
+                deliver(message)
 
-        return self._ros_node.create_subscription(kind, topic, receive, qos)
-
-    def _register(
-        self,
-        connection: Connection,
-        publishers: list[Publisher],
-        subscriptions: list[Subscription],
-        is_sender: bool,
-        on_registered: Callable[[], None],
-    ) -> None:
-        self._registrations.append(
-            Registration(
-                self._ros_node,
-                connection,
-                publishers=publishers,
-                subscriptions=subscriptions,
-                is_sender=is_sender,
-                on_registered=lambda: self._loop.post(on_registered),
-            )
+        return self._ros_node.create_subscription(
+            kind, topic, self._loop.guarded(receive), qos, raw=is_raw
         )
 
     def _look_for_others(self) -> None:
@@ -189,6 +232,18 @@ def data_qos(connection: Connection) -> QoSProfile:
     return QoSProfile(
         depth=connection.window, reliability=reliable if connection.is_reliable else best_effort
     )
+
+
+def _decoding(carrier: Decoder, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
+    """What receives bytes: it delivers the packet, unless that was lost on its way."""
+    decode = carrier.decode
+
+    def receive(data: bytes) -> None:
+        packet = decode(data)
+        if packet is not None:
+            deliver(packet)
+
+    return receive
 
 
 def _call(function: Callable[[Connection], None], connection: Connection) -> Callable[[], None]:

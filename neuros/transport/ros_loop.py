@@ -1,9 +1,9 @@
 """The thread in which all nodes of a process run: one queue for ROS's events and the engine's.
 
-rclpy's ``SingleThreadedExecutor`` builds a new wait set for every callback; its
-``EventsExecutor`` keeps one queue in C++ and takes a third of the time. Two of its habits shape
-this module: without a finite timeout it spins hot, and past its deadline it goes on while events
-keep coming. So it is always given a deadline, and is stopped from inside when a timer is due.
+It serves ROS with one of rclpy's executors (see :mod:`neuros.transport.executors`), by default the
+``EventsExecutor``. Two habits of that shape this module: without a finite timeout it spins hot,
+and past its deadline it goes on while events keep coming. So it is always given a deadline, and is
+stopped from inside when a timer is due.
 
 Events of the engines wait in a deque of their own, since passing each of them through C++ would
 cost more than the engine itself. One task in the executor's queue (the *pump*) stands for them, so
@@ -19,12 +19,16 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node as RosNode
+
+from neuros.transport.executors import make_executor
 
 Event = Callable[[], None]
 
-_TURN_NS = 100_000
+# How long events of engines may keep those of ROS waiting, besides the event that runs. Each turn
+# costs 5 to 25 us, more with cold caches; 1 ms makes that a few per cent, and no hook of a node next
+# to others in the same process can count on less.
+_TURN_NS = 1_000_000
 _LONG_S = 3600.0
 
 
@@ -48,7 +52,7 @@ class RosLoop:
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
-        self._executor = EventsExecutor(context=context)
+        self._executor = make_executor(context)
         self._on_failure = on_failure
         self._waker = _Waker()
         self._events: deque[tuple[Event, bool]] = deque()
@@ -86,14 +90,28 @@ class RosLoop:
         """Like :meth:`post`, from any thread."""
         self._executor.create_task(self.guard, event)
 
-    def guard(self, event: Callable[..., None], *arguments: Any) -> None:
+    def guard(self, event: Event) -> None:
         """Run what ROS calls: a failure must not unwind through the executor's C++."""
         try:
-            event(*arguments)
+            event()
         except BaseException as error:
             self._on_failure(error)
         if self._timers:
             self._check_timers()
+
+    def guarded(self, receive: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The same for what ROS calls with a message, again and again."""
+        on_failure, timers = self._on_failure, self._timers
+
+        def guarded(message: Any) -> None:
+            try:
+                receive(message)
+            except BaseException as error:
+                on_failure(error)
+            if timers:
+                self._check_timers()
+
+        return guarded
 
     def run(self) -> None:
         """Run until :meth:`stop`."""

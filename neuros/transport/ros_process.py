@@ -6,7 +6,6 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -16,17 +15,13 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.transport.copying import copy_packet
+from neuros.transport.dds_profile import dds_environment
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
+from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
-
-PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-"""Where Fast DDS 2 looks for its settings when the first ROS node of a process is created."""
-
-PROFILES = Path(__file__).with_name("fast_dds.xml")
-"""NeuROS's settings of Fast DDS."""
 
 _LINGER_S = 0.05
 # What takes a callback, and at which place of its arguments.
@@ -44,7 +39,7 @@ class RosProcess:
         in_memory: bool,
         debug: bool = False,
     ) -> None:
-        os.environ.setdefault(PROFILES_VARIABLE, str(PROFILES))  # a user's own file wins
+        os.environ.update(dds_environment(os.environ))
         self._context = rclpy.Context()
         # rcl would write each record to a second log file, which costs as much as a packet.
         arguments = ["--ros-args", "--disable-external-lib-logs"]
@@ -68,7 +63,7 @@ class RosProcess:
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
-        ros_node = RosNode(file.node.name, context=self._context)
+        ros_node = PlainNode(file.node.name, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
         transport: Transport

@@ -8,18 +8,21 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from neuros.transport.ros_process import PROFILES, PROFILES_VARIABLE
+import pytest
+
+from neuros.transport.dds_profile import (
+    LOCAL_PROFILES,
+    PROFILES,
+    PROFILES_VARIABLE,
+    RANGE_VARIABLE,
+)
 
 READER_WAITS_NS = 5_000_000  # before it asks for what it missed: heartbeatResponseDelay
 CREATE_A_NODE = "import rclpy; rclpy.init(); rclpy.create_node('reader_of_settings')"
 
 
-def what_fast_dds_says_to(file: Path) -> str:
-    environment = {
-        **os.environ,
-        PROFILES_VARIABLE: str(file),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
+def what_fast_dds_says_to(file: Path, discovery: str) -> str:
+    environment = {**os.environ, PROFILES_VARIABLE: str(file), RANGE_VARIABLE: discovery}
     command = [sys.executable, "-c", CREATE_A_NODE]
     result = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=True, timeout=30
@@ -27,11 +30,16 @@ def what_fast_dds_says_to(file: Path) -> str:
     return result.stdout + result.stderr
 
 
-def test_fast_dds_reads_the_file_and_finds_nothing_wrong(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("file", "discovery"), [(PROFILES, "LOCALHOST"), (LOCAL_PROFILES, "SYSTEM_DEFAULT")]
+)
+def test_fast_dds_reads_the_files_and_finds_nothing_wrong(
+    file: Path, discovery: str, tmp_path: Path
+) -> None:
     misspelt = tmp_path / "misspelt.xml"
-    misspelt.write_text(PROFILES.read_text().replace("nackSup", "nackSupp"))
-    assert "XMLPARSER" in what_fast_dds_says_to(misspelt)
-    assert "XMLPARSER" not in what_fast_dds_says_to(PROFILES)
+    misspelt.write_text(file.read_text().replace("nackSup", "nackSupp"))
+    assert "XMLPARSER" in what_fast_dds_says_to(misspelt, discovery)
+    assert "XMLPARSER" not in what_fast_dds_says_to(file, discovery)
 
 
 def test_no_request_to_send_again_comes_while_requests_are_ignored() -> None:

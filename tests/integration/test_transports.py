@@ -13,6 +13,7 @@ from neuros.launch.domain import choose_domain
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.testing.transports import TransportChecks
+from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.ros_process import RosProcess
 
 SLICE_S = 0.002
@@ -83,3 +84,11 @@ class TestMemoryTransportOnRos(TransportChecks):
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
         return RosNetwork([files], in_memory=True)
+
+
+class TestRosTransportOnAWaitSet(TestRosTransport):
+    """The same, served by the executor that the loop falls back to."""
+
+    @pytest.fixture(autouse=True)
+    def wait_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv(EXECUTOR_VARIABLE, "wait_set")

@@ -37,13 +37,14 @@ class Cameras:
         self._model = model
         self._fine = fine
         self._resources: _Resources | None = None
+        self._pixels: dict[tuple[int, ...], npt.NDArray[np.uint8]] = {}
 
     def use(self, model: Any) -> None:
         """Render another model from the next image on; any thread that has its turn."""
         self._model = model
 
-    def render(self, data: Any, camera: int, width: int, height: int) -> npt.NDArray[np.uint8]:
-        """What a camera sees: RGB, shape (height, width, 3), the top row first."""
+    def render(self, data: Any, camera: int, image: npt.NDArray[np.uint8]) -> None:
+        """Fill ``image`` with what a camera sees: RGB, shape (height, width, 3), top row first."""
         if self._resources is not None and self._resources.model is not self._model:
             self.close()
         if self._resources is None:
@@ -54,11 +55,14 @@ class Cameras:
         held.camera.fixedcamid = camera
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, held.option, None, held.camera, every, held.scene)
+        height, width, _ = image.shape
         area = mujoco.MjrRect(0, 0, width, height)
-        image = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_render(area, held.scene, held.context)
-        mujoco.mjr_readPixels(image, None, area, held.context)
-        return np.ascontiguousarray(image[::-1])  # OpenGL counts rows from the bottom
+        pixels = self._pixels.get(image.shape)
+        if pixels is None:
+            pixels = self._pixels[image.shape] = np.empty(image.shape, np.uint8)
+        mujoco.mjr_readPixels(pixels, None, area, held.context)
+        image[:] = pixels[::-1]  # OpenGL counts rows from the bottom
 
     def close(self) -> None:
         """Free the OpenGL context; the next image makes a new one."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import mujoco
+import numpy as np
 
 from neuros.ports import Packet
 from neuros.simulators.mujoco.cameras import Cameras
@@ -181,7 +182,9 @@ def _bind_camera(binding: Binding) -> Fill | None:
         packet.width, packet.height, packet.step = width, height, 3 * width
         packet.encoding = "rgb8"
         # rclpy checks lists and bytes element by element; an array is taken as it is.
-        packet.data = array("B", cameras.render(data, camera, width, height).tobytes())
+        pixels = array("B", (0,)) * (3 * width * height)
+        cameras.render(data, camera, np.frombuffer(pixels, np.uint8).reshape(height, width, 3))
+        packet.data = pixels
 
     return fill
 

@@ -1,0 +1,41 @@
+"""Which settings Fast DDS gets, and how far the nodes of a process look for each other.
+
+ROS's range ``LOCALHOST`` ("this machine only") brings transports of its own, which announce a
+participant to the first 32 of the domain only: of 64 processes some never find each other. So
+NeuROS takes the range ``SYSTEM_DEFAULT`` instead, which leaves transports to the settings, and has
+settings with the same meaning and room for all 120 participants of a domain. ROS programs of the
+user with the ranges ``LOCALHOST`` and ``SUBNET`` find such nodes, and are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+"""Where Fast DDS 2 looks for its settings when the first ROS node of a process is created."""
+
+PROFILES = Path(__file__).with_name("fast_dds.xml")
+"""NeuROS's settings of Fast DDS, whatever the range."""
+
+LOCAL_PROFILES = Path(__file__).with_name("fast_dds_local.xml")
+"""The same, with transports that stay on this machine."""
+
+MOST_LOCAL_PARTICIPANTS = 120
+"""Processes with ROS nodes that one domain has ports for (DDSI-RTPS 2.5, 9.6.2)."""
+
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_PEERS_VARIABLE = "ROS_STATIC_PEERS"
+
+
+def dds_environment(environ: Mapping[str, str]) -> dict[str, str]:
+    """What to add to ``environ`` before the first ROS node of a process is created.
+
+    Nothing if it names settings of the user's own. A range other than ``LOCALHOST``, and
+    ``LOCALHOST`` with peers on other machines, are left to ROS.
+    """
+    if environ.get(PROFILES_VARIABLE) not in (None, "", str(PROFILES), str(LOCAL_PROFILES)):
+        return {}
+    if environ.get(RANGE_VARIABLE) != "LOCALHOST" or environ.get(_PEERS_VARIABLE):
+        return {PROFILES_VARIABLE: str(PROFILES)}
+    return {PROFILES_VARIABLE: str(LOCAL_PROFILES), RANGE_VARIABLE: "SYSTEM_DEFAULT"}

@@ -1,0 +1,226 @@
+"""Large packets between processes of one machine: their buffers go through shared memory.
+
+DDS copies a large message six or seven times on its way from one Python to another. Here the sender
+copies each buffer once, into a slot of a :mod:`segment <neuros.transport.packet_segment>`, and
+publishes on the same topic as always a *parcel*: the serialised message with empty buffers, and
+behind it a note of where they are. The receiver copies them out, as it takes the parcel, before
+it acknowledges anything.
+
+A parcel is told from an ordinary serialised message by the two option bytes of its encapsulation
+header, which are zero in the plain CDR of ROS (DDSI-RTPS 2.3, 10.5). A reader that knows nothing of
+this sees a message with empty buffers; therefore parcels are for receivers alone that have said
+that they can read them (:func:`machine_token`), on topics that nobody else reads.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import struct
+from array import array
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+from weakref import ReferenceType, ref
+
+from neuros.errors import ProtocolError
+from neuros.project.model import Connection
+from neuros.transport.carriers import message_carrier
+from neuros.transport.message_buffers import MessageBuffers
+from neuros.transport.packet_segment import (
+    SHARED_MEMORY,
+    Overwritten,
+    Place,
+    SegmentReader,
+    SegmentWriter,
+    StoredBuffer,
+)
+
+LARGE_BYTES = 64 * 1024
+"""Buffers of together this size or more leave the message: below, DDS is as fast."""
+
+_MARK = b"NR"
+_OPTIONS = slice(2, 4)
+# Behind the message, and read from its end: lengths of the buffers, the name of the segment, and
+# generation, size of a slot, slot, length of the message, number of buffers, length of the name.
+_NOTE = struct.Struct("<QQIIHH")
+
+
+class LargeOutput:
+    """The packets that one output sends to receivers that can read parcels.
+
+    Args:
+        owner: as for :class:`SegmentWriter`.
+        slots: of the segment; see :func:`slots_for`.
+        warn: is told, once, when shared memory is full and all goes through DDS from then on.
+    """
+
+    def __init__(
+        self,
+        kind: type,
+        buffers: MessageBuffers,
+        *,
+        owner: str,
+        slots: int,
+        warn: Callable[[str], object],
+        folder: Path = SHARED_MEMORY,
+    ) -> None:
+        self._plain = message_carrier(kind)
+        self._buffers = buffers
+        self._writer = SegmentWriter(owner, slots, folder)
+        self._owner = owner
+        self._warn = warn
+        self._has_room = True
+        self._counts: list[Callable[[], int]] = []
+
+    def add_receiver(self, count_readers: Callable[[], int]) -> None:
+        """One more connection; ``count_readers`` says how many read its topic now."""
+        self._counts.append(count_readers)
+
+    def encode(self, packet: Any) -> bytes:
+        """The parcel of a large packet; any other, or what others read too, as a whole message."""
+        buffers = self._buffers.of(packet) if self._has_room else None
+        if buffers is None or not _is_large(buffers) or any(n() != 1 for n in self._counts):
+            return self._plain.encode(packet)
+        try:
+            place = self._writer.write(buffers)
+        except OSError as error:
+            self._has_room = False
+            self._warn(f"large packets of {self._owner} go through DDS, which is slower: {error}")
+            return self._plain.encode(packet)
+        return _parcel(self._plain.encode(self._buffers.leave_out(packet)), place)
+
+    def close(self) -> None:
+        """Remove the shared memory."""
+        self._writer.close()
+
+
+class LargeInput:
+    """The packets that arrive on one connection, with their buffers.
+
+    On a reliable connection the buffers stay where they are until somebody looks at them, or at the
+    latest until the hook after is about to start: before that is acknowledged, nobody writes there.
+    On one of best effort they are copied at once, and a packet that was overtaken counts as lost.
+    """
+
+    def __init__(
+        self,
+        kind: type,
+        buffers: MessageBuffers,
+        *,
+        is_reliable: bool,
+        folder: Path = SHARED_MEMORY,
+    ) -> None:
+        self._plain = message_carrier(kind)
+        self._buffers = buffers
+        self._is_reliable = is_reliable
+        self._reader = SegmentReader(folder)
+        self._received = 0
+        # What may still be in shared memory: the packet's number, and its buffers.
+        self._stored: deque[tuple[int, list[ReferenceType[StoredBuffer]]]] = deque()
+
+    def decode(self, data: bytes) -> Any | None:
+        """The next packet, from a parcel or a whole message.
+
+        ``None`` if it was lost: its sender has ended and taken the segment along, or, on a
+        connection of best effort, it was overtaken.
+
+        Raises:
+            ProtocolError: if the parcel is broken, or its segment cannot be read.
+        """
+        self._received += 1
+        if data[_OPTIONS] != _MARK:
+            return self._plain.decode(data)
+        try:
+            message, place = _contents(data)
+            buffers = self._reader.find(place, self._buffers.typecodes)
+            if buffers is None:
+                return None
+            if self._is_reliable:
+                self._stored.append((self._received, [ref(buffer) for buffer in buffers]))
+            else:
+                for buffer in buffers:
+                    buffer.fetch()
+        except Overwritten:
+            return None
+        except (OSError, ValueError, struct.error) as error:
+            raise ProtocolError(f"a large packet cannot be read: {error}") from error
+        packet = self._plain.decode(message)
+        self._buffers.put_back(packet, buffers)
+        return packet
+
+    def settle(self, position: int) -> None:
+        """Copy what is still in use of the packets before ``position``: it gets acknowledged.
+
+        Raises:
+            ProtocolError: if that has been overwritten.
+        """
+        while self._stored and self._stored[0][0] < position:
+            for reference in self._stored.popleft()[1]:
+                buffer = reference()
+                if buffer is not None:
+                    buffer.fetch()
+
+    def close(self) -> None:
+        """Give up the shared memory."""
+        self._reader.close()
+
+
+@cache
+def machine_token(folder: Path = SHARED_MEMORY) -> str:
+    """What is equal in two processes that see the same shared memory as the same user.
+
+    Empty where large packets had better go through DDS.
+    """
+    if platform.machine() not in ("x86_64", "AMD64"):  # see packet_segment on the order of stores
+        return ""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+        users = os.stat("/proc/self/ns/user").st_ino
+        shared = folder.stat()
+    except OSError:
+        return ""
+    return f"{boot}:{shared.st_dev}:{shared.st_ino}:{users}:{os.getuid()}"
+
+
+def slots_for(connections: Sequence[Connection]) -> int:
+    """The slots that an output with these connections needs.
+
+    What is outstanding on a reliable connection, its window, and the packet before, which a hook
+    may be working on; for one of best effort one more, since nobody waits while it is copied.
+    """
+    return max(each.window + (1 if each.is_reliable else 2) for each in connections)
+
+
+def _is_large(buffers: Sequence[array[Any]]) -> bool:
+    size = 0
+    for buffer in buffers:
+        size += len(buffer) * buffer.itemsize
+    return size >= LARGE_BYTES
+
+
+def _parcel(message: bytes, place: Place) -> bytes:
+    name = place.segment.encode()
+    # RTPS pads to four bytes by itself, and the note must be found from the end.
+    padding = bytes(-(len(message) + len(name)) % 4)
+    lengths = struct.pack(f"<{len(place.lengths)}Q", *place.lengths)
+    note = _NOTE.pack(
+        place.generation,
+        place.slot_bytes,
+        place.slot,
+        len(message),
+        len(place.lengths),
+        len(name),
+    )
+    return b"".join((message[:2], _MARK, message[4:], padding, lengths, name, note))
+
+
+def _contents(data: bytes) -> tuple[bytes, Place]:
+    at = len(data) - _NOTE.size
+    generation, slot_bytes, slot, length, count, name_length = _NOTE.unpack_from(data, at)
+    name = data[at - name_length : at].decode()
+    lengths = struct.unpack_from(f"<{count}Q", data, at - name_length - 8 * count)
+    message = data[:2] + b"\0\0" + data[4:length]
+    return message, Place(name, slot_bytes, slot, generation, lengths)

@@ -1,0 +1,176 @@
+"""The loop on each executor of rclpy; the one with a wait set is what it falls back to."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from launching import EXAMPLES, launch
+from rclpy.node import Node as RosNode
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Int32
+
+from neuros.errors import EnvironmentFault
+from neuros.launch.domain import choose_domain
+from neuros.transport.executors import EXECUTOR_VARIABLE, WaitSetExecutor, make_executor
+from neuros.transport.messages import message_class
+from neuros.transport.ros_loop import RosLoop
+
+EVENTS = "rclpy.experimental.events_executor"
+TIMEOUT_S = 20.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> Iterator[None]:
+    """A ROS domain of our own on this machine."""
+    with choose_domain(None, {}, False) as lock, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(lock.id))
+        yield
+
+
+@pytest.fixture
+def context() -> Iterator[rclpy.Context]:
+    """A context of its own for each test."""
+    message_class("std_msgs/msg/Int32")  # ROS's first conversion of a type imports what warns
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+class Loop:
+    """A loop whose failures fail the test."""
+
+    def __init__(self, context: rclpy.Context) -> None:
+        self.failures: list[BaseException] = []
+        self.loop = RosLoop(context, self.failures.append)
+
+    def run(self) -> None:
+        """Until it is stopped, at most for a while."""
+        limit = threading.Timer(TIMEOUT_S, self.loop.stop)
+        limit.start()
+        try:
+            self.loop.run()
+            assert limit.is_alive(), f"the loop was not stopped within {TIMEOUT_S:g} s"
+        finally:
+            limit.cancel()
+            self.loop.close()
+        if self.failures:
+            raise self.failures[0]
+
+
+@pytest.fixture(params=["events", "wait_set"])
+def loop(request: pytest.FixtureRequest, context: rclpy.Context) -> Loop:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(EXECUTOR_VARIABLE, request.param)
+        return Loop(context)
+
+
+def test_events_are_handled_in_the_order_in_which_they_were_posted(loop: Loop) -> None:
+    seen: list[int] = []
+    for number in range(5):
+        loop.loop.post(lambda n=number: seen.append(n))  # type: ignore[misc]
+    loop.loop.post(loop.loop.stop)
+    loop.run()
+    assert seen == [0, 1, 2, 3, 4]
+
+
+def test_a_loop_back_comes_after_all_that_ros_has_waiting(
+    loop: Loop, context: rclpy.Context
+) -> None:
+    node = RosNode("node", context=context)
+    loop.loop.add_node(node)
+    seen: list[object] = []
+    receive = loop.loop.guarded(lambda message: seen.append(message.data))
+    subscription = node.create_subscription(Int32, "numbers", receive, 10)
+    publisher = node.create_publisher(Int32, "numbers", 10)
+
+    def begin() -> None:
+        if not (publisher.get_subscription_count() and subscription.get_publisher_count()):
+            loop.loop.post(begin)
+            return
+        for number in range(5):
+            publisher.publish(Int32(data=number))
+        time.sleep(0.2)  # nothing can be asked whether it has arrived without taking it
+        loop.loop.post_loop_back(lambda: seen.append("loop-back"))
+        loop.loop.post(loop.loop.stop)
+
+    loop.loop.post(begin)
+    loop.run()
+    node.destroy_node()
+    assert seen == [0, 1, 2, 3, 4, "loop-back"]
+
+
+def test_another_thread_wakes_and_stops_a_loop_that_has_nothing_to_do(loop: Loop) -> None:
+    seen: list[threading.Thread] = []
+
+    def event() -> None:
+        seen.append(threading.current_thread())
+        threading.Thread(target=loop.loop.stop).start()
+
+    threading.Thread(target=lambda: loop.loop.post_from_thread(event)).start()
+    loop.run()
+    assert seen == [threading.main_thread()]
+
+
+def test_a_stop_before_the_loop_runs_counts(loop: Loop) -> None:
+    loop.loop.stop()
+    loop.run()
+
+
+def test_timers_are_called_when_they_are_due(loop: Loop) -> None:
+    due_ns = [time.monotonic_ns() + 30_000_000 * n for n in (1, 2, 3)]
+    late_ns: list[int] = []
+
+    def on_due() -> None:
+        late_ns.append(time.monotonic_ns() - due_ns.pop(0))
+        if not due_ns:
+            loop.loop.stop()
+
+    loop.loop.add_timer(lambda: due_ns[0] if due_ns else None, on_due)
+    loop.run()
+    assert len(late_ns) == 3
+    assert min(late_ns) >= 0
+
+
+def test_without_the_events_executor_a_wait_set_takes_its_place(
+    context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, EVENTS, None)  # as if it had been removed
+    executor = make_executor(context)
+    assert isinstance(executor, WaitSetExecutor)
+    executor.shutdown(0)
+    assert capfd.readouterr().err.count("falling back to a wait set") == 1
+
+
+def test_with_an_events_executor_that_has_changed_too(
+    context: rclpy.Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{EVENTS}.EventsExecutor", lambda *, context: object())
+    executor = make_executor(context)
+    assert isinstance(executor, WaitSetExecutor)
+    executor.shutdown(0)
+
+
+def test_an_unknown_executor_is_refused(
+    context: rclpy.Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(EXECUTOR_VARIABLE, "fast")
+    with pytest.raises(EnvironmentFault, match="'events' or 'wait_set'"):
+        make_executor(context)
+
+
+@pytest.mark.parametrize("backend", ["process", "in-process"])
+def test_a_project_runs_on_a_wait_set(
+    backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(EXECUTOR_VARIABLE, "wait_set")
+    run = launch(EXAMPLES / "2_synchronisation/tennis", "--backend", backend, cwd=tmp_path)
+    assert run.exit_code == 0, run.output
+    for connection in run.record["connections"]:
+        assert connection["sent"] == connection["received"] > 0, connection

@@ -1,0 +1,41 @@
+"""The ROS node that a plugin gets: others may reach its parameters once it has some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.signals import SignalHandlerOptions
+
+from neuros.transport.messages import message_class
+from neuros.transport.plain_node import PlainNode
+
+message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
+
+
+@pytest.fixture
+def node() -> Iterator[PlainNode]:
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = PlainNode("robot", context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def services(node: PlainNode) -> list[str]:
+    return [service.srv_name for service in node.services]
+
+
+def test_a_node_without_parameters_offers_no_services(node: PlainNode) -> None:
+    assert services(node) == []
+    assert node.get_parameter("use_sim_time").value is False
+
+
+def test_the_first_parameter_brings_the_services_for_all(node: PlainNode) -> None:
+    assert node.declare_parameter("speed", 3).value == 3
+    assert node.declare_parameter("colour", "red").value == "red"
+    assert len(services(node)) == 6
+    assert node.get_parameter("speed").value == 3

@@ -1,0 +1,74 @@
+"""Which settings of Fast DDS a process of nodes gets."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from neuros.transport.dds_profile import (
+    LOCAL_PROFILES,
+    MOST_LOCAL_PARTICIPANTS,
+    PROFILES,
+    PROFILES_VARIABLE,
+    RANGE_VARIABLE,
+    dds_environment,
+)
+
+NAMESPACE = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
+LOCAL = {RANGE_VARIABLE: "LOCALHOST"}
+
+
+def test_nodes_that_stay_on_this_machine_get_transports_that_do() -> None:
+    assert dds_environment(LOCAL) == {
+        PROFILES_VARIABLE: str(LOCAL_PROFILES),
+        RANGE_VARIABLE: "SYSTEM_DEFAULT",
+    }
+
+
+@pytest.mark.parametrize(
+    "environ",
+    [
+        {},
+        {RANGE_VARIABLE: "SUBNET"},
+        {RANGE_VARIABLE: "OFF"},
+        {RANGE_VARIABLE: "SYSTEM_DEFAULT"},
+        {**LOCAL, "ROS_STATIC_PEERS": "192.0.2.7"},
+    ],
+)
+def test_another_range_is_left_to_ros(environ: dict[str, str]) -> None:
+    assert dds_environment(environ) == {PROFILES_VARIABLE: str(PROFILES)}
+
+
+def test_a_file_of_the_users_own_wins() -> None:
+    assert dds_environment({**LOCAL, PROFILES_VARIABLE: "/home/me/dds.xml"}) == {}
+
+
+def test_a_file_of_neuros_that_was_inherited_is_no_file_of_the_users_own() -> None:
+    assert dds_environment({**LOCAL, PROFILES_VARIABLE: str(PROFILES)}) == dds_environment(LOCAL)
+
+
+def test_both_files_say_the_same_of_writers() -> None:
+    (writer,), (local_writer,) = (
+        ElementTree.parse(file).iter(f"{NAMESPACE}data_writer")
+        for file in (PROFILES, LOCAL_PROFILES)
+    )
+    assert words(writer) == words(local_writer)
+
+
+def words(element: ElementTree.Element) -> list[tuple[str, str]]:
+    return [(each.tag, (each.text or "").strip()) for each in element.iter()]
+
+
+def test_nothing_but_this_machine_is_reached_and_all_of_a_domain() -> None:
+    tree = ElementTree.parse(LOCAL_PROFILES)
+    assert {each.text for each in tree.iter(f"{NAMESPACE}address")} == {"127.0.0.1"}
+    (reach,) = tree.iter(f"{NAMESPACE}maxInitialPeersRange")
+    assert reach.text == str(MOST_LOCAL_PARTICIPANTS)
+
+
+def test_both_files_are_packaged() -> None:
+    for file in (PROFILES, LOCAL_PROFILES):
+        assert file.suffix == ".xml"
+        assert file.parent == Path(__file__).resolve().parents[2] / "neuros" / "transport"
