@@ -1,7 +1,9 @@
 """The same experiment in one loop without NeuROS: how fast it could be at best.
 
 The same model, network, figure and cadence of the figure as in project.json; what NeuROS adds or
-gains (nodes side by side) is the ratio to this. Prints one line of JSON.
+gains (nodes side by side) is the ratio to this. Prints one line of JSON, with the wall time of
+each part; ``overlap_bound`` is what could be gained at best by physics beside the network:
+(physics + network) / network.
 
     python floor.py --duration 20 --rate 1 --seed 1
 """
@@ -40,16 +42,21 @@ def run(duration_s: float = 20.0, rate_rad_s: float = 1.0, seed: int = 1) -> dic
     estimates: dict[int, float] = {}
     truths: dict[int, float] = {}
 
+    physics_s = network_s = 0.0
     start = time.perf_counter()
     for packet in range(1, round(duration_s / IMU_PERIOD_S) + 1):
         stamp_ns = packet * round(IMU_PERIOD_S * 1e9)
+        physics_start = time.perf_counter()
         mujoco.mj_step(model, data, steps)
         mujoco.mj_forward(model, data)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, imu, velocity, 1)
         w, x, y, z = body.xquat.tolist()
         truths[stamp_ns] = yaw_of(x, y, z, w)
+        physics_s += time.perf_counter() - physics_start
         plot.redraw_if_due(estimates, truths)
+        network_start = time.perf_counter()
         estimates[stamp_ns] = network.step(float(velocity[2]), IMU_PERIOD_S)
+        network_s += time.perf_counter() - network_start
         plot.redraw_if_due(estimates, truths)
     wall_s = time.perf_counter() - start
 
@@ -57,6 +64,10 @@ def run(duration_s: float = 20.0, rate_rad_s: float = 1.0, seed: int = 1) -> dic
         "simulated_s": duration_s,
         "wall_s": wall_s,
         "real_time_factor": duration_s / wall_s,
+        "physics_s": physics_s,
+        "network_s": network_s,
+        "plot_s": wall_s - physics_s - network_s,
+        "overlap_bound": (physics_s + network_s) / network_s,
         "redraws": plot.redraws,
         **asdict(heading_error(plot.redraw(estimates, truths))),
     }
