@@ -17,10 +17,13 @@ def clean_environment():
     """This environment without the libraries of another ROS 2, which would be loaded before ours.
 
     There are two sorts: a sourced distribution (AMENT_PREFIX_PATH), and the parent's own .venv.
+    The mark keeps the ROS wheels from starting Python once more for their libraries: launching
+    needs none of them. Nodes get both anew (neuros/launch/wheels.py).
     """
     environment = dict(os.environ)
     if environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None):
         environment.pop("LD_LIBRARY_PATH", None)
+    environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     prefixes = [p for p in environment.pop("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     for key in ("PYTHONPATH", "LD_LIBRARY_PATH"):
         if prefixes and key in environment:

@@ -1,1 +1,1 @@
-"""What NeuROS costs, measured against the same thing without it: ``python -m benchmarks``."""
+"""What NeuROS costs, measured against the same thing without it: ``neuros benchmark``."""

@@ -1,161 +1,209 @@
-"""Repeated measurements side by side, and what may be said about them.
+"""What a subject declares, and how it is measured: side by side, in rounds.
 
 Machines differ, and one machine differs from minute to minute. So nothing is measured alone: each
-*round* measures all candidates one after the other, every other round in the opposite order, and
-two candidates are compared round by round. What is reported is the median of those ratios.
+*round* measures all candidates of a group one after the other, every other round in the opposite
+order, and two candidates are compared within the rounds.
 """
 
 from __future__ import annotations
 
-import os
-import platform
-import statistics
-import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
-from typing import Any
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Union
 
-Measurement = Callable[[], float]
+Round = dict[str, dict[str, float]]
+"""What one round measured: candidate, figure, value."""
+
+Measurement = Callable[[], Union[float, Mapping[str, float]]]  # noqa: UP007 (evaluated on 3.10)
+"""Measures once: one figure, which is then called ``value``, or several by name."""
+
+MINIMUM_PAIRS = 10
+_ENOUGH_FAILURES = 2
 
 
-@dataclass(frozen=True)
-class Target:
-    """A bound for a figure, or for its ratio to another: at most or at least ``bound``."""
-
-    bound: float
-    is_maximum: bool = True
-
-    def is_met(self, value: float) -> bool:
-        """Whether ``value`` keeps within the bound."""
-        return value <= self.bound if self.is_maximum else value >= self.bound
-
-    def __str__(self) -> str:
-        return f"{'<=' if self.is_maximum else '>='} {self.bound:g}"
+class Unavailable(Exception):
+    """What a measurement needs is not there (a second core, a package); the text says what."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One line of the table: what was measured in each round, and against what.
+class Figure:
+    """A figure that a candidate's measurement returns."""
+
+    candidate: str
+    name: str = "value"
+
+    @property
+    def candidates(self) -> frozenset[str]:
+        """Whose measurements it needs."""
+        return frozenset({self.candidate})
+
+    def of(self, measured: Round) -> float:
+        """Its value in a round; raises ``KeyError`` where the measurement has no such figure."""
+        return measured[self.candidate][self.name]
+
+
+@dataclass(frozen=True)
+class Quotient:
+    """One value divided by another one of the same round."""
+
+    dividend: Value
+    divisor: Value
+
+    @property
+    def candidates(self) -> frozenset[str]:
+        """Whose measurements it needs."""
+        return self.dividend.candidates | self.divisor.candidates
+
+    def of(self, measured: Round) -> float:
+        """Its value in a round."""
+        return self.dividend.of(measured) / self.divisor.of(measured)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One value without another one of the same round."""
+
+    minuend: Value
+    subtrahend: Value
+
+    @property
+    def candidates(self) -> frozenset[str]:
+        """Whose measurements it needs."""
+        return self.minuend.candidates | self.subtrahend.candidates
+
+    def of(self, measured: Round) -> float:
+        """Its value in a round."""
+        return self.minuend.of(measured) - self.subtrahend.of(measured)
+
+
+Value = Union[Figure, Quotient, Difference]  # noqa: UP007 (evaluated on 3.10)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure of the documentation, one curve per series; axes with their units."""
+
+    key: str
+    title: str
+    x_label: str
+    y_label: str
+    is_log_x: bool = False
+    is_log_y: bool = False
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a row is shown in a plot, and its reference; an empty series is not drawn."""
+
+    plot: str
+    series: str
+    x: float
+    reference_series: str = ""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table before it is measured.
 
     Attributes:
-        unit: of ``values``.
-        reference: name and values of what it is compared with, round by round.
-        target: for the ratio to the reference, or for the figure itself where there is none.
+        unit: of the value: us, 1/s, MB (1e6 bytes), empty for shares and factors.
+        reference: what the value is compared with, in the same round and unit.
+        against: what the reference is called in the table.
+        bound: a key of :data:`benchmarks.targets.BOUNDS`; it judges the ratio to the reference,
+            or the value where there is none.
     """
 
     name: str
     unit: str
-    values: tuple[float, ...]
-    reference: tuple[str, tuple[float, ...]] | None = None
-    target: Target | None = None
+    value: Value
+    reference: Value | None = None
+    against: str = ""
+    bound: str | None = None
+    point: Point | None = None
 
     @property
-    def ratios(self) -> tuple[float, ...]:
-        """Value over reference of each round; empty without a reference."""
-        if self.reference is None:
-            return ()
-        return tuple(a / b for a, b in zip(self.values, self.reference[1], strict=True))
-
-    @property
-    def is_met(self) -> bool | None:
-        """Whether the median keeps to the target, ``None`` without one."""
-        if self.target is None:
-            return None
-        return self.target.is_met(statistics.median(self.ratios or self.values))
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain data, with every single value."""
-        reference = self.reference and {"name": self.reference[0], "values": self.reference[1]}
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "values": self.values,
-            "median": statistics.median(self.values),
-            "reference": reference,
-            "ratio": statistics.median(self.ratios) if self.reference else None,
-            "target": None if self.target is None else str(self.target),
-            "is_met": self.is_met,
-        }
-
-    def as_cells(self) -> list[str]:
-        """The cells of the table, see :data:`HEADERS`."""
-        against = "" if self.reference is None else self.reference[0]
-        met = {True: "yes", False: "NO", None: ""}[self.is_met]
-        return [
-            self.name,
-            f"{_with_range(self.values)} {self.unit}",
-            against,
-            _with_range(self.ratios) if self.ratios else "",
-            "" if self.target is None else str(self.target),
-            met,
-        ]
+    def candidates(self) -> frozenset[str]:
+        """Whose measurements it needs."""
+        return self.value.candidates | (self.reference.candidates if self.reference else set())
 
 
-HEADERS = ["measurement", "median (range)", "against", "ratio (range)", "target", "met"]
+@dataclass(frozen=True)
+class Group:
+    """Candidates that are measured in the same rounds, and the rows that follow from them."""
+
+    candidates: Mapping[str, Measurement]
+    cases: tuple[Case, ...]
+    rounds: int = MINIMUM_PAIRS
+
+    def only(self, text: str) -> Group:
+        """The part that is needed for the rows whose names contain ``text``."""
+        cases = tuple(case for case in self.cases if text.lower() in case.name.lower())
+        needed = frozenset[str]().union(*(case.candidates for case in cases))
+        candidates = {name: each for name, each in self.candidates.items() if name in needed}
+        return replace(self, candidates=candidates, cases=cases)
 
 
-def in_rounds(
-    candidates: Mapping[str, Measurement], rounds: int, say: Callable[[str], None]
-) -> dict[str, tuple[float, ...]]:
-    """Measure all candidates in each round, A B C, C B A, A B C, ...
+@dataclass(frozen=True)
+class Subject:
+    """A topic that can be measured by itself: ``neuros benchmark NAME``."""
 
-    Returns:
-        The values of each candidate, one per round.
+    description: str
+    groups: tuple[Group, ...]
+    plots: tuple[Plot, ...] = ()
+
+
+@dataclass
+class Run:
+    """A group while it is measured.
+
+    Attributes:
+        rounds: what was measured, round by round; a round may lack candidates.
+        unavailable: why a candidate is not measured here.
+        failures: what went wrong with a candidate, once or more.
     """
-    values: dict[str, list[float]] = {name: [] for name in candidates}
-    for number in range(rounds):
-        names = list(candidates)
-        for name in reversed(names) if number % 2 else names:
-            value = candidates[name]()
-            values[name].append(value)
-            say(f"  {number + 1}/{rounds} {name}: {value:.4g}")
-    return {name: tuple(each) for name, each in values.items()}
 
+    group: Group
+    rounds: list[Round] = field(default_factory=list)
+    unavailable: dict[str, str] = field(default_factory=dict)
+    failures: dict[str, list[str]] = field(default_factory=dict)
 
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "packages": dict(_versions(("ros-jazzy-rclpy", "mujoco", "nest-simulator"))),
-    }
+    def measure(self, rounds: int, say: Callable[[str], None]) -> Iterator[None]:
+        """Measure; yields after each candidate, what was measured by then is in ``rounds``."""
+        for number in range(rounds):
+            names = self._names()
+            self.rounds.append({})
+            for name in reversed(names) if number % 2 else names:
+                self._measure_once(name, f"  {number + 1}/{rounds} {name}: ", say)
+                yield
 
+    def _names(self) -> list[str]:
+        """The candidates that are worth a try, and that some row still has use for."""
+        lost = {*self.unavailable}
+        lost |= {name for name, each in self.failures.items() if len(each) >= _ENOUGH_FAILURES}
+        cases = [case for case in self.group.cases if not case.candidates & lost]
+        needed = frozenset[str]().union(*(case.candidates for case in cases))
+        return [name for name in self.group.candidates if name in needed]
 
-def load_before(seconds: float = 1.0) -> float:
-    """Share of all cores that others keep busy now, by watching them for a while."""
-    first = _cpu_times()
-    time.sleep(seconds)
-    busy, total = (now - then for now, then in zip(_cpu_times(), first, strict=True))
-    return busy / total if total else 0.0
-
-
-def _cpu_times() -> tuple[int, int]:
-    """Busy and total time of all cores since the start of the machine (``proc_stat(5)``)."""
-    fields = Path("/proc/stat").read_text().splitlines()[0].split()[1:9]
-    times = [int(field) for field in fields]
-    idle = times[3] + times[4]  # idle and iowait; stolen time counts as busy
-    return sum(times) - idle, sum(times)
-
-
-def _processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _versions(names: Iterable[str]) -> Iterable[tuple[str, str]]:
-    for name in names:
+    def _measure_once(self, name: str, label: str, say: Callable[[str], None]) -> None:
+        if name in self.unavailable:
+            return
         try:
-            yield name, metadata.version(name)
-        except metadata.PackageNotFoundError:
-            yield name, "not installed"
+            figures = self.group.candidates[name]()
+        except Unavailable as reason:
+            self.unavailable[name] = str(reason)
+            say(f"{label}left out: {reason}")
+        except Exception as error:  # one broken measurement must not cost the others
+            self.failures.setdefault(name, []).append(_describe(error))
+            say(f"{label}FAILED: {_describe(error).splitlines()[-1]}")
+        else:
+            named = figures if isinstance(figures, Mapping) else {"value": figures}
+            self.rounds[-1][name] = {key: float(value) for key, value in named.items()}
+            say(label + ", ".join(f"{value:.4g}" for value in named.values()))
 
 
-def _with_range(values: Iterable[float]) -> str:
-    values = sorted(values)
-    return f"{statistics.median(values):.3g} ({values[0]:.3g} to {values[-1]:.3g})"
+def _describe(error: Exception) -> str:
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, subprocess.CalledProcessError | subprocess.TimeoutExpired):
+        text += f"\n{error.stderr or error.output or ''}"
+    return text.strip()

@@ -38,7 +38,15 @@ def is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(package + ".")
 
 
-SUPERVISOR = ("supervisor", "channels", "outcome", "probing", "quiescence", "watch")
+SUPERVISOR = (
+    "supervisor",
+    "channels",
+    "outcome",
+    "probing",
+    "processes",
+    "quiescence",
+    "watch",
+)
 
 # The first room that holds a module is its room.
 ROOMS = (

@@ -157,6 +157,20 @@ def environment_of(tree: Path, *extras: str) -> Environment:
     return Environment(tree, extras, Progress(StringIO()))
 
 
+def test_the_modules_are_compiled_whatever_python_may_write_by_itself(
+    tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    environment = environment_of(tree)
+    environment.python.parent.mkdir(parents=True)
+    environment.python.symlink_to(sys.executable)
+    (tree / "neuros").mkdir()
+    (tree / "neuros" / "hooks.py").write_text("", "utf-8")
+    environment.compile()
+    cache = f"hooks.{sys.implementation.cache_tag}.pyc"
+    assert (tree / "neuros" / "__pycache__" / cache).exists()
+
+
 class TestStamp:
     """What an earlier run left says whether there is anything to do."""
 

@@ -1,6 +1,7 @@
-"""Serves a packet, times how long it takes until it is back, and serves it again.
+"""Serves a packet, times how long it takes until one is back, and serves again.
 
-ROUND_TRIPS in the environment is how many; result.json in the node's folder gets their durations.
+ROUND_TRIPS in the environment is how many, BYTES the size of the packet; result.json in the node's
+folder gets their durations in microseconds.
 """
 
 import itertools
@@ -8,13 +9,16 @@ import json
 import os
 import time
 
+from packets import fill
+
 from neuros.hooks import Optional, neuros_function, neuros_initialise
 
 
 class Times:
-    """Moments at which the packet came back, in nanoseconds."""
+    """Moments at which a packet came back, in nanoseconds; ``ball`` is what was served first."""
 
-    def __init__(self, wanted):
+    def __init__(self, ball, wanted):
+        self.ball = ball
         self.moments_ns = []
         self.wanted = wanted
 
@@ -25,8 +29,9 @@ class Times:
 
 @neuros_initialise(outputs="ball")
 def serve(node):
-    node.set_user_data(Times(int(os.environ["ROUND_TRIPS"])))
-    return node.make_packet("ball")
+    ball = fill(node.make_packet("ball"), int(os.environ["BYTES"]))
+    node.set_user_data(Times(ball, int(os.environ["ROUND_TRIPS"])))
+    return ball
 
 
 @neuros_function(inputs="back", outputs=Optional("ball"))
@@ -34,7 +39,7 @@ def strike(node, packet):
     times = node.get_user_data()
     times.moments_ns.append(time.perf_counter_ns())
     if len(times.moments_ns) <= times.wanted:
-        return packet
+        return packet if type(packet) is type(times.ball) else times.ball
     (node.run_dir / "result.json").write_text(json.dumps(times.durations_us()))
     node.shutdown("all round trips are timed")
     return None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import secrets
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,14 +35,14 @@ _PATIENCE_S = 1.0
 
 def launch(options: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
-    with _signals_noted() as signals:
+    with _signals_noted() as (signals, waker):
         plan = make_plan(options)
         with choose_domain(options.domain_id, os.environ, plan.needs_known_domain) as domain:
             if options.dry_run:
                 return _dry_run(plan, domain, options.output)
             run_folder = make_run_folder(options.output, plan.project.name)
             files = write_node_files(plan, run_folder)
-            return _Run(plan, files, domain, run_folder, signals).execute()
+            return _Run(plan, files, domain, run_folder, signals, waker).execute()
 
 
 class _Run:
@@ -55,13 +55,15 @@ class _Run:
         domain: DomainLock,
         run_folder: Path,
         signals: list[int],
+        waker: socket.socket,
     ) -> None:
         self._plan = plan
         self._files = files
         self._domain = domain
         self._run_folder = run_folder
         self._signals = signals
-        self._run_id = secrets.token_hex(8)
+        self._waker = waker
+        self._run_id = os.urandom(8).hex()
         logs = {file.node.name: run_folder / file.node.name / "node.log" for file in files}
         if plan.backend == "in-process":
             logs["host"] = run_folder / "host.log"
@@ -108,13 +110,14 @@ class _Run:
     def _supervisor(self, guardian: Guardian) -> Supervisor:
         return Supervisor(
             self._files,
-            self._plan.launcher(guardian.watch),
+            self._plan.launcher(self._domain.id, guardian.watch),
             self._environment(),
             self._run_folder,
             self._console,
             self._signals,
             duration_s=self._plan.duration.wall_s,
             is_partial=self._plan.is_partial,
+            waker=self._waker,
         )
 
     def _environment(self) -> dict[str, str]:
@@ -132,24 +135,34 @@ class _Run:
 def _dry_run(plan: Plan, domain: DomainLock, output: str | None) -> int:
     folder = run_folder_path(output, plan.project.name, "<utc time>")
     print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
-    for line in plan.launcher().describe(plan.node_files(folders_of(plan, folder))):
+    for line in plan.launcher(domain.id).describe(plan.node_files(folders_of(plan, folder))):
         print(line)
     return 0
 
 
 @contextmanager
-def _signals_noted() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM instead of dying of them, until the run is cleaned up."""
+def _signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
+    """Collect SIGINT and SIGTERM instead of dying of them, until the run is cleaned up.
+
+    Yields them, and a socket to which a byte goes for each, and whenever a child has ended.
+    """
     noted: list[int] = []
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else nohup wants it to go on
         numbers.append(signal.SIGHUP)
     previous = {
         number: signal.signal(number, lambda number, _: noted.append(number)) for number in numbers
     }
+    previous[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None)
+    waker = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py had them wait
     try:
-        yield noted
+        yield noted, reader
     finally:
+        signal.set_wakeup_fd(waker)
         for number, handler in previous.items():
             signal.signal(number, handler)
+        reader.close()
+        writer.close()

@@ -22,6 +22,7 @@ import sys
 from collections.abc import Sequence
 
 from neuros import __version__
+from neuros.cli.benchmark import add_benchmark
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -87,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
     _add_launch(commands)
     _add_validate(commands)
     _add_graph(commands)
+    add_benchmark(commands)
     _add_node(commands)
     return result
 
@@ -133,6 +135,11 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "--output",
         metavar="DIR",
         help="the run folder; new or empty (default: runs/<project>/<utc time>)",
+    )
+    launch.add_argument(
+        "--no-placement",
+        action="store_true",
+        help="leave it to the kernel which node runs on which core; affinity has no effect",
     )
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import ctypes
 import faulthandler
 import json
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +20,8 @@ from neuros.runtime.process import NodeProcess
 
 def run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
+    leave = _Leave()
+    atexit.register(leave)  # first, so that it comes last, after what plugins have registered
     faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log
     files = [node_file_from_json(json.loads(Path(p).read_text())) for p in options.node_files]
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
@@ -27,11 +32,31 @@ def run_node(options: argparse.Namespace) -> int:
     ) -> Middleware:
         from neuros.transport.ros_process import RosProcess
 
-        return RosProcess(files, on_failure, in_memory=options.in_memory, debug=options.debug)
+        middleware = RosProcess(files, on_failure, in_memory=options.in_memory, debug=options.debug)
+        leave.has_leftovers = lambda: middleware.has_leftovers
+        return middleware
 
-    return NodeProcess(
+    leave.exit_code = NodeProcess(
         files,
         make_middleware,
         duration_sim_s=options.duration_sim,
         own_logs=options.in_memory,
     ).run()
+    return leave.exit_code
+
+
+class _Leave:
+    """Python's last act: it ends the process at once where ROS has not been given up."""
+
+    def __init__(self) -> None:
+        self.exit_code: int | None = None
+        self.has_leftovers: Callable[[], bool] = lambda: False
+
+    def __call__(self) -> None:
+        if self.exit_code is None or not self.has_leftovers():
+            return
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        ctypes.CDLL(None).fflush(None)  # what libraries in C have printed
+        os._exit(self.exit_code)

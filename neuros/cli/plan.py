@@ -6,23 +6,22 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
 from neuros.cli.projects import load
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
+from neuros.launch.affinity import usable_cores
 from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.placement import Cores, place
 from neuros.launch.process import ProcessLauncher
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
+from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-
-MOST_LOCAL_PROCESSES = 30
-"""ROS processes that surely find each other with LOCALHOST discovery (measured: about 33)."""
-
-_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS, RANGE_VARIABLE
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,7 @@ class Plan:
     backend: str
     duration: Duration
     is_verbose: bool
+    is_placed: bool = True
 
     @property
     def is_partial(self) -> bool:
@@ -60,16 +60,33 @@ class Plan:
         files = split(self.project, lambda _: folders)
         return [file for file in files if file.node.name in self.names]
 
-    def launcher(self, on_started: Callable[[int], None] | None = None) -> Launcher:
-        """The launcher of the back end; ``on_started`` hears of every process."""
+    def placement(self, domain_id: int) -> Mapping[str, Cores]:
+        """The cores of the nodes that are to be started, where that is not up to the kernel.
+
+        What runs elsewhere is not known: the other nodes of a project that is started in parts may
+        be on the same cores. In one process there is nothing to spread. Runs at the same time are
+        mostly in different domains, and so begin with different cores.
+        """
+        if not self.is_placed:
+            return {}
+        nodes = [node for node in self.project.nodes if node.name in self.names]
+        is_spread = self.backend != "in-process" and not self.is_partial
+        cores = usable_cores() if is_spread else ()
+        # The first domain that runs pick is 1.
+        return place(nodes, cores, os.environ, begin=max(domain_id - 1, 0))
+
+    def launcher(self, domain_id: int, on_started: Callable[[int], None] | None = None) -> Launcher:
+        """The launcher of the back end in a ROS domain; ``on_started`` hears of every process."""
         command = [sys.executable, "-m", "neuros.cli", "node"]
         if self.duration.sim_s is not None:
             command += ["--duration-sim", repr(self.duration.sim_s)]
         if self.is_verbose:
             command.append("--debug")
         if self.backend == "in-process":
-            return InProcessLauncher([*command, "--in-memory"], on_started)
-        return ProcessLauncher(command, on_started)
+            return InProcessLauncher(
+                [*command, "--in-memory"], on_started, self.placement(domain_id)
+            )
+        return ProcessLauncher(command, on_started, self.placement(domain_id))
 
 
 def make_plan(options: argparse.Namespace) -> Plan:
@@ -82,7 +99,8 @@ def make_plan(options: argparse.Namespace) -> Plan:
     project = load(options)
     backend = choose_backend(options.backend)
     names = _chosen_names(project, options.node, backend)
-    plan = Plan(project, names, backend, duration, options.verbose)
+    is_placed = not options.no_placement
+    plan = Plan(project, names, backend, duration, options.verbose, is_placed)
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
@@ -121,20 +139,46 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     """Check that this machine can run the plan.
 
     Raises:
-        EnvironmentFault: if ROS is missing, or cannot join so many processes.
+        EnvironmentFault: if ROS is missing, or cannot join so many processes, or a node asks for
+            a core that is not there.
     """
     if find_spec("rclpy") is None:
         raise EnvironmentFault(
             f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
             " install.py"
         )
-    is_local = environ.get(_RANGE, "LOCALHOST") == "LOCALHOST"
-    if plan.backend == "process" and is_local and len(plan.names) > MOST_LOCAL_PROCESSES:
+    if plan.is_placed:
+        _check_cores(plan)
+    is_local = environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
+    if plan.backend == "process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(
             f"{len(plan.names)} processes are more than find each other with discovery on this"
-            f" machine only ({MOST_LOCAL_PROCESSES}): use --backend in-process, or set"
-            f" {_RANGE}=SUBNET"
+            f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or set"
+            f" {RANGE_VARIABLE}=SUBNET"
         )
+
+
+def _check_cores(plan: Plan) -> None:
+    """A project may have been written for another machine: its cores are no mistake in it."""
+    usable, nodes = usable_cores(), [plan.project.node(name) for name in plan.names]
+    problems = [
+        f"{display_name(node.file)}:{line}:{column}: {pointer}: node '{node.name}' asks for"
+        f" {_cores_in_words(missing)}"
+        for node in nodes
+        if (missing := set(node.affinity) - usable)
+        for pointer in [f"{node.pointer}/affinity"]
+        for line, column in [place_of(node.file, pointer)]
+    ]
+    if problems:
+        problems.append(
+            f"NeuROS may use {_cores_in_words(usable)} here: choose others with --set"
+            " nodes.NAME.affinity=[...], or leave it to the kernel with --no-placement"
+        )
+        raise EnvironmentFault("\n".join(problems))
+
+
+def _cores_in_words(cores: Collection[int]) -> str:
+    return f"core{'s' if len(cores) > 1 else ''} {', '.join(map(str, sorted(cores)))}"
 
 
 def _chosen_names(project: Project, wanted: Sequence[str], backend: str) -> tuple[str, ...]:

@@ -54,6 +54,7 @@ _PROOFS = {
     "plot": _Proof("Matplotlib", "matplotlib", "import matplotlib.figure"),
     "tensorflow": _Proof("TensorFlow", "tensorflow-cpu", "import tensorflow"),
     "docs": _Proof("Sphinx", "sphinx", "import sphinx, furo"),
+    "benchmark": _Proof("psutil", "psutil", "import psutil"),
     "dev": _Proof("pytest", "pytest", "import pytest, hypothesis, mypy, psutil"),
 }
 
@@ -122,6 +123,15 @@ class Environment:
             raise EnvironmentFault(explain_missing_library("; ".join(faults)))
         if not self.is_installed:
             self.write_stamp()
+        self.compile()
+
+    def compile(self) -> None:
+        """Compile NeuROS's modules, so that no start has to, whoever may write here by then.
+
+        What cannot be compiled, or written, Python compiles at each start: no fault.
+        """
+        command = [str(self.python), "-m", "compileall", "-qq", str(self._root / "neuros")]
+        subprocess.run(command, env=clean_environment(os.environ), check=False)
 
     def write_stamp(self) -> None:
         """Note for the next time what is installed."""

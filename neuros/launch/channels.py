@@ -18,6 +18,7 @@ from neuros.errors import EnvironmentFault
 
 _MOST_UNSENT_BYTES = 1 << 20
 _READS_AT_A_TIME = 64
+_WAKING_BYTES = 1024
 
 
 class Channels:
@@ -40,10 +41,21 @@ class Channels:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listening, selectors.EVENT_READ)
         self._ends: dict[Lines, bytearray] = {}
+        self._waker: socket.socket | None = None
+
+    def wake_on(self, waker: socket.socket) -> None:
+        """Let :meth:`wait` return, too, when bytes arrive here; they mean nothing by themselves."""
+        waker.setblocking(False)
+        self._waker = waker
+        self._selector.register(waker, selectors.EVENT_READ)
 
     def wait(self, timeout_s: float) -> None:
         """Until something arrives, ``timeout_s`` at most."""
         self._selector.select(timeout_s)
+        if self._waker is not None:
+            with contextlib.suppress(BlockingIOError):
+                while self._waker.recv(_WAKING_BYTES) != b"":
+                    pass
 
     def receive(self) -> Iterator[tuple[Lines, Mapping[str, Any]]]:
         """All that has arrived. What a process sent before it ended is there when it has ended."""

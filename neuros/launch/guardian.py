@@ -11,7 +11,8 @@ in the session of a host that the launcher announced, or a child of a process of
 finds those that were started with an empty environment.
 
 The guardian is started first, without site-packages, ignores the signals that a terminal or a
-service manager sends, and needs nothing but the standard library.
+service manager sends, and needs nothing but the standard library. This is the launcher's end;
+:mod:`neuros.launch.guardian_program` is what the guardian itself does.
 """
 
 from __future__ import annotations
@@ -20,28 +21,21 @@ import contextlib
 import json
 import os
 import select
-import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.domain import DomainLock, remove_lock
-from neuros.launch.run_processes import RUN_ID, RunProcesses
-from neuros.launch.shared_memory import sweep
+from neuros.launch.domain import DomainLock
+from neuros.launch.guardian_program import KILL_DEADLINE_S, READY, Orders, clean_up
+from neuros.launch.run_processes import RUN_ID
 
 _PROGRAM = (
     "import sys; sys.path.insert(0, sys.argv[1]); "
-    "from neuros.launch.guardian import main; main(sys.argv[2])"
+    "from neuros.launch.guardian_program import main; main(sys.argv[2])"
 )
-_READY = b"ready\n"
 _START_DEADLINE_S = 10.0
-_GRACE_S = 4.5  # nodes have this long when the launcher died; all is gone within 6 s
-_KILL_DEADLINE_S = 20.0  # a process in an uninterruptible system call outlasts even SIGKILL
-_POLL_S = 0.05
 
 
 class Guardian:
@@ -59,7 +53,7 @@ class Guardian:
         self._run_id = run_id
         self._process = process
         self._pipe: int | None = pipe
-        self._orders = _Orders(started_s=time.time())
+        self._orders = Orders(started_s=time.time())
 
     @classmethod
     def start(cls, run_id: str, lock: DomainLock | None = None) -> Guardian:
@@ -123,12 +117,12 @@ class Guardian:
         os.close(self._pipe)
         self._pipe = None
         try:
-            self._process.wait(grace_s + _KILL_DEADLINE_S + 5.0)
+            self._process.wait(grace_s + KILL_DEADLINE_S + 5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
         if self._process.returncode != 0:  # it was killed: its duty falls to us
-            _clean_up(self._run_id, self._orders)
+            clean_up(self._run_id, self._orders)
 
     def _tell(self, order: str, value: object) -> None:
         self._orders.take(order, value)
@@ -141,7 +135,7 @@ class Guardian:
         assert self._process.stdout is not None
         with self._process.stdout as answer:
             ready, _, _ = select.select([answer], [], [], _START_DEADLINE_S)
-            if ready and answer.read(len(_READY)) == _READY:
+            if ready and answer.read(len(READY)) == READY:
                 return
         self._process.kill()
         self._process.wait()
@@ -152,88 +146,3 @@ class Guardian:
             f"the guardian process did not start ({sys.executable}): nothing was started, since "
             "without it a killed launcher would leave nodes behind"
         )
-
-
-class _Orders:
-    """What the launcher has told the guardian so far."""
-
-    def __init__(self, started_s: float) -> None:
-        self.started_s = started_s
-        self.grace_s = _GRACE_S
-        self.sessions: list[int] = []
-        self.paths: list[str] = []
-        self.locks: list[tuple[int, Path]] = []
-
-    def take(self, order: str, value: object) -> None:
-        if order == "session" and isinstance(value, int):
-            self.sessions.append(value)
-        elif order == "remove" and isinstance(value, str):
-            self.paths.append(value)
-        elif order == "lock" and isinstance(value, list):
-            self.locks.append((value[0], Path(value[1])))
-        elif order == "grace" and isinstance(value, (int, float)):
-            self.grace_s = float(value)
-
-
-def main(run_id: str) -> None:
-    """What the guardian process does: wait for the pipe on standard input to close, clean up."""
-    for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
-        signal.signal(name, signal.SIG_IGN)
-    orders = _Orders(started_s=time.time())
-    processes = RunProcesses(run_id)
-    os.write(1, _READY)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    for order, value in _read_orders():
-        orders.take(order, value)
-        if order == "session" and isinstance(value, int):
-            processes.add_session(value)
-    _clean_up(run_id, orders, processes)
-
-
-def _read_orders() -> Iterator[tuple[str, object]]:
-    with open(0, "rb", closefd=False) as pipe:
-        for line in pipe:
-            # A launcher that is killed while it writes leaves half a line.
-            with contextlib.suppress(ValueError, TypeError):
-                order, value = json.loads(line)
-                yield order, value
-
-
-def _clean_up(run_id: str, orders: _Orders, processes: RunProcesses | None = None) -> None:
-    if processes is None:
-        processes = RunProcesses(run_id)
-        for pid in orders.sessions:
-            processes.add_session(pid)
-    _end_all(processes, orders.grace_s)
-    sweep(orders.started_s)
-    _remove(orders.paths)
-    for descriptor, path in orders.locks:
-        remove_lock(descriptor, path)
-
-
-def _end_all(processes: RunProcesses, grace_s: float) -> None:
-    now = time.monotonic()
-    kill_at, give_up_at = now + grace_s, now + grace_s + _KILL_DEADLINE_S
-    pause_s = _POLL_S / 5
-    while (alive := processes.alive()) and time.monotonic() < give_up_at:
-        if time.monotonic() >= kill_at:
-            _kill(alive)
-            pause_s = _POLL_S / 5
-        time.sleep(max(0.001, min(pause_s, abs(kill_at - time.monotonic()))))
-        pause_s = min(_POLL_S, pause_s * 2)
-
-
-def _kill(processes: Mapping[int, int]) -> None:
-    for pid in processes:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.kill(pid, signal.SIGKILL)
-
-
-def _remove(paths: Iterable[str]) -> None:
-    for path in paths:
-        with contextlib.suppress(OSError):
-            if os.path.isdir(path) and not os.path.islink(path):
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                os.unlink(path)

@@ -13,7 +13,10 @@ DEADLOCK_AFTER_S = 1.0
 """Nothing must have moved for this long before nodes are asked whether anything ever will."""
 
 _DRAINING_PAUSE_S = 0.01
+# Two rounds tell a deadlock. Where they told that somebody may wake a node, the answers of the
+# next rounds will hardly differ, so these come more and more rarely until something has moved.
 _RUNNING_PAUSE_S = DEADLOCK_AFTER_S / 2
+_LONGEST_PAUSE_S = 2.0
 _BUSY_S = 0.1
 
 
@@ -46,6 +49,7 @@ class Probing:
         self._is_draining = False
         self._number = 0
         self._asked_s = 0.0
+        self._pause_s = 0.0
         self._probes: dict[str, Mapping[str, Any]] = {}
         self._answers: Mapping[str, Mapping[str, Any]] = {}  # of the last whole round
         self._last_round: tuple[Any, ...] | None = None
@@ -73,7 +77,10 @@ class Probing:
             has_answers = len(self._probes) == len(self._names)
             if has_answers and pause_s >= _DRAINING_PAUSE_S and self.verdict is Verdict.UNDECIDED:
                 self._ask(now_s)
-        elif rested_s >= DEADLOCK_AFTER_S and pause_s >= _RUNNING_PAUSE_S:
+        elif rested_s < DEADLOCK_AFTER_S:
+            self._pause_s = 0.0
+        elif pause_s >= self._pause_s:
+            self._pause_s = min(max(2 * self._pause_s, _RUNNING_PAUSE_S), _LONGEST_PAUSE_S)
             self._ask(now_s)
         return self.verdict
 

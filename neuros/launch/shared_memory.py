@@ -15,6 +15,9 @@ neighbour keeps its mapping and opens a new port when a new node comes. A group 
 ``lttng-ust-wait-*`` is one file per machine and one per user, shared by everything that is linked
 with LTTng; it goes when nobody maps it, and the next process makes it anew.
 
+``neuros_<run id>_...`` holds the large packets of a run's nodes. Once the processes of that run are
+gone it goes, and only then: the name says whose it is.
+
 Standard library only: the guardian runs this.
 """
 
@@ -36,6 +39,22 @@ _LTTNG = re.compile(r"lttng-ust-wait-.+")
 _LOCKS = ("_el", "_sl")
 # The kernel stamps files with a clock that is a tick (10 ms at most) behind time.time().
 _CLOCK_SLACK_S = 0.05
+
+
+def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[str, ...]:
+    """Remove what a run, none of whose processes is left, had in shared memory for large packets.
+
+    Returns the names removed.
+    """
+    mine: list[tuple[str, int]] = []
+    with contextlib.suppress(FileNotFoundError):
+        for name in os.listdir(folder):
+            if name.startswith(f"neuros_{run_id}_"):
+                with contextlib.suppress(FileNotFoundError):
+                    status = os.lstat(folder / name)
+                    if status.st_uid == os.getuid():
+                        mine.append((name, status.st_ino))
+    return tuple(_remove(folder, mine))
 
 
 def sweep(

@@ -8,6 +8,7 @@ for a node or for a reader of its output.
 from __future__ import annotations
 
 import signal
+import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,18 +18,24 @@ from neuros.control import Lines
 from neuros.launch.channels import Channels
 from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Phase
 from neuros.launch.probing import Probing, Verdict, connections_among
+from neuros.launch.processes import Processes, names_of
 from neuros.launch.watch import Watch
-from neuros.ports import Launcher, RunningNode
+from neuros.ports import Launcher
 from neuros.project.model import NodeFile
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
 
+# How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
+_QUIET_TICK_S = 0.2
 
 
 class Output(Protocol):
-    """Where the supervisor writes for people; neither call may wait for a reader."""
+    """Where the supervisor writes for people; neither call may wait for a reader.
+
+    ``poll`` shows what nodes have logged since; it returns whether that was anything.
+    """
 
     def log(self, severity: str, text: str) -> None: ...
     def poll(self) -> object: ...
@@ -46,6 +53,8 @@ class Supervisor:
         signals: numbers of the signals that have arrived, appended to by a signal handler.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
         is_partial: whether nodes that are not started here may be running elsewhere.
+        waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
+            hosts that end before they have connected, are seen a fifth of a second late.
 
     Raises:
         EnvironmentFault: if there can be no control socket in the run folder.
@@ -62,6 +71,7 @@ class Supervisor:
         *,
         duration_s: float | None = None,
         is_partial: bool = False,
+        waker: socket.socket | None = None,
     ) -> None:
         self._files = files
         self._launcher = launcher
@@ -73,11 +83,12 @@ class Supervisor:
         names = [file.node.name for file in files]
         self._phase = Phase.RUNNING
         self._deadline_s = 0.0
-        self._processes: list[RunningNode] = []
-        self._killed: set[str] = set()
-        self._has_told_failure: set[str] = set()
         self._channels = Channels(run_folder)
+        if waker is not None:
+            self._channels.wake_on(waker)
+        self.outcome = Outcome()
         self._watch = Watch(names, time.monotonic())
+        self._processes = Processes(self._watch, self.outcome)
         self._probing = Probing(names, connections_among(files), self._channels.send)
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
@@ -87,22 +98,22 @@ class Supervisor:
             "failed": self._on_failed,
             "explanation": self._on_explanation,
         }
-        self.outcome = Outcome()
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
         try:
             self._heed_signals()  # one may have come before anything was started
             if self._phase is Phase.RUNNING:
-                self._processes = list(self._launcher.start(self._files, self._environment))
+                self._processes.add(self._launcher.start(self._files, self._environment))
+            has_shown = True
             while self._processes and not self._is_hopeless():
-                self._channels.wait(_TICK_S)
+                self._channels.wait(self._pause_s(has_shown))
                 self._heed_signals()
                 self._hear()
                 self._look_at_processes()
                 self._look_at_time()
                 self._channels.flush()
-                self._output.poll()
+                has_shown = bool(self._output.poll())
         finally:
             for process in self._processes:
                 process.kill()
@@ -140,7 +151,7 @@ class Supervisor:
         self._drain(f"{message['node']} ended the project{reason}", float(message["drain_s"]))
 
     def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._has_told_failure.add(message["node"])
+        self._processes.note_failure(message["node"])
         first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
         self._fail(f"node '{message['node']}' failed: {first_line}")
 
@@ -160,11 +171,11 @@ class Supervisor:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         # A node that is still loading has sent nothing, and nobody could send to it yet.
-        for process in self._unloaded_processes():
-            self._output.log("INFO", f"{_names(process)} had not started yet: killed")
-            self._kill(process)
+        for process in self._processes.not_loaded():
+            self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
+            self._processes.kill(process)
         self._channels.send("drain")
-        self._probing.drain(self._killed, now_s)
+        self._probing.drain(self._processes.killed, now_s)
 
     def _fail(self, reason: str) -> None:
         self.outcome.fail(reason)
@@ -177,26 +188,14 @@ class Supervisor:
         self.outcome.begin_to_end(now_s)
         self._deadline_s = now_s + STOP_S
         self._channels.send("stop")
-        for process in self._unloaded_processes():
-            self._kill(process)  # it has not come as far as anything worth finalising
+        for process in self._processes.not_loaded():
+            self._processes.kill(process)  # it has not come as far as anything worth finalising
 
     def _kill_all(self) -> None:
         self._phase = Phase.KILLED
         self._deadline_s = time.monotonic() + STOP_S
         for process in self._processes:
-            self._kill(process)
-
-    def _kill(self, process: RunningNode) -> None:
-        self._killed.update(process.names)
-        process.kill()
-
-    def _unloaded_processes(self) -> list[RunningNode]:
-        """Those in which no node has come as far as its first hook."""
-        return [
-            process
-            for process in self._processes
-            if not any(self._watch.is_loaded(name) for name in process.names)
-        ]
+            self._processes.kill(process)
 
     def _heed_signals(self) -> None:
         while self._signals:
@@ -218,29 +217,13 @@ class Supervisor:
     # ------------------------------------------------------------------ processes
 
     def _look_at_processes(self) -> None:
-        ended = [(process, how) for process in self._processes if (how := process.poll())]
+        ended = self._processes.ended()
         if ended:
             self._hear()  # what they said last has arrived by now
         for process, how in ended:
-            self._processes.remove(process)
-            if not self._is_expected_to_end(process):
-                noun = "node" if len(process.names) == 1 else "nodes"
-                self._fail(f"{noun} {_names(process)} {self._unexpectedly(process)}: {how}")
-
-    def _unexpectedly(self, process: RunningNode) -> str:
-        if self._phase is Phase.STOPPING:
-            return "ended while finalising"
-        if not any(map(self._watch.is_greeted, process.names)):
-            were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
-            return f"ended before {were} wrote is above)"
-        seen = "".join(self._watch.last_seen(name) for name in process.names)
-        return f"ended unexpectedly{seen}"
-
-    def _is_expected_to_end(self, process: RunningNode) -> bool:
-        names = set(process.names)
-        if names <= self._killed or names & self._has_told_failure:
-            return True
-        return self._phase is Phase.STOPPING and all(map(self.outcome.has_final_report, names))
+            is_stopping = self._phase is Phase.STOPPING
+            if not self._processes.may_end(process, is_stopping=is_stopping):
+                self._fail(self._processes.how_it_failed(process, how, is_stopping=is_stopping))
 
     def _is_hopeless(self) -> bool:
         """Whether something outlasts even SIGKILL; the guardian will try on for a while."""
@@ -248,11 +231,22 @@ class Supervisor:
 
     # ------------------------------------------------------------------ time
 
+    def _pause_s(self, has_shown: bool) -> float:
+        """How long nothing needs to be looked at; ``has_shown``: nodes are logging now."""
+        if has_shown or self._phase is not Phase.RUNNING:
+            return _TICK_S
+        limit_s, started_s = self._duration_s, self.outcome.started_s
+        if limit_s is None or started_s is None:
+            return _QUIET_TICK_S
+        return min(_QUIET_TICK_S, max(0.0, started_s + limit_s - time.monotonic()))
+
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
         if self._phase is Phase.STOPPING and now_s >= self._deadline_s:
             for process in self._processes:
-                self._output.log("WARN", f"{_names(process)}: not ended after {STOP_S:g} s, killed")
+                self._output.log(
+                    "WARN", f"{names_of(process)}: not ended after {STOP_S:g} s, killed"
+                )
             self._kill_all()
         elif self._phase is Phase.DRAINING:
             if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
@@ -277,7 +271,3 @@ class Supervisor:
             return
         if self._probing.look(now_s, self._watch.rested_s(now_s)) is Verdict.DEAD:
             self._fail(self._probing.why_dead())
-
-
-def _names(process: RunningNode) -> str:
-    return " and ".join(f"'{name}'" for name in process.names)

@@ -52,6 +52,7 @@ class Builder:
             file=element.source.file,
             pointer=element.pointer,
             environment_paths=tuple(sorted(paths)),
+            affinity=_affinity(element),
         )
 
     def _file(self, element: Element, key: str) -> Path | None:
@@ -105,6 +106,12 @@ class Builder:
             gazebo_type=element.string("gazebo_type"),
             **keys,
         )
+
+
+def _affinity(node: Element) -> tuple[int, ...]:
+    """The cores that a node asks for; the schema has reported what is no number of a core."""
+    cores = (core.value for core in node.items("affinity"))
+    return tuple(int(core) for core in cores if isinstance(core, int | float) and core % 1 == 0)
 
 
 def connection(element: Element, index: int) -> Connection:

@@ -44,6 +44,7 @@ class Node:
         environment: environment variables, with ``#path`` and ``@path`` already resolved.
         file: the file that describes the node, for messages; ``pointer`` is its place in there.
         environment_paths: names of the environment variables that are such paths, sorted.
+        affinity: numbers of the cores that it is to run on, from 0; empty if it does not matter.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Node:
     file: Path = Path()
     pointer: str = ""
     environment_paths: tuple[str, ...] = ()
+    affinity: tuple[int, ...] = ()
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""

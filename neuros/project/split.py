@@ -99,6 +99,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             file=Path(content["file"]),
             pointer=content["pointer"],
             environment_paths=tuple(content.get("environment_paths", ())),
+            affinity=tuple(node.get("affinity", ())),
         ),
         connections=tuple(Connection(**connection) for connection in content["connections"]),
         folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
@@ -139,6 +140,8 @@ def _node_keys(node: Node) -> dict[str, Any]:
     }
     if node.script is not None:
         keys["script"] = str(node.script)
+    if node.affinity:
+        keys["affinity"] = list(node.affinity)
     keys["inputs"] = [_port_keys(port) for port in node.inputs]
     keys["outputs"] = [_port_keys(port) for port in node.outputs]
     return keys

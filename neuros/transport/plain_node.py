@@ -1,8 +1,8 @@
 """The ROS node of a NeuROS node: rclpy's own, with services for parameters only where it has some.
 
-rclpy gives each node six services for parameters and one for type descriptions: fourteen of some
-twenty endpoints, which every process of a domain hears of from every other. In a project of 64
-processes that is two thirds of what has to be found before the first packet.
+rclpy gives each node six services for parameters: twelve of some twenty endpoints, which every
+process of a domain hears of from every other, and more than half of what has to be found before
+the first packet.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ from typing import Any
 
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
-
-_WITHOUT_TYPE_DESCRIPTIONS = Parameter("start_type_description_service", value=False)
 
 
 class PlainNode(Node):  # type: ignore[misc]
@@ -26,7 +23,6 @@ class PlainNode(Node):  # type: ignore[misc]
             name,
             context=context,
             start_parameter_services=False,
-            parameter_overrides=[_WITHOUT_TYPE_DESCRIPTIONS],
         )
         self._is_complete = True
         self._parameter_service: ParameterService | None = None

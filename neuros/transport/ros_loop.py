@@ -25,9 +25,9 @@ from neuros.transport.executors import make_executor
 
 Event = Callable[[], None]
 
-# How long events of engines may keep those of ROS waiting, besides the event that runs. Each turn
-# costs 5 to 25 us, more with cold caches; 1 ms makes that a few per cent, and no hook of a node next
-# to others in the same process can count on less.
+# How long events of engines may keep those of ROS waiting, besides the event that runs. A turn
+# costs 5 to 25 us, more with cold caches: 1 ms makes that a few per cent, and no node that shares
+# its process with others can count on less.
 _TURN_NS = 1_000_000
 _LONG_S = 3600.0
 
@@ -126,8 +126,10 @@ class RosLoop:
             self._run_due_timers()
 
     def run_for(self, seconds: float) -> None:
-        """Serve events for a while, for instance to let the last ones out."""
-        self._executor.spin_until_future_complete(self._waker, max(seconds, 1e-6))
+        """Serve events for a while, for instance to let the last ones out, stopped or not."""
+        end_s = time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_until_future_complete(self._waker, left_s)
 
     def stop(self) -> None:
         """End :meth:`run` after the current event. Any thread."""

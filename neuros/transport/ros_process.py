@@ -24,12 +24,20 @@ from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 
 _LINGER_S = 0.05
+# Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
+# up the 5 s that they have, some of them blocked inside DDS; up to 17 take a fraction of a second.
+_CROWD = 16
 # What takes a callback, and at which place of its arguments.
 _CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service", 2))
 
 
 class RosProcess:
-    """The middleware of a process with one node, or (``in_memory``) with all nodes of a project."""
+    """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
+
+    Attributes:
+        has_leftovers: whether :meth:`close` has left ROS as it was. Python would destroy it at its
+            own end, so the process has to leave without that (``os._exit``).
+    """
 
     def __init__(
         self,
@@ -39,6 +47,7 @@ class RosProcess:
         in_memory: bool,
         debug: bool = False,
     ) -> None:
+        self.has_leftovers = False
         os.environ.update(dds_environment(os.environ))
         self._context = rclpy.Context()
         # rcl would write each record to a second log file, which costs as much as a packet.
@@ -104,14 +113,27 @@ class RosProcess:
         return message_class(type_name)
 
     def close(self) -> None:
-        """Let what was sent last leave, then give up everything."""
+        """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
+
+        Others in that crowd notice after 20 s that a process has gone, as with one that was
+        killed; the shared memory of DDS is left to the guardian.
+        """
         for transport in self._transports:
             transport.close()
         self._loop.run_for(_LINGER_S)
+        self.has_leftovers = self._is_in_a_crowd()
+        if self.has_leftovers:
+            return
         self._loop.close()
         for ros_node in self._ros_nodes.values():
             ros_node.destroy_node()
         rclpy.shutdown(context=self._context)
+
+    def _is_in_a_crowd(self) -> bool:
+        """Whether many nodes of other processes are in the domain."""
+        for ros_node in self._ros_nodes.values():
+            return len({*ros_node.get_node_names()} - {*self._ros_nodes}) > _CROWD
+        return False
 
 
 def _creating(create: Callable[..., Any], place: int, enter: Callable[[], None]) -> Any:

@@ -14,7 +14,6 @@ import pytest
 
 from neuros.cli.main import main
 from neuros.cli.plan import (
-    MOST_LOCAL_PROCESSES,
     Duration,
     Plan,
     check_machine,
@@ -23,6 +22,7 @@ from neuros.cli.plan import (
 from neuros.cli.run_folder import make_run_folder
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
+from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS
 
 PORT = "std_msgs/msg/Int32"
 
@@ -182,7 +182,8 @@ def test_a_dry_run_starts_nothing_and_writes_nothing(
     assert main(["launch", ".", "--dry-run"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("back end process; ROS domain ")
-    assert [line.split(":")[0] for line in lines[1:]] == ["process a", "process b"]
+    names = [line.partition(":")[0].partition(" on ")[0] for line in lines[1:]]
+    assert names == ["process a", "process b"]
     assert sorted(project.parent.rglob("*")) == before
 
 
@@ -191,6 +192,23 @@ def test_a_dry_run_in_process_is_one_process(
 ) -> None:
     assert main(["launch", ".", "--dry-run", "--backend", "in-process"]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith("one process for a, b: ")
+
+
+def test_a_dry_run_shows_the_cores_and_no_placement_leaves_them_to_the_kernel(
+    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def shown(*options: str) -> list[str]:
+        assert main(["launch", ".", "--dry-run", *options]) == 0
+        return [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()[1:]]
+
+    monkeypatch.setattr("neuros.cli.plan.usable_cores", lambda: frozenset({2, 3, 5, 7}))
+    affinity = ("--set", "nodes.b.affinity=[3]")
+    assert shown() == ["process a on cores 2, 3", "process b on cores 5, 7"]
+    assert shown(*affinity) == ["process a on cores 2, 5, 7", "process b on core 3"]
+    assert shown("--no-placement", *affinity) == ["process a", "process b"]
+    assert shown("-n", "a") == ["process a"], "the others may run on the same cores"
+    assert shown("--backend", "in-process") == ["one process for a, b"]
+    assert shown("--backend", "in-process", *affinity) == ["one process for a, b on core 3"]
 
 
 def test_validate_says_that_all_is_well(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -287,12 +305,28 @@ def plan_of(count: int, backend: str) -> Plan:
 
 
 def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_named() -> None:
-    too_many = MOST_LOCAL_PROCESSES + 1
+    too_many = MOST_LOCAL_PARTICIPANTS + 1
     with pytest.raises(EnvironmentFault, match="--backend in-process, or set ROS_AUTOMATIC"):
         check_machine(plan_of(too_many, "process"), {})
-    check_machine(plan_of(MOST_LOCAL_PROCESSES, "process"), {})
+    check_machine(plan_of(MOST_LOCAL_PARTICIPANTS, "process"), {})
     check_machine(plan_of(too_many, "in-process"), {})
     check_machine(plan_of(too_many, "process"), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"})
+
+
+def test_a_core_that_this_machine_lacks_is_named_with_its_place_and_the_ways_out(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project.write_text(
+        project.read_text().replace('"name": "b"', '"affinity": [9999], "name": "b"')
+    )
+    assert main(["launch", "."]) == 4
+    assert re.search(
+        r"project\.json:1:\d+: /nodes/1/affinity: node 'b' asks for core 9999\n"
+        r"NeuROS may use cores? [\d, ]+ here: choose others with --set"
+        r" nodes\.NAME\.affinity=\[\.\.\.\], or leave it to the kernel with --no-placement",
+        capsys.readouterr().err,
+    )
+    assert main(["validate", "."]) == 0, "it may be right for another machine"
 
 
 def test_what_could_not_be_started_is_recorded_and_leaves_nothing(

@@ -25,17 +25,20 @@ def node() -> Iterator[PlainNode]:
     rclpy.shutdown(context=context)
 
 
+TYPE_DESCRIPTIONS = ["robot/get_type_description"]
+
+
 def services(node: PlainNode) -> list[str]:
     return [service.srv_name for service in node.services]
 
 
-def test_a_node_without_parameters_offers_no_services(node: PlainNode) -> None:
-    assert services(node) == []
+def test_a_node_without_parameters_offers_no_services_for_them(node: PlainNode) -> None:
+    assert services(node) == TYPE_DESCRIPTIONS
     assert node.get_parameter("use_sim_time").value is False
 
 
 def test_the_first_parameter_brings_the_services_for_all(node: PlainNode) -> None:
     assert node.declare_parameter("speed", 3).value == 3
     assert node.declare_parameter("colour", "red").value == "red"
-    assert len(services(node)) == 6
+    assert len(services(node)) == 6 + len(TYPE_DESCRIPTIONS)
     assert node.get_parameter("speed").value == 3

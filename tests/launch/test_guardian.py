@@ -45,7 +45,7 @@ LAUNCHER = """
 import os, subprocess, sys, time
 from pathlib import Path
 from neuros.launch.guardian import Guardian
-from neuros.launch.process import host_environment
+from neuros.launch.host_command import host_environment
 guardian = Guardian.start(sys.argv[1])
 print(guardian.pid, flush=True)
 guardian.remove_later(Path(sys.argv[2]))
@@ -259,3 +259,16 @@ def test_a_guardian_holds_the_domain_and_removes_the_lock_file(run_id: str, tmp_
         assert other.id != lock.id
     guardian.finish()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_launcher_waits_for_no_import_that_only_removing_files_needs() -> None:
+    root = str(Path(__file__).resolve().parents[2])
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import neuros.launch.guardian_program;"
+        " print(*sorted({'dataclasses', 'pathlib', 'shutil', 'subprocess'} & {*sys.modules}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", program, root],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "\n"

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.host import HostProcess
+from neuros.launch.host_command import host_environment
 from neuros.launch.in_process import InProcessLauncher
-from neuros.launch.process import HostProcess, ProcessLauncher, host_environment
+from neuros.launch.process import ProcessLauncher
 from neuros.project.model import Folders, Node, NodeFile
 
 # A host that says all that it was given.
@@ -258,3 +260,11 @@ def test_what_would_be_started_can_be_described(run: Run) -> None:
     assert len(lines) == 2
     (line,) = InProcessLauncher(["python", "-m", "host"]).describe(nodes)
     assert line.startswith("one process for snn, robot: python -m host '")
+    placed = {"snn": (1,), "robot": (0, 2)}
+    lines = ProcessLauncher(["python"], placement=placed).describe(nodes)
+    assert [line.partition(":")[0] for line in lines] == [
+        "process snn on core 1",
+        "process robot on cores 0, 2",
+    ]
+    (line,) = InProcessLauncher(["python"], placement=placed).describe(nodes)
+    assert line.startswith("one process for snn, robot on cores 0, 1, 2: ")

@@ -319,6 +319,20 @@ def test_nobody_is_asked_while_something_moves() -> None:
     assert asked == [1], "and then not too often"
 
 
+def test_the_longer_nothing_moves_the_more_rarely_nodes_are_asked_until_something_does() -> None:
+    asked: list[float] = []
+    now_s = 0.0
+    probing = Probing("a", [], lambda kind, number: asked.append(now_s))
+    for tick in range(1, 600):
+        now_s = tick / 10
+        has_moved_s = 50.0 if now_s >= 50.0 else 0.0
+        probing.look(now_s, now_s - has_moved_s)
+        if asked and asked[-1] == now_s:
+            probing.take("a", probe(probe=len(asked), is_wakeable=True))
+    assert asked[:5] == [1.0, 1.5, 2.5, 4.5, 6.5], "two soon, for a deadlock; then ever later"
+    assert [at for at in asked if at >= 50.0][:3] == [51.0, 51.5, 52.5], "and soon again"
+
+
 def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> None:
     asked: list[int] = []
     probing = Probing("ab", [AB], lambda kind, number: asked.append(number))

@@ -20,7 +20,7 @@ import pytest
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.run_processes import RUN_ID
-from neuros.launch.shared_memory import sweep
+from neuros.launch.shared_memory import remove_segments, sweep
 
 SHM = Path("/dev/shm")
 PORT = ("fastrtps_port7411", "fastrtps_port7411_el", "sem.fastrtps_port7411_mutex")
@@ -106,6 +106,28 @@ def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
 
 def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
     assert _sweep(tmp_path / "nowhere") == ()
+    assert remove_segments("abc", folder=tmp_path / "nowhere") == ()
+
+
+def test_segments_for_large_packets_go_with_the_run_that_their_name_tells(tmp_path: Path) -> None:
+    own = {"neuros_abc_camera_image_1234", "neuros_abc_scanner_scan_5678"}
+    others = {"neuros_abcd_camera_image_1234", "neuros_xyz_camera_image_1", "neuros", "other"}
+    for name in own | others:
+        (tmp_path / name).touch()
+    assert set(remove_segments("abc", folder=tmp_path)) == own
+    assert _names(tmp_path) == others
+    assert _sweep(tmp_path) == ()
+
+
+def test_the_guardian_removes_the_segments_of_its_run() -> None:
+    run_id = secrets.token_hex(8)
+    guardian = Guardian.start(run_id)
+    segment = SHM / f"neuros_{run_id}_camera_image_1"
+    try:
+        segment.write_bytes(b"x" * 64)
+    finally:
+        guardian.finish()
+    assert not segment.exists()
 
 
 # ------------------------------------------------------------------------- real ROS nodes

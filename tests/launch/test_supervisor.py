@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.host import HostProcess
 from neuros.launch.in_process import InProcessLauncher
 from neuros.launch.outcome import Outcome
-from neuros.launch.process import HostProcess, ProcessLauncher
+from neuros.launch.process import ProcessLauncher
 from neuros.launch.supervisor import Supervisor
 from neuros.project.model import Connection, Folders, Node, NodeFile
 

@@ -96,3 +96,15 @@ def test_one_that_has_gone_is_no_error(channels: Channels, node: Lines) -> None:
     channels.send("stop")
     assert kinds(channels) == []
     channels.send("stop")
+
+
+def test_a_signal_ends_the_wait(channels: Channels) -> None:
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        channels.wake_on(reader)
+        writer.send(b"\x11\x11")
+        channels.wait(60.0)
+        writer.send(b"\x11")
+        channels.wait(60.0)
+        with pytest.raises(BlockingIOError):
+            reader.recv(1)  # or it would never wait again

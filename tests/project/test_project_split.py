@@ -68,6 +68,7 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             file=root / "project.json",
             pointer=f"/nodes/{index}",
             environment_paths=paths,
+            affinity=tuple(draw(st.lists(st.integers(0, 9), max_size=2, unique=True))),
         )
         nodes.append(node)
     pairs = [

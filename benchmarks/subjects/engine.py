@@ -13,30 +13,33 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from benchmarks.launching import PLUGINS, launch, project_of_plugins
-from benchmarks.measure import Row, Target, in_rounds
+from benchmarks.measure import Case, Figure, Group, Subject
 from neuros.core.engine import Engine
 from neuros.core.hook import Hook
 from neuros.hooks import hook_specs_of, neuros_function
 from neuros.project.model import Connection, Node, Port
 
 
-def measure(is_quick: bool, say: Callable[[str], None]) -> list[Row]:
-    """All rows of this module."""
-    count, rounds = (20_000, 2) if is_quick else (100_000, 9)
-    values = in_rounds(
-        {
-            "engine alone, loop-back": functools.partial(loop_back_us, count),
-            "engine alone, packet and acknowledgement": functools.partial(relay_us, count),
-            "in process": functools.partial(real_run_us, "in-process", count),
-            "process": functools.partial(real_run_us, "process", count),
-        },
-        rounds,
-        say,
+def subject(is_quick: bool) -> Subject:
+    """Hook executions per run: enough that one takes most of a second."""
+    count = 20_000 if is_quick else 100_000
+    candidates = {
+        "engine alone, loop-back": functools.partial(loop_back_us, count),
+        "engine alone, packet and acknowledgement": functools.partial(relay_us, count),
+        "in process": functools.partial(real_run_us, "in-process", count),
+        "process": functools.partial(real_run_us, "process", count),
+    }
+    cases = tuple(
+        Case(
+            f"execution of a hook, {name}",
+            "us",
+            Figure(name),
+            # The free-running hook as users have it; the engine alone is the profile of it.
+            bound="hook" if name == "process" else None,
+        )
+        for name in candidates
     )
-    return [
-        Row(f"execution of a hook, {name}", "us", each, target=Target(15))
-        for name, each in values.items()
-    ]
+    return Subject("cost per hook execution", (Group(candidates, cases),))
 
 
 class Surroundings:

@@ -1,0 +1,144 @@
+"""What ``neuros benchmark`` does, after its options were read by :mod:`neuros.cli.benchmark`."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+from tabulate import tabulate
+
+from benchmarks import comparing, running, subjects
+from benchmarks.machine import ROOT
+from benchmarks.measure import Subject
+from benchmarks.results import Results, combine, differences, utc_time
+from benchmarks.table import LEGEND, notice_lines, rows_table, targets_table
+from benchmarks.targets import TARGETS
+from neuros.errors import UsageError
+
+FOLDER = ROOT / "build" / "benchmarks"
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command; returns its exit code.
+
+    Raises:
+        UsageError: for a name or a file that does not exist.
+        EnvironmentFault: where figures are wanted and Matplotlib is missing.
+    """
+    if options.list:
+        print(_list())
+        return 0
+    if options.compare:
+        a, b = (Results.read(Path(file)) for file in options.compare)
+        print(comparing.report(a, b))
+        return 0
+    if options.files:
+        results, code = _combined([Path(file) for file in options.files]), 0
+    else:
+        results, code = _measure(options)
+    print(_report(results, is_whole=not (options.subjects or options.rows)))
+    _draw(results, options)
+    return code
+
+
+def _measure(options: argparse.Namespace) -> tuple[Results, int]:
+    chosen = subjects.load(options.subjects, options.quick)
+    if options.rows:
+        chosen = _only(chosen, options.rows)
+    results, code = Results.here(options.quick), 0
+    file = Path(options.output) if options.output else FOLDER / f"{utc_time()}.json"
+    try:
+        with _interrupted_by_termination():
+            running.measure(chosen, results, file, _say, options.rounds)
+    except KeyboardInterrupt:
+        _say("interrupted: what was measured is kept")
+        code = 130
+    _say(f"all values: {file}")
+    return results, code or int(any(notice.is_failure for notice in results.notices))
+
+
+def _combined(files: Sequence[Path]) -> Results:
+    """The results of several files, with a warning where they do not belong together."""
+    parts = [Results.read(file) for file in files]
+    for file, part in zip(files[1:], parts[1:], strict=True):
+        for difference in differences(parts[0], part):
+            _say(f"warning: {files[0]} and {file} differ in {difference}")
+    return combine(parts)
+
+
+def _only(chosen: dict[str, Subject], text: str) -> dict[str, Subject]:
+    """The parts of subjects that are needed for rows whose names contain ``text``."""
+    parts = {}
+    for name, subject in chosen.items():
+        groups = tuple(part for part in (each.only(text) for each in subject.groups) if part.cases)
+        if groups:
+            parts[name] = replace(subject, groups=groups)
+    if not parts:
+        raise UsageError(f"-k {text}: no row of {', '.join(chosen)} has that in its name")
+    return parts
+
+
+def _list() -> str:
+    cells = []
+    for name, subject in subjects.load([], is_quick=False).items():
+        rows = sum(len(group.cases) for group in subject.groups)
+        held = sum(target.subject == name for target in TARGETS)
+        cells.append([name, rows, held or "", subject.description])
+    return tabulate(cells, headers=["subject", "rows", "targets", "what is measured"])
+
+
+def _report(results: Results, is_whole: bool) -> str:
+    """The tables; of a part, only the targets that it is about."""
+    parts = [rows_table(results.rows)]
+    if is_whole or any(row.bound for row in results.rows):
+        parts.append(targets_table(results.rows, is_whole=is_whole))
+    parts.append(LEGEND)
+    parts += ["\n".join(notice_lines(results.notices))] if results.notices else []
+    about = {**results.machine, **results.versions}
+    parts.append(", ".join(f"{name} {value}" for name, value in about.items()))
+    loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
+    parts.append(f"busy with other things before: {loads}")
+    if results.is_quick:
+        parts.append("A quick run: it shows that everything works, and no figures to quote.")
+    return "\n\n".join(parts)
+
+
+def _draw(results: Results, options: argparse.Namespace) -> None:
+    """Figures and documentation; Matplotlib is imported for nothing else."""
+    if not (options.figures or options.write_docs):
+        return
+    from benchmarks import figures, page
+
+    if options.figures:
+        for file in figures.draw(results, Path(options.figures)):
+            _say(f"drawn: {file}")
+    if options.write_docs:
+        page.write(results, ROOT / "docs")
+
+
+@contextlib.contextmanager
+def _interrupted_by_termination() -> Iterator[None]:
+    """SIGTERM, and a terminal that is closed, end the measurements as Ctrl+C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {
+        number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say(line: str) -> None:
+    """Show progress."""
+    print(line, file=sys.stderr, flush=True)

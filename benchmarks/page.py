@@ -1,0 +1,72 @@
+"""The part of docs/numbers.md that is generated: tables, figures, and what was measured on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks import figures
+from benchmarks.results import Results
+from benchmarks.table import LEGEND, notice_lines, rows_table, symbols, targets_table
+from neuros.errors import UsageError
+
+BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
+
+
+def write(results: Results, docs: Path) -> None:
+    """Put the results between the markers of ``numbers.md``, and figures into ``figures/``.
+
+    Raises:
+        UsageError: if the page has no markers.
+    """
+    page = docs / "numbers.md"
+    before, begin, rest = page.read_text("utf-8").partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise UsageError(f"{page} has no lines {BEGIN} and {END}")
+    drawn = figures.draw(results, docs / "figures")
+    body = generated(results, [file.relative_to(docs).as_posix() for file in drawn])
+    page.write_text(f"{before}{BEGIN}\n\n{body}\n\n{END}{after}", "utf-8")
+
+
+def generated(results: Results, drawn: list[str]) -> str:
+    """The text between the markers."""
+    titles = {f"figures/{plot.key}.svg": plot.title for plot in results.plots}
+    pictures = [f"![{titles.get(file, 'All targets')}]({file})" for file in drawn]
+    # Figures without a title of a subject are those of the targets, and stand beside their table.
+    overview = [each for each, file in zip(pictures, drawn, strict=True) if file not in titles]
+    curves = [each for each, file in zip(pictures, drawn, strict=True) if file in titles]
+    parts = [
+        "### Targets",
+        symbols(targets_table(results.rows, "pipe")),
+        LEGEND,
+        *overview,
+        "### Everything",
+        _by_subject(results),
+        *curves,
+        "### Measured on",
+        _about(results),
+    ]
+    if results.notices:
+        parts.append("\n".join(f"- {line}" for line in notice_lines(results.notices)))
+    return "\n\n".join(parts)
+
+
+def _by_subject(results: Results) -> str:
+    """One table per subject."""
+    parts = []
+    for subject in dict.fromkeys(row.subject for row in results.rows):
+        rows = [row for row in results.rows if row.subject == subject]
+        parts += [f"`neuros benchmark {subject}`", symbols(rows_table(rows, "pipe"))]
+    return "\n\n".join(parts)
+
+
+def _about(results: Results) -> str:
+    machine, versions = results.machine, dict(results.versions)
+    loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
+    others = ", ".join(f"{name} {version}" for name, version in versions.items())
+    text = (
+        f"{results.started[:10]}, {machine['cores']} cores of {machine['processor']},"
+        f" {machine['system']}; {others}. Others kept this share of the cores busy in the second"
+        f" before each subject: {loads}."
+    )
+    return f"A quick run: no figures to quote. {text}" if results.is_quick else text

@@ -1,0 +1,177 @@
+"""What NeuROS has to reach, row by row, and which subject measures it.
+
+All figures hold on a machine with 2 cores; ratios are within the same run. A row is met when the
+95 % interval of the median (of the ratios, or of the values where there is no reference) over at
+least 10 rounds reaches the limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Bound:
+    """At most, or at least, this much.
+
+    Attributes:
+        key: what cases name it by.
+        limit: for the ratio to the reference of the case, or for its value (in its unit) where it
+            has none; ``None`` where there is a goal only.
+        goal: what is hoped for.
+        label: which figure of the target, where there are several.
+    """
+
+    key: str
+    limit: float | None
+    is_maximum: bool = True
+    goal: float | None = None
+    unit: str = ""
+    label: str = ""
+
+    def text(self, limit: float) -> str:
+        """``limit`` as a condition."""
+        return f"{'<=' if self.is_maximum else '>='} {limit:,g} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Target:
+    """One row: what, compared with what, measured by which subject, and its bounds.
+
+    ``short`` is for figures, where room is scarce.
+    """
+
+    what: str
+    short: str
+    reference: str
+    subject: str
+    bounds: tuple[Bound, ...]
+
+
+TARGETS = (
+    Target(
+        "acknowledged lossless round trip, small packet, two processes on two cores",
+        "round trip, a core each",
+        "bare rclpy.spin without acknowledgements, placed alike",
+        "round_trip",
+        (Bound("round-trip-core-each", 0.95, goal=0.8),),
+    ),
+    Target(
+        "the same on one core",
+        "round trip, one core",
+        "the same",
+        "round_trip",
+        (Bound("round-trip-one-core", 0.5),),
+    ),
+    Target(
+        "the same, unpinned",
+        "round trip, unpinned",
+        "dora-rs",
+        "round_trip",
+        (Bound("round-trip-unpinned", 0.8),),
+    ),
+    Target(
+        "round trip in one process, hook to hook, lossless",
+        "round trip, in process",
+        "bare rclpy, two nodes in one executor",
+        "round_trip",
+        (Bound("round-trip-in-process", 0.25),),
+    ),
+    Target(
+        "hook execution that does nothing (free-running)",
+        "hook execution",
+        "",
+        "engine",
+        (Bound("hook", 10, unit="us"),),
+    ),
+    Target(
+        "921,600 B there, small packet back, two processes, lossless",
+        "921,600 B and back",
+        "dora-rs (shared memory)",
+        "round_trip",
+        (
+            Bound("large-packet", 1.3, goal=1.0, label="median"),
+            Bound("large-packet-p99", 5000, unit="us", label="p99"),
+        ),
+    ),
+    Target(
+        "WhiskEye strict, process back end",
+        "WhiskEye strict, process",
+        "one loop without a framework",
+        "whiskeye",
+        (
+            Bound("whiskeye-strict-process", 0.97, is_maximum=False),
+            Bound(
+                "whiskeye-strict-process-overlap",
+                None,
+                is_maximum=False,
+                goal=0.95,
+                label="of the overlap bound",
+            ),
+        ),
+    ),
+    Target(
+        "WhiskEye strict, in process",
+        "WhiskEye strict, in process",
+        "one loop without a framework",
+        "whiskeye",
+        (Bound("whiskeye-strict-in-process", 0.93, is_maximum=False),),
+    ),
+    Target(
+        "WhiskEye hybrid, process back end",
+        "WhiskEye hybrid, process",
+        "one loop without a framework",
+        "whiskeye",
+        (Bound("whiskeye-hybrid", 1.0, is_maximum=False),),
+    ),
+    Target(
+        "WhiskEye without discard limit: IMU packets consumed per second",
+        "WhiskEye, no discard limit",
+        "WhiskEye strict",
+        "whiskeye",
+        (Bound("whiskeye-no-discard-limit", 0.95, is_maximum=False),),
+    ),
+    Target(
+        "tick at 20 ms",
+        "tick at 20 ms",
+        "bare rclpy timer",
+        "tick",
+        (
+            Bound("tick-share", 1.0, is_maximum=False, label="share within 1 ms"),
+            Bound("tick-deviation", 1.1, label="standard deviation"),
+        ),
+    ),
+    Target(
+        "WhiskEye from the command to the first hook of its last node",
+        "first hook of WhiskEye",
+        "",
+        "start_up",
+        (
+            Bound("first-hook-process", 3.0, unit="s", label="process"),
+            Bound("first-hook-in-process", 1.5, unit="s", label="in process"),
+        ),
+    ),
+    Target(
+        "memory per node (process), beyond bare rclpy node",
+        "memory per node",
+        "bare rclpy node",
+        "memory",
+        (Bound("memory", 10, unit="MB"),),
+    ),
+    Target(
+        "idle project of 3 nodes: share of a core",
+        "idle, 3 nodes",
+        "",
+        "idle",
+        (Bound("idle", 0.01),),
+    ),
+    Target(
+        "ring of 16 nodes: how much slower than its ring of 2, packets/s",
+        "ring of 16 against 2",
+        "bare rclpy ring of 16 and of 2",
+        "rings",
+        (Bound("ring", 1.0),),
+    ),
+)
+
+BOUNDS = {bound.key: bound for target in TARGETS for bound in target.bounds}

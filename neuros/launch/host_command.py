@@ -1,0 +1,113 @@
+"""What a host executes: its command line, its environment, and the scripts that run before it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from neuros.launch.wheels import with_libraries, without_mark
+from neuros.project.model import NodeFile
+
+# One thread each: more threads than free cores make numerical libraries slower, not faster, and
+# simulators differ in the last bit with their number.
+_DEFAULTS = {
+    "PYTHONUNBUFFERED": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+# Runs the scripts one after another, each with the log of its node for output; the shell passes
+# SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the host of it: same
+# process id, nothing in between.
+_SCRIPTS = """\
+run() {
+  name=$1 script=$2 log=$3; shift 3
+  "$@" >>"$log" 2>&1 & wait "$!"; code=$?
+  if [ "$code" -ne 0 ]; then
+    echo "[FATAL] [$(date +%s.%N)] [$name]: script $script failed: exit code $code"
+    exit 1
+  fi
+}
+trap 'trap - TERM; kill -TERM 0' TERM
+"""
+_SCRIPT_FAILED = re.compile(
+    r"\[FATAL\] \[\d+\.\d+\] \[(?P<node>\w+)\]: "
+    r"script (?P<script>.*) failed: (?P<how>exit code \d+)"
+)
+_TAIL_BYTES = 8192
+
+
+def node_folder(node: NodeFile) -> Path:
+    """The node's own folder in the run folder."""
+    return node.folders.run / node.node.name
+
+
+def log_file(node: NodeFile) -> Path:
+    """Where the output of a node goes."""
+    return node_folder(node) / "node.log"
+
+
+def node_environment(node: NodeFile) -> dict[str, str]:
+    """What a node finds in its environment besides what all find there."""
+    return {**node.node.environment, "NEUROS_RUN_DIR": str(node_folder(node))}
+
+
+def host_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a host: ``base`` (the launcher's own) with ``added`` on top."""
+    return {**_DEFAULTS, **without_mark(base), **added}
+
+
+def start_environment(
+    command: Sequence[str], nodes: Sequence[NodeFile], environment: Mapping[str, str]
+) -> dict[str, str]:
+    """``environment`` so that a host that is this very Python starts in it without a restart.
+
+    Not where scripts run first: they may run any Python.
+    """
+    is_this_python = command[0] == sys.executable
+    if not is_this_python or any(node.node.script for node in nodes):
+        return dict(environment)
+    return with_libraries(environment)
+
+
+def host_command(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """The host program for these nodes, without their scripts."""
+    return [*command, *(str(node_folder(node) / "node.json") for node in nodes)]
+
+
+def host_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """What to execute for these nodes: their scripts, one after another, and then the host.
+
+    A script runs in a process of its own in its node's environment; what it changes there does
+    not reach the node. What it prints goes to the log of its node.
+    """
+    host = host_command(command, nodes)
+    scripts = [_script_line(node, node.node.script) for node in nodes if node.node.script]
+    if not scripts:
+        return host
+    program = [_SCRIPTS.rstrip("\n"), *scripts, "trap - TERM", f"exec {shlex.join(host)}"]
+    return ["/bin/sh", "-c", "\n".join(program)]
+
+
+def script_failure(log: Path) -> str | None:
+    """What the last line of a host's log says of a script that failed, if that is what it says."""
+    with contextlib.suppress(OSError), open(log, "rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        lines = file.read().decode(errors="replace").splitlines()
+        match = _SCRIPT_FAILED.fullmatch(lines[-1]) if lines else None
+        if match:
+            return f"script {match['script']} of '{match['node']}' failed: {match['how']}"
+    return None
+
+
+def _script_line(node: NodeFile, script: Path) -> str:
+    variables = [f"{key}={value}" for key, value in node_environment(node).items()]
+    start = [str(script)] if os.access(script, os.X_OK) else ["/bin/sh", str(script)]
+    return shlex.join(
+        ["run", node.node.name, str(script), str(log_file(node)), "env", *variables, *start]
+    )
