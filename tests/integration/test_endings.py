@@ -629,14 +629,14 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
     running.wait_for("a has been executing 'think' for 5 s", 10.0)
     if bench.back_end == "process":
         running.wait_for("c waits for `x` from b", 3.0)
+        running.wait_for("b waits for `x` from a", 3.0)
+        running.wait_for("d waits for the next tick of 'rarely'", 3.0)
     running.signal(signal.SIGINT)
     finished = running.finish()
     assert_ended(finished, 130, "ended by Ctrl\\+C")
     said = finished.said("neuros")
     assert len([text for text in said if "has been executing" in text]) == 1
     if bench.back_end == "process":
-        assert "b waits for `x` from a" in said
-        assert any(text.startswith("d waits for the next tick of 'rarely'") for text in said)
         assert not any(text.startswith("a executes") for text in said), "that was said before"
 
 
@@ -653,7 +653,7 @@ def test_waiting_connections_are_named_after_five_seconds(tmp_path: Path) -> Non
 
 
 def test_two_runs_at_once_in_one_folder_do_not_meet(bench: Bench) -> None:
-    bench.project("a.o -> b.x", a=SOURCE, b=SINK, c=ENDS)
+    bench.project("a.o -> b.x", ("a.o -> c.x", None), a=SOURCE, b=SINK, c=COUNTS)
     pair = [bench.start(), bench.start()]
     for running in pair:
         running.finish()
@@ -661,5 +661,5 @@ def test_two_runs_at_once_in_one_folder_do_not_meet(bench: Bench) -> None:
     records = [json.loads(file.read_text()) for file in bench.folder.rglob("run.json")]
     assert len({record["domain_id"] for record in records}) == 2
     for record in records:
-        (connection,) = record["connections"]
-        assert connection["sent"] == connection["consumed"]
+        lossless, _ = record["connections"]
+        assert lossless["sent"] == lossless["consumed"] >= 50

@@ -49,16 +49,21 @@ def test_a_file_of_neuros_that_was_inherited_is_no_file_of_the_users_own() -> No
     assert dds_environment({**LOCAL, PROFILES_VARIABLE: str(PROFILES)}) == dds_environment(LOCAL)
 
 
-def test_both_files_say_the_same_of_writers() -> None:
-    (writer,), (local_writer,) = (
-        ElementTree.parse(file).iter(f"{NAMESPACE}data_writer")
-        for file in (PROFILES, LOCAL_PROFILES)
-    )
-    assert words(writer) == words(local_writer)
+def test_only_what_stays_on_this_machine_is_repaired_late() -> None:
+    """A reader asks 5 ms after it has missed something, if nothing is said, and the writer hears
+    it that long after a publication."""
+    assert duration_ms(PROFILES, "nackSupressionDuration") < 5
+    assert duration_ms(PROFILES, "heartbeatResponseDelay") is None
+    assert duration_ms(LOCAL_PROFILES, "nackSupressionDuration") == 50
+    assert duration_ms(LOCAL_PROFILES, "heartbeatResponseDelay") == 50
 
 
-def words(element: ElementTree.Element) -> list[tuple[str, str]]:
-    return [(each.tag, (each.text or "").strip()) for each in element.iter()]
+def duration_ms(file: Path, name: str) -> float | None:
+    found = ElementTree.parse(file).find(f".//{NAMESPACE}{name}")
+    if found is None:
+        return None
+    seconds, nanoseconds = (int(found.findtext(f"{NAMESPACE}{u}", "0")) for u in ("sec", "nanosec"))
+    return seconds * 1e3 + nanoseconds / 1e6
 
 
 def test_nothing_but_this_machine_is_reached_and_all_of_a_domain() -> None:
