@@ -142,7 +142,7 @@ TARGETS = (
         ),
     ),
     Target(
-        "WhiskEye from the command to the first hook of its last node",
+        "WhiskEye from the command to its first hook",
         "first hook of WhiskEye",
         "",
         "start_up",

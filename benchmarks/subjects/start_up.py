@@ -60,10 +60,8 @@ def _whiskeye() -> Group:
     cases = []
     for label in candidates:
         name = f"launch of whiskeye, {label}, first hook"
-        cases.append(
-            Case(f"{name} of the last node", "s", Figure(label, "last"), bound=bounds[label])
-        )
-        cases.append(Case(f"{name} of any", "s", Figure(label, "any")))
+        cases.append(Case(f"{name} of any node", "s", Figure(label, "any"), bound=bounds[label]))
+        cases.append(Case(f"{name} of the last node", "s", Figure(label, "last")))
     return Group(candidates, tuple(cases))
 
 
