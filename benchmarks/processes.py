@@ -13,6 +13,7 @@ from typing import IO
 
 from benchmarks.machine import ROOT
 from benchmarks.measure import Unavailable
+from neuros.launch.affinity import children_on, usable_cores
 from neuros.launch.domain import choose_domain
 
 END_S = 5.0
@@ -20,7 +21,7 @@ END_S = 5.0
 
 def cores() -> tuple[int, ...]:
     """The cores that may be used."""
-    return tuple(sorted(os.sched_getaffinity(0)))
+    return tuple(sorted(usable_cores()))
 
 
 def two_cores() -> tuple[int, int]:
@@ -35,17 +36,6 @@ def two_cores() -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def on_cores(chosen: Sequence[int]) -> Iterator[None]:
-    """Let what is started inside run on these cores only."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, chosen)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
-
-
-@contextlib.contextmanager
 def running(
     command: Sequence[str],
     environment: Mapping[str, str],
@@ -57,7 +47,7 @@ def running(
     At the end its input is closed, which is what ends the programs of the benchmarks; one that
     takes no notice is terminated, and then killed.
     """
-    with on_cores(cores() if chosen is None else chosen):
+    with children_on(chosen):
         process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
