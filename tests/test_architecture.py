@@ -61,7 +61,7 @@ ROOMS = (
     Room(4, ("simulators",)),
     Room(4, ("observe",)),
     Room(5, ("runtime",)),
-    Room(6, ("cli",)),
+    Room(6, ("cli", "doctor")),
     Room(6, ("testing",)),
     Room(1, ("installation",)),
 )

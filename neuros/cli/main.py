@@ -23,6 +23,7 @@ from collections.abc import Sequence
 
 from neuros import __version__
 from neuros.cli.benchmark import add_benchmark
+from neuros.cli.doctor import add_doctor
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -88,6 +89,7 @@ def parser() -> argparse.ArgumentParser:
     _add_launch(commands)
     _add_validate(commands)
     _add_graph(commands)
+    add_doctor(commands)
     add_benchmark(commands)
     _add_node(commands)
     return result

@@ -1,0 +1,112 @@
+"""What runs need of the machine itself: Python, packages, memory, a domain, screens, GPUs."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+
+from neuros.doctor.findings import Finding, absent, bad, good
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.installation.machine import Machine, system_install
+from neuros.launch.affinity import usable_cores
+from neuros.launch.domain import choose_domain
+
+SHARED_MEMORY = Path("/dev/shm")
+_LEAST_SHARED_BYTES = 64 * 2**20
+"""What Docker gives a container, too, if it is not asked for more."""
+_EXTRAS = (
+    ("MuJoCo", "mujoco", "./install.py --extras mujoco"),
+    ("NEST", "nest-simulator", "./install.py --extras nest"),
+    ("Matplotlib", "matplotlib", "./install.py --extras plot"),
+)
+_GPU_TIMEOUT_S = 10.0
+
+
+def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
+    """All findings about this machine, one after another."""
+    yield _python()
+    yield _package("ROS 2", "ros-jazzy-rclpy") or bad("ROS 2", "not installed", "run ./install.py")
+    for subject, distribution, remedy in _EXTRAS:
+        yield _package(subject, distribution) or absent(subject, "not installed", remedy)
+    yield good("cores", f"{len(usable_cores())} usable")
+    yield _shared_memory(SHARED_MEMORY)
+    yield _domain(environ)
+    yield _display(environ)
+    yield _cameras()
+    yield _gpu()
+
+
+def _python() -> Finding:
+    text = f"{platform.python_version()} ({sys.executable})"
+    try:
+        Machine.here().require_support()
+    except EnvironmentFault as fault:
+        return bad("Python", text, str(fault))
+    return good("Python", text)
+
+
+def _package(subject: str, distribution: str) -> Finding | None:
+    """``None`` if it is not installed."""
+    try:
+        return good(subject, f"{distribution} {metadata.version(distribution)}")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _shared_memory(folder: Path) -> Finding:
+    subject = "memory"
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return bad(
+            subject,
+            f"{folder} cannot be written",
+            "packets go between processes through it; mount a tmpfs there",
+        )
+    free_bytes = shutil.disk_usage(folder).free
+    text = f"{free_bytes / 2**20:.0f} MiB free in {folder}"
+    if free_bytes < _LEAST_SHARED_BYTES:
+        return bad(subject, text, "images need more; end other runs, or mount it larger")
+    return good(subject, text)
+
+
+def _domain(environ: Mapping[str, str]) -> Finding:
+    try:
+        with choose_domain(None, environ, False) as domain:
+            return good("domain", f"{domain.reason} would be used")
+    except (EnvironmentFault, UsageError) as error:
+        return bad("domain", str(error))
+
+
+def _display(environ: Mapping[str, str]) -> Finding:
+    for variable in ("WAYLAND_DISPLAY", "DISPLAY"):
+        if environ.get(variable):
+            return good("display", f"{variable}={environ[variable]}")
+    return absent("display", "none; figures go to files, and viewers do not open")
+
+
+def _cameras() -> Finding:
+    found = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
+    if found:
+        return good("cameras", f"simulated cameras can draw with {' and '.join(found)}")
+    remedy = system_install(apt="libegl1 libgl1-mesa-dri libosmesa6", dnf="mesa-libEGL")
+    return absent("cameras", "simulated cameras cannot draw without a graphics library", remedy)
+
+
+def _gpu() -> Finding:
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return absent("GPU", "no nvidia-smi; everything runs on the processor")
+    command = [program, "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(
+            command, capture_output=True, text=True, timeout=_GPU_TIMEOUT_S, check=True
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        return bad("GPU", f"nvidia-smi fails ({error})", "mend the driver")
+    return good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))

@@ -1,0 +1,81 @@
+"""What the doctor finds on machines that lack something."""
+
+from __future__ import annotations
+
+import shutil
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuros.doctor import machine
+from neuros.doctor.findings import Finding, State, bad
+
+
+def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:
+    return {finding.subject: finding for finding in machine.look_at_machine(environ or {})}
+
+
+def test_nothing_is_wrong_with_a_machine_that_runs_the_tests() -> None:
+    states = {finding.subject: finding.state for finding in findings().values()}
+    assert State.BAD not in states.values()
+    assert states["Python"] is states["ROS 2"] is states["domain"] is State.GOOD
+
+
+def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def version(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    found = findings()
+    assert found["ROS 2"].state is State.BAD
+    assert "./install.py" in found["ROS 2"].remedy
+    assert found["MuJoCo"].state is State.ABSENT
+    assert "--extras mujoco" in found["MuJoCo"].remedy
+
+
+def test_shared_memory_that_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(machine, "SHARED_MEMORY", tmp_path / "none")
+    assert findings()["memory"].state is State.BAD
+    assert str(tmp_path / "none") in findings()["memory"].text
+
+
+def test_shared_memory_too_small_for_images_is_a_problem(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usage: Any = shutil.disk_usage("/")._replace(free=2**20)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    assert findings()["memory"].state is State.BAD
+    assert "1 MiB free" in findings()["memory"].text
+
+
+def test_a_domain_id_that_is_none_is_a_problem() -> None:
+    assert findings({"ROS_DOMAIN_ID": "many"})["domain"].state is State.BAD
+
+
+def test_the_display_is_the_one_that_the_environment_names() -> None:
+    assert findings({})["display"].state is State.ABSENT
+    assert findings({"DISPLAY": ":7"})["display"].text == "DISPLAY=:7"
+
+
+def test_a_gpu_tool_that_fails_is_a_problem(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\nexit 9\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    assert findings()["GPU"].state is State.BAD
+    tool.write_text("#!/bin/sh\necho 'Some GPU, 555.1'\n")
+    assert findings()["GPU"].text == "Some GPU, 555.1"
+
+
+def test_a_finding_is_one_line_with_its_remedy() -> None:
+    assert str(bad("ROS 2", "not installed", "run ./install.py")) == (
+        "PROBLEM  ROS 2        not installed: run ./install.py"
+    )
