@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from neuros.cli.console import Console
+from neuros.cli.observation import Observation, check_observation
 from neuros.cli.plan import Plan, make_plan
 from neuros.cli.run_folder import (
     folders_of,
@@ -29,6 +30,7 @@ from neuros.launch.supervisor import Supervisor
 from neuros.observe.report import run_record, run_table
 from neuros.project.model import NodeFile
 
+EXIT_ENVIRONMENT = 4
 _ENDED_BY_SIGNAL = (130, 143)
 _PATIENCE_S = 1.0
 
@@ -40,9 +42,10 @@ def launch(options: argparse.Namespace) -> int:
         with choose_domain(options.domain_id, os.environ, plan.needs_known_domain) as domain:
             if options.dry_run:
                 return _dry_run(plan, domain, options.output)
+            check_observation(options)
             run_folder = make_run_folder(options.output, plan.project.name)
             files = write_node_files(plan, run_folder)
-            return _Run(plan, files, domain, run_folder, signals, waker).execute()
+            return _Run(plan, files, domain, run_folder, signals, waker).execute(options)
 
 
 class _Run:
@@ -69,11 +72,12 @@ class _Run:
             logs["host"] = run_folder / "host.log"
         self._console = Console(logs, lambda: bool(signals))
 
-    def execute(self) -> int:
+    def execute(self, options: argparse.Namespace) -> int:
         """Start, supervise, clean up, report."""
         started, started_s = time.time(), time.monotonic()
         guardian = Guardian.start(self._run_id, self._domain)
         guardian.remove_later(self._run_folder / SOCKET_NAME)
+        observation = self._observation(options)
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self._run_folder}")
@@ -81,10 +85,13 @@ class _Run:
             outcome = supervisor.outcome
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
-            outcome.exit_code = 4 if isinstance(error, EnvironmentFault) else 1
+            outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
             outcome.reason = f"not started: {error}"
             raise
         finally:
+            observed, faults = observation.finish()
+            for fault in faults:
+                outcome.fail(fault, EXIT_ENVIRONMENT)
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
@@ -94,6 +101,7 @@ class _Run:
                 "backend": self._plan.backend,
                 "domain_id": self._domain.id,
                 "started": started,
+                **observed,
             }
             try:
                 write_record(record, self._run_folder)
@@ -106,6 +114,13 @@ class _Run:
         is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return outcome.exit_code
+
+    def _observation(self, options: argparse.Namespace) -> Observation:
+        names = [file.node.name for file in self._files]
+        is_one_process = self._plan.backend == "in-process"
+        return Observation(
+            options, self._run_id, self._run_folder, names, is_one_process=is_one_process
+        )
 
     def _supervisor(self, guardian: Guardian) -> Supervisor:
         return Supervisor(

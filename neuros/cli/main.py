@@ -5,7 +5,8 @@
 1   a node failed, or a deadlock
 2   wrong usage of the command line
 3   invalid project
-4   something is missing on this machine (package, engine, image)
+4   something is missing on this machine (package, engine, image), or what was to be recorded
+    could not be written
 130 ended by Ctrl+C
 143 ended by SIGTERM, or because the terminal was closed
 === ===========================================================
@@ -24,6 +25,7 @@ from collections.abc import Sequence
 from neuros import __version__
 from neuros.cli.benchmark import add_benchmark
 from neuros.cli.doctor import add_doctor
+from neuros.cli.observation import add_observation
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -34,7 +36,7 @@ exit codes:
   1    a node failed, or a deadlock
   2    wrong usage
   3    invalid project: every problem is listed with its file and line
-  4    something is missing on this machine
+  4    something is missing on this machine, or a record could not be written
   130  ended by Ctrl+C (a second one kills at once)
   143  ended by SIGTERM, or because the terminal was closed
 """
@@ -143,6 +145,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         action="store_true",
         help="leave it to the kernel which node runs on which core; affinity has no effect",
     )
+    add_observation(launch)
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
     launch.set_defaults(command=_launch)

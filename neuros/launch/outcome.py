@@ -30,7 +30,8 @@ class Outcome:
     """How a run ended, and what its nodes said last.
 
     Attributes:
-        exit_code: 0 ended normally, 1 a node failed or deadlock, 130 and 143 by signal.
+        exit_code: 0 ended normally, 1 a node failed or deadlock, 4 what should have been recorded
+            could not be, 130 and 143 by signal.
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.
@@ -66,8 +67,8 @@ class Outcome:
         """Whether a node has come to its end."""
         return bool(self.reports.get(name, {}).get("is_final"))
 
-    def fail(self, reason: str) -> None:
+    def fail(self, reason: str, exit_code: int = 1) -> None:
         """Note a failure; the first one decides, unless the user had ended the run before."""
         self.failures.append(reason)
         if self.exit_code == 0:
-            self.exit_code, self.reason = 1, reason
+            self.exit_code, self.reason = exit_code, reason

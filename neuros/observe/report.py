@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from neuros.observe.load_table import load_table
 from neuros.project.model import Connection, NodeFile, Project
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
@@ -61,7 +62,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         colalign=("left", "right", "right", "right", "right", "left"),
     )
     parts = [connections] if record["connections"] else []
-    return "\n\n".join([*parts, nodes, _times(record)])
+    load = [load_table(record["system_load"])] if "system_load" in record else []
+    return "\n\n".join([*parts, nodes, *load, _times(record)])
 
 
 def _running_s(ended: Ended) -> float | None:

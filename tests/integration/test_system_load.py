@@ -1,0 +1,54 @@
+"""``--monitor-system-load`` on real runs."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from launching import Finished, launch
+
+PROJECT = Path(__file__).parent / "back_ends/time"
+
+
+def watched(folder: Path, back_end: str) -> tuple[Finished, list[dict[str, str]]]:
+    finished = launch(PROJECT, "--backend", back_end, "--duration", "2.5", "-m", cwd=folder)
+    assert finished.exit_code == 0, finished.output
+    with open(finished.run_folder / "system_load.csv", newline="") as file:
+        return finished, list(csv.DictReader(file))
+
+
+def test_every_node_has_figures_of_its_own(tmp_path: Path) -> None:
+    finished, rows = watched(tmp_path, "process")
+    nodes = list(finished.record["nodes"])
+    assert len(nodes) == 2
+    for node in nodes:
+        assert any(int(row[f"{node}.memory_bytes"] or 0) > 20_000_000 for row in rows), rows
+        assert finished.record["system_load"]["processes"][node]["threads_max"] > 1
+    assert "system load" in finished.output
+    assert finished.record["system_load"]["samples"] == len(rows) >= 2
+
+
+def test_nodes_that_share_a_process_share_its_figures(tmp_path: Path) -> None:
+    finished, rows = watched(tmp_path, "in-process")
+    assert int(rows[-1]["host.memory_bytes"]) > 20_000_000
+    assert not {f"{node}.threads" for node in finished.record["nodes"]} & rows[0].keys()
+
+
+def test_without_the_option_nothing_is_written(tmp_path: Path) -> None:
+    finished = launch(PROJECT, "--duration", "0.2", cwd=tmp_path)
+    assert not (finished.run_folder / "system_load.csv").exists()
+    assert "system_load" not in finished.record
+
+
+def test_a_missing_package_is_said_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from neuros.cli import observation
+    from neuros.cli.main import main
+
+    monkeypatch.setattr(observation, "find_spec", lambda name: None)
+    monkeypatch.chdir(tmp_path)
+    assert main(["launch", str(PROJECT), "-m"]) == 4
+    assert "psutil" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
