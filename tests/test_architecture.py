@@ -77,7 +77,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport": {"rclpy", "rpyutils"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
-    "launch.docker": {"docker"},
+    "launch.docker": {"docker", "requests"},
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate"},
     "testing": {"pytest", "hypothesis"},
 }

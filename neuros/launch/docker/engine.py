@@ -1,0 +1,111 @@
+"""The Docker engine: found as Docker's own tools find it, or one sentence on why there is none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import docker
+import requests
+from docker import DockerClient
+from docker.errors import APIError, DockerException
+
+from neuros.errors import EnvironmentFault
+
+OLDEST_API, OLDEST_ENGINE = (1, 41), "20.10"
+
+_TIMEOUT_S = 60.0
+_WITHOUT = "or run without containers: --backend process"
+
+
+def connect(
+    environ: Mapping[str, str] = os.environ, *, timeout_s: float | None = _TIMEOUT_S
+) -> DockerClient:
+    """Connect to the engine that ``DOCKER_HOST``, the current context, or the usual socket names.
+
+    Where the usual socket does not exist, one of rootless Docker is taken. A single request may
+    last ``timeout_s`` seconds, ``None`` for any time; the caller closes the client.
+
+    Raises:
+        EnvironmentFault: where there is none, it may not be used, or it is too old.
+    """
+    given = dict(environ)
+    rootless = _rootless_socket(given)
+    if rootless:
+        given["DOCKER_HOST"] = rootless
+    where = given.get("DOCKER_HOST") or "its usual socket"
+    try:
+        # "auto" asks the engine, so that whatever is wrong shows here.
+        engine = docker.from_env(version="auto", timeout=timeout_s, environment=given)
+    except (DockerException, requests.RequestException, OSError, ValueError) as error:
+        raise EnvironmentFault(_explain(error, where)) from error
+    found = tuple(map(int, str(engine.api.api_version).split(".")))
+    if found < OLDEST_API:
+        engine.close()
+        raise EnvironmentFault(
+            f"the Docker engine at {where} is too old (API {engine.api.api_version}): install"
+            f" Docker {OLDEST_ENGINE} or newer, {_WITHOUT}"
+        )
+    return engine
+
+
+@contextmanager
+def engine_faults(doing: str) -> Iterator[None]:
+    """Turn what the Docker SDK raises into ``EnvironmentFault``, which begins with ``doing``."""
+    try:
+        yield
+    except APIError as error:
+        raise EnvironmentFault(f"{doing}: {explain(str(error.explanation or error))}") from error
+    except (DockerException, requests.RequestException) as error:
+        if isinstance(_cause(error), ConnectionError | FileNotFoundError):
+            raise EnvironmentFault(f"{doing}: the Docker engine has gone away") from error
+        raise EnvironmentFault(f"{doing}: {error}") from error
+
+
+def explain(text: str) -> str:
+    """What the engine said, on one line, with a remedy where there is a known one."""
+    said = " ".join(text.split())
+    if "no space left on device" in said.lower():
+        return f"{said}: the disk is full: make room (docker system df; docker image prune)"
+    return said
+
+
+def _rootless_socket(environ: Mapping[str, str]) -> str | None:
+    named = any(environ.get(key) for key in ("DOCKER_HOST", "DOCKER_CONTEXT"))
+    folder = environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    socket = Path(folder) / "docker.sock"
+    if named or Path("/var/run/docker.sock").exists() or not socket.is_socket():
+        return None
+    return f"unix://{socket}"
+
+
+def _explain(error: BaseException, where: str) -> str:
+    cause = _cause(error)
+    if isinstance(cause, PermissionError):
+        return (
+            f"this user may not use the Docker engine at {where}: sudo usermod -aG docker"
+            f" {os.environ.get('USER', '$USER')}, then log in again (or install rootless Docker),"
+            f" {_WITHOUT}"
+        )
+    if isinstance(cause, OSError):
+        return (
+            f"no Docker engine answers at {where} ({cause.strerror or cause}): install and start"
+            f" it (sudo apt-get install docker.io; sudo systemctl start docker), {_WITHOUT}"
+        )
+    return f"the Docker engine at {where} cannot be used ({error}): see DOCKER_HOST, {_WITHOUT}"
+
+
+def _cause(error: BaseException) -> OSError | None:
+    """The operating system's error at the bottom of what three libraries have wrapped around it."""
+    to_see: list[Any] = [error]
+    while to_see:
+        each = to_see.pop()
+        if not isinstance(each, BaseException):
+            continue
+        if isinstance(each, OSError) and not isinstance(each, requests.RequestException):
+            return each
+        to_see += [each.__cause__, each.__context__, getattr(each, "reason", None), *each.args]
+    return None
