@@ -10,6 +10,7 @@ from neuros.project.draft import Draft
 from neuros.project.message_types import normalised, unknown_type
 from neuros.project.model import Connection, Node, Port
 from neuros.project.paths import PathError
+from neuros.project.resources import Access, Resources, access_of, resources_of
 from neuros.project.source import Element
 
 STANDARD_CONTAINERS = frozenset(
@@ -41,6 +42,7 @@ class Builder:
                 environment[name] = value
                 if is_path:
                     paths.append(name)
+        resources, access = _resources_and_access(element)
         return Node(
             name=element.string("name") or "",
             container=element.string("container") or "",
@@ -53,6 +55,8 @@ class Builder:
             pointer=element.pointer,
             environment_paths=tuple(sorted(paths)),
             affinity=_affinity(element),
+            resources=resources,
+            access=access,
         )
 
     def _file(self, element: Element, key: str) -> Path | None:
@@ -112,6 +116,14 @@ def _affinity(node: Element) -> tuple[int, ...]:
     """The cores that a node asks for; the schema has reported what is no number of a core."""
     cores = (core.value for core in node.items("affinity"))
     return tuple(int(core) for core in cores if isinstance(core, int | float) and core % 1 == 0)
+
+
+def _resources_and_access(node: Element) -> tuple[Resources, Access]:
+    """What a node may use; the schema has reported what is wrong with it."""
+    try:
+        return resources_of(node.plain), access_of(node.plain)
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
+        return Resources(), Access()
 
 
 def connection(element: Element, index: int) -> Connection:

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from neuros.project.resources import Access, Resources
+
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -45,6 +47,8 @@ class Node:
         file: the file that describes the node, for messages; ``pointer`` is its place in there.
         environment_paths: names of the environment variables that are such paths, sorted.
         affinity: numbers of the cores that it is to run on, from 0; empty if it does not matter.
+        resources: what it may use at most.
+        access: what its container is let in to.
     """
 
     name: str
@@ -58,6 +62,8 @@ class Node:
     pointer: str = ""
     environment_paths: tuple[str, ...] = ()
     affinity: tuple[int, ...] = ()
+    resources: Resources = field(default_factory=Resources)
+    access: Access = field(default_factory=Access)
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""

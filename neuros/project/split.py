@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
+from neuros.project.resources import access_of, keys_of, resources_of
 
 _ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 
@@ -34,7 +35,7 @@ def split(
     """
     return tuple(
         NodeFile(
-            node=_translated(node, translate),
+            node=translated(node, translate),
             connections=tuple(
                 connection
                 for connection in project.connections
@@ -100,6 +101,8 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             pointer=content["pointer"],
             environment_paths=tuple(content.get("environment_paths", ())),
             affinity=tuple(node.get("affinity", ())),
+            resources=resources_of(node),
+            access=access_of(node),
         ),
         connections=tuple(Connection(**connection) for connection in content["connections"]),
         folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
@@ -120,7 +123,8 @@ def project_to_json(project: Project) -> dict[str, Any]:
     return content
 
 
-def _translated(node: Node, translate: Callable[[Path], Path]) -> Node:
+def translated(node: Node, translate: Callable[[Path], Path]) -> Node:
+    """The node with the paths of its plugin, script and environment translated."""
     return replace(
         node,
         plugin=translate(node.plugin),
@@ -142,6 +146,7 @@ def _node_keys(node: Node) -> dict[str, Any]:
         keys["script"] = str(node.script)
     if node.affinity:
         keys["affinity"] = list(node.affinity)
+    keys |= keys_of(node.resources, node.access)
     keys["inputs"] = [_port_keys(port) for port in node.inputs]
     keys["outputs"] = [_port_keys(port) for port in node.outputs]
     return keys

@@ -14,6 +14,7 @@ from jsonschema import Draft202012Validator
 
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, Port, Project
+from neuros.project.resources import Access, Resources
 from neuros.project.split import (
     merge,
     node_file_from_json,
@@ -27,6 +28,18 @@ ROOT = Path("/home/user/demo")
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,5}", fullmatch=True)
 TYPES = st.sampled_from(["std_msgs/msg/String", "sensor_msgs/msg/Imu"])
 TEXTS = st.text(st.characters(blacklist_characters="\0", blacklist_categories=["Cs"]), max_size=6)
+RESOURCES = st.builds(
+    Resources,
+    mem_bytes=st.none() | st.integers(1, 1 << 20).map(lambda kib: kib << 10),
+    cpus=st.none() | st.floats(0.01, 64),
+    pids=st.none() | st.integers(1, 4096),
+)
+ACCESSES = st.builds(
+    Access,
+    devices=st.sampled_from([(), ("/dev/ttyUSB0", "/dev/video0")]),
+    gpus=st.sampled_from([(), ("all",), ("0", "1")]),
+    display=st.booleans(),
+)
 SENSOR = {"sensor": "imu", "element": "imu", "rate": 50}
 
 
@@ -69,6 +82,8 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             pointer=f"/nodes/{index}",
             environment_paths=paths,
             affinity=tuple(draw(st.lists(st.integers(0, 9), max_size=2, unique=True))),
+            resources=draw(RESOURCES),
+            access=draw(ACCESSES),
         )
         nodes.append(node)
     pairs = [
