@@ -78,6 +78,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "launch.docker": {"docker", "requests"},
+    "launch.environments.requirements": {"packaging"},
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate"},
     "testing": {"pytest", "hypothesis"},
 }

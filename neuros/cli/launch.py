@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from neuros.cli.console import Console
+from neuros.cli.environments import make_environments
 from neuros.cli.observation import Observation, check_observation
 from neuros.cli.plan import Plan, make_plan
 from neuros.cli.run_folder import (
@@ -39,6 +40,8 @@ def launch(options: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with _signals_noted() as (signals, waker):
         plan = make_plan(options)
+        if not options.dry_run and (ended := make_environments(plan.pythons, signals)):
+            return ended
         with choose_domain(options.domain_id, os.environ, plan.needs_known_domain) as domain:
             if options.dry_run:
                 return _dry_run(plan, domain, options.output)
@@ -150,6 +153,8 @@ class _Run:
 def _dry_run(plan: Plan, domain: DomainLock, output: str | None) -> int:
     folder = run_folder_path(output, plan.project.name, "<utc time>")
     print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
+    for line in (*plan.pythons.notices, *plan.pythons.describe()):
+        print(line)
     for line in plan.launcher(domain.id).describe(plan.node_files(folders_of(plan, folder))):
         print(line)
     return 0

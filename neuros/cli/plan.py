@@ -7,12 +7,13 @@ import os
 import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 
 from neuros.cli.projects import load
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
+from neuros.launch.environments.pythons import Pythons, require_one_python
 from neuros.launch.in_process import InProcessLauncher
 from neuros.launch.placement import Cores, place
 from neuros.launch.process import ProcessLauncher
@@ -42,6 +43,7 @@ class Plan:
     duration: Duration
     is_verbose: bool
     is_placed: bool = True
+    pythons: Pythons = field(default_factory=lambda: Pythons({}))
 
     @property
     def is_partial(self) -> bool:
@@ -86,7 +88,8 @@ class Plan:
             return InProcessLauncher(
                 [*command, "--in-memory"], on_started, self.placement(domain_id)
             )
-        return ProcessLauncher(command, on_started, self.placement(domain_id))
+        placement = self.placement(domain_id)
+        return ProcessLauncher(command, on_started, placement, self.pythons.paths)
 
 
 def make_plan(options: argparse.Namespace) -> Plan:
@@ -100,7 +103,10 @@ def make_plan(options: argparse.Namespace) -> Plan:
     backend = choose_backend(options.backend)
     names = _chosen_names(project, options.node, backend)
     is_placed = not options.no_placement
-    plan = Plan(project, names, backend, duration, options.verbose, is_placed)
+    nodes = [project.node(name) for name in names]
+    is_process = backend == "process"
+    pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
+    plan = Plan(project, names, backend, duration, options.verbose, is_placed, pythons)
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
@@ -140,7 +146,7 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
 
     Raises:
         EnvironmentFault: if ROS is missing, or cannot join so many processes, or a node asks for
-            a core that is not there.
+            a core that is not there, or one Python has to do and does not.
     """
     if find_spec("rclpy") is None:
         raise EnvironmentFault(
@@ -149,6 +155,9 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
         )
     if plan.is_placed:
         _check_cores(plan)
+    if plan.backend == "in-process":
+        nodes = [plan.project.node(name) for name in plan.names]
+        require_one_python(nodes, plan.project.folder, environ)
     is_local = environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if plan.backend == "process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(

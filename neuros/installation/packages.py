@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
@@ -16,9 +16,9 @@ from neuros.installation.progress import Progress
 LOG = "neuros-install.log"
 """What pip wrote, in ``.venv``."""
 
-_PIP_INSTALL = (
+PIP_INSTALL = (
     *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
-    *("--progress-bar", "off", "--prefer-binary", "--editable"),
+    *("--progress-bar", "off", "--prefer-binary"),
 )
 
 
@@ -37,7 +37,8 @@ def install(python: Path, root: Path, extras: Sequence[str], progress: Progress)
         )
     log, names = folder / LOG, f"[{','.join(extras)}]"
     progress.step(f"installing neuros{names} from PyPI (log: {log})")
-    output = _follow([str(python), *_PIP_INSTALL, f".{names}"], root, log, progress)
+    command = [str(python), *PIP_INSTALL, "--editable", f".{names}"]
+    output = run_pip(command, root, log, progress, clean_environment(os.environ))
     if output is not None:
         rows = [row.strip() for row in output.splitlines()]
         errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
@@ -46,15 +47,22 @@ def install(python: Path, root: Path, extras: Sequence[str], progress: Progress)
         raise EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {log})")
 
 
-def _follow(command: Sequence[str], root: Path, log: Path, progress: Progress) -> str | None:
-    """Run pip and show what it does; ``None``, or all that it wrote if it failed."""
+def run_pip(
+    command: Sequence[str], folder: Path, log: Path, progress: Progress, environ: Mapping[str, str]
+) -> str | None:
+    """Run pip in ``folder`` and show what it does; ``None``, or all that it wrote if it failed.
+
+    Raises:
+        OSError: if it cannot be started, or the log cannot be written.
+    """
     rows: list[str] = []
     with (
         log.open("w", encoding="utf-8") as file,
         subprocess.Popen(
             command,
-            cwd=root,
-            env=clean_environment(os.environ),
+            cwd=folder,
+            env=environ,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -66,7 +74,7 @@ def _follow(command: Sequence[str], root: Path, log: Path, progress: Progress) -
                 file.write(row)
                 rows.append(row)
                 _show(row, progress)
-        except KeyboardInterrupt:
+        except BaseException:
             process.terminate()
             raise
     return "".join(rows) if process.returncode else None
@@ -81,8 +89,16 @@ def _show(row: str, progress: Progress) -> None:
 
 def explain_failure(text: str) -> str | None:
     """One sentence, cause and remedy, for what pip or the operating system wrote, where known."""
+    sentence = explain_machine(text)
+    if sentence is None and re.search("No matching distribution|Could not find a version", text):
+        return f"a package does not exist for this Python: run {other_python()} install.py"
+    return sentence
+
+
+def explain_machine(text: str, again: str = "install.py") -> str | None:
+    """The same, where the cause is this machine or its network; ``again`` is what to run then."""
     for pattern, sentence in (
-        ("No space left on device", "the disk is full: make room (df -h)"),
+        ("No space left on device|Disk quota exceeded", "the disk is full: make room (df -h)"),
         (
             "CERTIFICATE_VERIFY_FAILED",
             "the certificate of the package index is not trusted: "
@@ -93,16 +109,12 @@ def explain_failure(text: str) -> str | None:
             "ReadTimeout|ProxyError|Network is unreachable|Max retries exceeded|"
             "Connection refused|Connection reset",
             "the package index https://pypi.org cannot be reached: check the network "
-            "(behind a proxy: export HTTPS_PROXY=http://HOST:PORT), then install.py again",
+            f"(behind a proxy: export HTTPS_PROXY=http://HOST:PORT), then {again} again",
         ),
         (
             r"(command|unable to execute) '?\S*(gcc|g\+\+|cc|clang)\b|Python\.h: No such file",
             "a package has to be compiled and there is no C compiler: "
             + system_install(apt="build-essential python3-dev", dnf="gcc gcc-c++ python3-devel"),
-        ),
-        (
-            "No matching distribution found|Could not find a version",
-            f"a package does not exist for this Python: run {other_python()} install.py",
         ),
         ("Permission denied", "a file cannot be written: sudo chown -R $(id -un) ."),
     ):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 
 from neuros.launch.host import HostProcess, end_now
@@ -27,6 +28,7 @@ class ProcessLauncher:
         command: the host program; the paths of ``node.json`` files are appended to it.
         on_started: called with the process id of each host as soon as it exists.
         placement: the cores of each node, by name; the kernel places those that are not in it.
+        pythons: the Python of each node that does not run on the one of ``command``, by name.
     """
 
     def __init__(
@@ -34,10 +36,12 @@ class ProcessLauncher:
         command: Sequence[str],
         on_started: Callable[[int], None] | None = None,
         placement: Mapping[str, Cores] = MappingProxyType({}),
+        pythons: Mapping[str, Path] = MappingProxyType({}),
     ) -> None:
         self._command = tuple(command)
         self._on_started = on_started
         self._placement = placement
+        self._pythons = pythons
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
@@ -59,21 +63,24 @@ class ProcessLauncher:
         cores = self._placement.get(node.node.name)
         limits = thread_limits([node.node]) if cores else {}
         added = {**limits, **node_environment(node), **environment}
+        command = self._command_of(node)
         return HostProcess(
             [node.node.name],
-            host_arguments(self._command, [node]),
+            host_arguments(command, [node]),
             log=log_file(node),
             folder=node.folders.run,
-            environment=start_environment(
-                self._command, [node], host_environment(os.environ, added)
-            ),
+            environment=start_environment(command, [node], host_environment(os.environ, added)),
             cores=cores,
         )
+
+    def _command_of(self, node: NodeFile) -> Sequence[str]:
+        python = self._pythons.get(node.node.name)
+        return (str(python), *self._command[1:]) if python else self._command
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
         """One line per host."""
         return [
             f"process {node.node.name}{on_cores(self._placement.get(node.node.name))}:"
-            f" {shlex.join(host_command(self._command, [node]))} (log: {log_file(node)})"
+            f" {shlex.join(host_command(self._command_of(node), [node]))} (log: {log_file(node)})"
             for node in nodes
         ]

@@ -1,0 +1,156 @@
+"""The cache of virtual environments: what is whole, who is making what, what nobody uses.
+
+::
+
+    ~/.cache/neuros/environments/     (or $XDG_CACHE_HOME/neuros/environments)
+        <container>-<key>/            a virtual environment
+        <container>-<key>.json        says that it is whole, and which Python to run
+        <container>-<key>.lock        only while somebody makes it
+        <container>-<key>.log         what pip wrote
+
+The ``.json`` is written last, in one step: what was interrupted never looks whole. There are some
+without a folder: they remember that the launcher's own environment does, which saves the next
+start from reading the metadata of packages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+KEY_LENGTH = 12
+_NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
+_UNUSED_S = 30 * 24 * 3600.0
+
+
+def cache_folder(environ: Mapping[str, str]) -> Path:
+    """Where environments are kept (XDG Base Directory Specification)."""
+    base = environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):
+        base = os.path.join(environ.get("HOME") or "/", ".cache")
+    return Path(base) / "neuros" / "environments"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One environment, made or not."""
+
+    folder: Path
+
+    @property
+    def stamp(self) -> Path:
+        return self._beside(".json")
+
+    @property
+    def log(self) -> Path:
+        """What pip wrote."""
+        return self._beside(".log")
+
+    def _beside(self, suffix: str) -> Path:
+        return self.folder.with_name(self.folder.name + suffix)
+
+    @property
+    def future_python(self) -> Path:
+        """The Python in it, once it is made."""
+        return self.folder / "bin" / "python"
+
+    def python(self) -> Path | None:
+        """The Python to run, if that has been settled and is there."""
+        try:
+            is_here = json.loads(self.stamp.read_text("utf-8"))["is_here"]
+        except (OSError, ValueError, LookupError, TypeError):
+            return None
+        python = Path(sys.executable) if is_here else self.future_python
+        return python if os.access(python, os.X_OK) else None
+
+    def note_use(self) -> None:
+        """Keep it from being removed as unused."""
+        with contextlib.suppress(OSError):
+            os.utime(self.stamp)
+
+    def settle(self, *, is_here: bool) -> None:
+        """From now on it is whole; or, where ``is_here``, the launcher's own Python does.
+
+        Raises ``OSError``.
+        """
+        self.stamp.parent.mkdir(parents=True, exist_ok=True)
+        draft = self._beside(f".json.{os.getpid()}")
+        try:
+            draft.write_text(json.dumps({"is_here": is_here}), "utf-8")
+            draft.replace(self.stamp)
+        finally:
+            draft.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove it, as far as that is possible; the log stays."""
+        with contextlib.suppress(OSError):
+            for file in self.folder.parent.glob(f"{self.folder.name}.json*"):
+                file.unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def locked(self, *, wait: bool = True) -> Iterator[bool]:
+        """Be the only one who makes or removes it. Raises ``OSError``.
+
+        Yields:
+            False if somebody else is, and ``wait`` is false.
+        """
+        path = self._beside(".lock")
+        descriptor = _lock(path, wait)
+        try:
+            yield descriptor is not None
+        finally:
+            if descriptor is not None:
+                # While it is locked: whoever waits for it then sees that it is no longer the file.
+                path.unlink(missing_ok=True)
+                os.close(descriptor)
+
+
+def _lock(path: Path, wait: bool) -> int | None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        # Writable, without which network file systems give no exclusive lock.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if os.path.samestat(os.fstat(descriptor), os.lstat(path)):
+                return descriptor
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        except FileNotFoundError:
+            pass  # its holder has just removed it
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def sweep(cache: Path) -> None:
+    """Remove what was interrupted, and what no run has used for a month."""
+    oldest_s = time.time() - _UNUSED_S
+    names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
+    for name in sorted(names):
+        entry = Entry(cache / name)
+        with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
+            if is_mine and _last_used_s(entry) < oldest_s:
+                entry.remove()
+                entry.log.unlink(missing_ok=True)
+
+
+def _last_used_s(entry: Entry) -> float:
+    """When a run last used it; 0 for a folder that is not whole."""
+    try:
+        return entry.stamp.stat().st_mtime
+    except FileNotFoundError:
+        is_log_alone = not entry.folder.exists() and entry.log.exists()
+        return entry.log.stat().st_mtime if is_log_alone else 0.0
