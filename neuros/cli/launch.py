@@ -122,7 +122,12 @@ class _Run:
         names = [file.node.name for file in self._files]
         is_one_process = self._plan.backend == "in-process"
         return Observation(
-            options, self._run_id, self._run_folder, names, is_one_process=is_one_process
+            options,
+            self._run_id,
+            self._run_folder,
+            self._plan.project,
+            names,
+            is_one_process=is_one_process,
         )
 
     def _supervisor(self, guardian: Guardian) -> Supervisor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.run_processes import RUN_ID
+from neuros.project.model import Project
 
 if TYPE_CHECKING:
     from neuros.observe.monitor import LoadMonitor
@@ -43,7 +45,7 @@ class Observation:
     """Watches one run, as the options say.
 
     Args:
-        names: the nodes.
+        names: the nodes that are started.
         is_one_process: whether they share a process, so that no figure is one node's alone.
     """
 
@@ -52,10 +54,16 @@ class Observation:
         options: argparse.Namespace,
         run_id: str,
         run_folder: Path,
+        project: Project,
         names: Sequence[str],
         *,
         is_one_process: bool,
     ) -> None:
+        self._run_id = run_id
+        self._project = project
+        from neuros.observe.provenance import GitState
+
+        self._git = GitState(project.folder)
         self._monitor: LoadMonitor | None = None
         if options.monitor_system_load:
             self._monitor = _monitor(run_id, run_folder, names, is_one_process=is_one_process)
@@ -63,11 +71,18 @@ class Observation:
 
     def finish(self) -> tuple[dict[str, Any], list[str]]:
         """End it; returns what belongs into the run's record, and what has gone wrong."""
+        from neuros.observe.provenance import provenance
+
+        record = {
+            "run_id": self._run_id,
+            **provenance(sys.argv, self._project.nodes),
+            "git": self._git.finish(),
+        }
         if self._monitor is None:
-            return {}, []
-        summary = self._monitor.stop()
+            return record, []
+        record["system_load"] = self._monitor.stop()
         failure = self._monitor.failure
-        return {"system_load": summary}, [] if failure is None else [failure]
+        return record, [] if failure is None else [failure]
 
 
 def _monitor(

@@ -330,7 +330,8 @@ class Engine:
         self._turn += 1
         hook.turn = self._turn
         start_ns = self._clock()
-        if hook.period_ns:
+        if hook.ticks is not None:
+            hook.ticks.note(start_ns)
             hook.set_due(self.tick_start_ns, start_ns)
         self.accounts.spend(SCHEDULING, start_ns - self.rest_since_ns)
         self.rest_since_ns = start_ns

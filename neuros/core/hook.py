@@ -7,6 +7,7 @@ from typing import Any
 
 from neuros.core.flow import Outlet
 from neuros.core.inputs import InputSlot, Mailbox
+from neuros.core.ticks import TickBook
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec, OutputSpec
 from neuros.project.model import Port
@@ -40,6 +41,7 @@ class Hook:
         candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
             keeps itself in there, so that no event has to look at all the others.
         executions, busy_ns: how often it ran, and for how long in all.
+        ticks: the intervals between its starts, if it has a period.
     """
 
     __slots__ = (
@@ -59,6 +61,7 @@ class Hook:
         "period_ns",
         "slots",
         "spec",
+        "ticks",
         "turn",
     )
 
@@ -83,6 +86,7 @@ class Hook:
         self.due_ns = 0
         self.missed_ticks = 0
         self.period_ns = 0 if spec.period_s is None else max(1, round(spec.period_s * 1e9))
+        self.ticks = TickBook(self.period_ns) if self.period_ns else None
         self.loops = tuple(self._loops())
         for outlet in self.outlets():
             outlet.hooks.append(self)

@@ -31,7 +31,7 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
         ``incoming``: the same; an external topic is ``/topic -> b.in``.
-        ``hooks``: executions, seconds and missed ticks by name.
+        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals.
         ``accounting``: seconds by cause; ``total`` is the sum of all others.
     """
     hooks = tuple(engine.all_hooks)
@@ -105,6 +105,8 @@ def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
         entry["executions"] += hook.executions
         entry["busy_s"] += hook.busy_ns / 1e9
         entry["missed_ticks"] += hook.missed_ticks
+        if hook.ticks is not None:
+            entry["ticks"] = steadily(hook.ticks.figures, None)
     return books
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -35,6 +35,7 @@ class Outcome:
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.
+        timelines: by node, points of simulated against wall time; each report brings further ones.
         started_s: when the first hook started, ``None`` if none did.
         ending_s: when the end was asked for first: what comes after is draining and finalising.
         ended_s: when all processes had ended.
@@ -46,6 +47,7 @@ class Outcome:
     reason: str = ""
     reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     report_times_s: dict[str, float] = field(default_factory=dict)
+    timelines: dict[str, list[Sequence[float]]] = field(default_factory=dict)
     started_s: float | None = None
     ending_s: float | None = None
     ended_s: float = 0.0
@@ -56,6 +58,7 @@ class Outcome:
         """Keep a report, unless the node has made its final one."""
         if not self.has_final_report(name):
             self.reports[name] = report
+            self.timelines.setdefault(name, []).extend(report.get("timeline", ()))
             self.report_times_s[name] = now_s
 
     def begin_to_end(self, now_s: float) -> None:

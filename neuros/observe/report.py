@@ -7,6 +7,10 @@ from typing import Any, Protocol
 
 from neuros.observe.load_table import load_table
 from neuros.project.model import Connection, NodeFile, Project
+from neuros.project.split import project_to_json
+
+FORMAT = 2
+"""Of ``run.json``; grows when a reader of the old one could no longer read the new one."""
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 
@@ -18,6 +22,8 @@ class Ended(Protocol):
     reason: str
     reports: dict[str, Mapping[str, Any]]
     report_times_s: dict[str, float]
+    timelines: dict[str, list[Sequence[float]]]
+    started_s: float | None
     ending_s: float | None
     ended_s: float
 
@@ -30,6 +36,7 @@ def run_record(
     sim_s = max(sim_times, default=None)
     running_s = _running_s(ended)
     return {
+        "format": FORMAT,
         "project": project.name,
         "file": str(project.file),
         "exit_code": ended.exit_code,
@@ -38,8 +45,10 @@ def run_record(
         "sim_s": sim_s,
         "running_s": running_s,
         "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
-        "connections": [_connection(c, ended.reports) for c in _connections(files)],
+        "timeline": {name: _timeline(points, ended) for name, points in ended.timelines.items()},
+        "connections": [_connection(c, ended.reports, running_s) for c in _connections(files)],
         "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
+        "expanded_project": project_to_json(project),
     }
 
 
@@ -91,7 +100,19 @@ def _connections(files: Sequence[NodeFile]) -> list[Connection]:
     return sorted(every, key=lambda connection: connection.index)
 
 
-def _connection(connection: Connection, reports: Mapping[str, Any]) -> dict[str, Any]:
+def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[float]]:
+    """Points of simulated and wall time, both growing; wall time from the first hook on."""
+    start_s = ended.started_s or 0.0
+    found: list[list[float]] = []
+    for sim_s, wall_s in points:
+        if not found or int(sim_s) > int(found[-1][0]):
+            found.append([round(sim_s, 6), round(wall_s - start_s, 6)])
+    return found
+
+
+def _connection(
+    connection: Connection, reports: Mapping[str, Any], running_s: float | None
+) -> dict[str, Any]:
     key = str(connection)
     outgoing = _ledger(reports, connection.source_node, "outgoing").get(key, {})
     incoming = _ledger(reports, connection.destination_node, "incoming").get(key, {})
@@ -102,6 +123,7 @@ def _connection(connection: Connection, reports: Mapping[str, Any]) -> dict[str,
         "discard_limit": connection.discard_limit,
         "queue_size": connection.queue_size,
         "sent": sent,
+        "rate_hz": sent / running_s if sent is not None and running_s else None,
         "lost": None if sent is None or received is None else sent - received,
         **{field: incoming.get(field) for field in fields},
     }

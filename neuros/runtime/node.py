@@ -19,6 +19,7 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.plugin import describe, load_plugin, plugin_traceback
 from neuros.runtime.scope import Stage
+from neuros.runtime.timeline import Timeline
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
@@ -64,6 +65,7 @@ class NodeRuntime:
         self._clock = clock
         self._has_run = False
         self._read_time_s: Callable[[], float] | None = None
+        self._timeline = Timeline() if file.node.owns_time else None
         self._clock_ports = {p.name for p in file.node.outputs if p.type == CLOCK_TYPE}
         self._closers: list[Callable[[], None]] = []
         self._specs: Sequence[HookSpec] = ()
@@ -181,8 +183,8 @@ class NodeRuntime:
             self._on_initialised()
         if hook.outputs:
             self._transport.note_result(box)
-        if self._duration_sim_s is not None:
-            self._check_duration()
+        if self._timeline is not None:
+            self._look_at_time(self._timeline)
         return box[0]
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
@@ -255,8 +257,8 @@ class NodeRuntime:
         def offer() -> None:
             self.waiting_threads.add(thread)
             withdrawals.append(self._loaded.offer(packets, accept))
-            if self._duration_sim_s is not None:
-                self._check_duration()
+            if self._timeline is not None:
+                self._look_at_time(self._timeline)
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:
@@ -275,12 +277,15 @@ class NodeRuntime:
     def report(self) -> dict[str, Any]:
         """State and counters. Any thread."""
         now_ns = self._clock()
-        engine = self.engine
+        engine, sim_time = self.engine, self.sim_time
+        if self._timeline is not None and sim_time is not None:
+            self._timeline.note(sim_time, now_ns / 1e9)
         return {
             "node": self.name,
             "has_run": self._has_run,
             "waiting_for": [str(each) for each in self._transport.waiting_for()],
-            "sim_time": self.sim_time,
+            "sim_time": sim_time,
+            "timeline": self._timeline.take() if self._timeline is not None else [],
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "ledger": None if engine is None else snapshot(engine, now_ns),
         }
@@ -341,13 +346,16 @@ class NodeRuntime:
     def _note_clock(self, packet: Any) -> None:
         seconds = packet.clock.sec + packet.clock.nanosec * 1e-9
         self._read_time_s = lambda: seconds
-        if self._duration_sim_s is not None:
-            self._check_duration()
+        if self._timeline is not None:
+            self._look_at_time(self._timeline)
 
-    def _check_duration(self) -> None:
+    def _look_at_time(self, timeline: Timeline) -> None:
+        """Simulated time may have gone on; it may be over."""
         time_s = self.sim_time
-        assert self._duration_sim_s is not None
-        if time_s is not None and time_s >= self._duration_sim_s - 1e-9:
+        if time_s is None:
+            return
+        timeline.note(time_s, self._clock() / 1e9)
+        if self._duration_sim_s is not None and time_s >= self._duration_sim_s - 1e-9:
             limit, self._duration_sim_s = self._duration_sim_s, None
             self.shutdown(f"{limit:g} s of simulated time", 5.0)
 

@@ -1,0 +1,127 @@
+"""What a run was made of: versions, machine, seeds, command line, and the state of the project."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuros import __version__
+from neuros.project.model import Node
+
+_GIT_PATIENCE_S = 5.0
+
+
+def provenance(command: Sequence[str], nodes: Iterable[Node]) -> dict[str, Any]:
+    """All of it but git's part, ready for JSON.
+
+    Args:
+        command: the command line that was given.
+        nodes: of the project: what is called a seed in their environment is listed.
+    """
+    return {
+        "command": list(command),
+        "versions": {
+            "neuros": __version__,
+            "python": platform.python_version(),
+            "kernel": f"{platform.system()} {platform.release()}",
+            "packages": installed_packages(sys.path),
+        },
+        "machine": machine(),
+        "seeds": seeds(nodes),
+    }
+
+
+def installed_packages(folders: Iterable[str]) -> dict[str, str]:
+    """Name and version of every package on a search path, read from the names of its metadata.
+
+    (``importlib.metadata`` would open each of some 200 files: 0.2 s.)
+    """
+    found: dict[str, str] = {}
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            for entry in os.listdir(folder or "."):
+                name, dash, version = entry.removesuffix(".dist-info").partition("-")
+                if dash and entry.endswith(".dist-info"):
+                    found.setdefault(name, version)
+    return dict(sorted(found.items(), key=lambda pair: pair[0].lower()))
+
+
+def machine() -> dict[str, Any]:
+    """The machine, as far as figures depend on it."""
+    return {
+        "name": platform.node(),
+        "processor": _first("/proc/cpuinfo", "model name") or platform.machine(),
+        "cores": os.cpu_count(),
+        "usable_cores": len(os.sched_getaffinity(0)),
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "system": _first("/etc/os-release", "PRETTY_NAME"),
+    }
+
+
+def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
+    """By node, the variables of its environment that are named after a seed."""
+    found = {
+        node.name: {key: value for key, value in node.environment.items() if "SEED" in key.upper()}
+        for node in nodes
+    }
+    return {name: variables for name, variables in found.items() if variables}
+
+
+class GitState:
+    """Which commit a folder is at. Asked in the background, so that nobody waits for git.
+
+    Reads the state from when it is made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._commit = _git(folder, "rev-parse", "HEAD")
+        self._changes = _git(folder, "status", "--porcelain", "--", ".")
+
+    def finish(self) -> dict[str, Any] | None:
+        """``commit``, and ``is_dirty`` if the folder differs from it; ``None`` outside git."""
+        commit, changes = _answer(self._commit), _answer(self._changes)
+        if commit is None:
+            return None
+        return {"commit": commit.strip(), "is_dirty": None if changes is None else bool(changes)}
+
+
+def _git(folder: Path, *arguments: str) -> subprocess.Popen[bytes] | None:
+    # Variables of a surrounding git command (a hook, say) would lead it to another repository.
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
+    try:
+        return subprocess.Popen(
+            ["git", "--no-optional-locks", "-C", str(folder), *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+    except OSError:  # there is no git
+        return None
+
+
+def _answer(asked: subprocess.Popen[bytes] | None) -> str | None:
+    if asked is None:
+        return None
+    try:
+        output, _ = asked.communicate(timeout=_GIT_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        asked.kill()
+        asked.communicate()
+        return None
+    return output.decode(errors="replace") if asked.returncode == 0 else None
+
+
+def _first(file: str, key: str) -> str | None:
+    """The first value of a key in a file of lines such as ``key : value`` or ``KEY="value"``."""
+    with contextlib.suppress(OSError), open(file, encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.startswith(key):
+                return line[len(key) :].strip().lstrip(":=").strip().strip('"')
+    return None

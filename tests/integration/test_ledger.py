@@ -1,0 +1,65 @@
+"""What ``run.json`` keeps of a real run, on every back end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from launching import BACKENDS, EXAMPLES, Finished, launch
+
+PROJECT = EXAMPLES / "1_tick/clock"
+TIME = Path(__file__).parent / "back_ends/time"
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The clock, ticking every second, for three and a half."""
+    folder = tmp_path_factory.mktemp("clock")
+    set_seed = ("--set", "nodes.clock.environment.SEED=7")
+    finished = launch(
+        PROJECT, "--backend", request.param, "--duration", "3.5", *set_seed, cwd=folder
+    )
+    assert finished.exit_code == 0, finished.output
+    return finished
+
+
+def test_it_has_what_the_run_was_made_of(run: Finished) -> None:
+    record = run.record
+    assert record["seeds"] == {"clock": {"SEED": "7"}}
+    assert any("clock" in part for part in record["command"])
+    assert record["versions"]["packages"]["ros_jazzy_rclpy"]
+    assert record["machine"]["cores"] >= 1
+    names = [node["name"] for node in record["expanded_project"]["nodes"]]
+    assert names == ["clock", "display"]
+    assert "SEED" in record["expanded_project"]["nodes"][0]["environment"]
+    assert "git" in record
+
+
+def test_it_has_the_intervals_of_the_timed_hook(run: Finished) -> None:
+    (ticks,) = (
+        hook["ticks"] for hook in run.record["nodes"]["clock"]["hooks"].values() if "ticks" in hook
+    )
+    assert ticks["period_ms"] == 1000.0
+    assert ticks["intervals"] >= 1
+    assert sum(count for _, count in ticks["histogram"]) == ticks["intervals"]
+    assert ticks["min_ms"] <= ticks["mean_ms"] <= ticks["max_ms"]
+
+
+def test_wall_time_of_every_node_is_divided_without_rest(run: Finished) -> None:
+    for node in run.record["nodes"].values():
+        spent = node["accounting"]
+        parts = sum(sum(spent[kind].values()) for kind in ("executing", "waiting", "blocked"))
+        parts += spent["idle"] + spent["registering"] + spent["scheduling"]
+        assert parts == pytest.approx(spent["total"], abs=1e-6)
+
+
+@pytest.mark.parametrize("back_end", BACKENDS)
+def test_simulated_time_has_a_point_per_second(tmp_path: Path, back_end: str) -> None:
+    finished = launch(TIME, "--backend", back_end, "--duration", "4sim", cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    points = finished.record["timeline"]["clock"]
+    assert [int(sim_s) for sim_s, _ in points] == [*range(int(points[0][0]), len(points))]
+    assert len(points) >= 4
+    walls = [wall_s for _, wall_s in points]
+    assert walls == sorted(walls)
+    assert -1.0 < walls[0] < finished.record["wall_s"] + 1.0
