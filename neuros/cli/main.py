@@ -24,6 +24,7 @@ from collections.abc import Sequence
 
 from neuros import __version__
 from neuros.cli.benchmark import add_benchmark
+from neuros.cli.containers import add_containers
 from neuros.cli.doctor import add_doctor
 from neuros.cli.observation import add_observation
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
@@ -92,6 +93,7 @@ def parser() -> argparse.ArgumentParser:
     _add_validate(commands)
     _add_graph(commands)
     add_doctor(commands)
+    add_containers(commands)
     add_benchmark(commands)
     _add_node(commands)
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -39,17 +40,6 @@ def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
     return images
 
 
-def default_of(text: str, argument: str) -> str | None:
-    """The default of a build argument that is declared in front of the first ``FROM``."""
-    for line in _CONTINUED.sub(" ", text).splitlines():
-        match = _INSTRUCTION.match(line)
-        if match and match[1].upper() == "FROM":
-            return None
-        if match and match[2].partition("=")[0] == argument:
-            return _unquoted(match[2].partition("=")[2])
-    return None
-
-
 def after_each_from(text: str, lines: str) -> str:
     """The Dockerfile with ``lines`` behind each ``FROM``: they count in all of its stages."""
     found = []
@@ -61,6 +51,23 @@ def after_each_from(text: str, lines: str) -> str:
             found.append(lines)
             is_from = False
     return "\n".join(found) + "\n"
+
+
+def on_images(text: str, tags: Mapping[str, str]) -> str:
+    """The Dockerfile with other names for the images that it begins from: ``{name: tag}``."""
+
+    def renamed(match: re.Match[str]) -> str:
+        name = match[2].removesuffix(":latest")
+        return f"{match[1]}{tags[name]}" if name in tags else match[0]
+
+    head = r"(?im)^([ \t]*(?:FROM[ \t]+(?:--\S+[ \t]+)*|ARG[ \t]+\w+=[\"']?))([^\s\"']+)"
+    return re.sub(head, renamed, text)
+
+
+def label_line(labels: Mapping[str, str]) -> str:
+    """The instruction that writes labels, all in one step."""
+    pairs = (f"{key}={json.dumps(value)}" for key, value in sorted(labels.items()))
+    return f"LABEL {' '.join(pairs)}".replace("$", "\\$")
 
 
 def _filled(text: str, values: Mapping[str, str]) -> str:

@@ -19,7 +19,7 @@ from neuros.launch.docker.recipes import BASE, Recipe, find_recipe
 CONTAINER = "neuros.image.container"
 FOLDER = "neuros.image.folder"
 DIGEST = "neuros.image.digest"
-BASE_IMAGE = "neuros.image.base"
+
 START = "neuros.image.start"
 PYTHON = "neuros.image.python"
 
@@ -116,7 +116,7 @@ def _built(recipe: Recipe, project_folder: Path | None, engine: DockerClient) ->
     notice = ""
     if not is_current(image, recipe):
         notice = f"the image of container '{recipe.name}' is older than its recipe: {remedy}"
-    return _labelled(image, recipe.tag, notice)
+    return _labelled(image, recipe.tags[0], notice)
 
 
 def _labelled(image: Any, name: str, notice: str = "") -> Image:

@@ -72,9 +72,10 @@ class Recipe:
         return [parent for parent in self.parents if parent.name in names]
 
     @property
-    def tag(self) -> str:
-        """The name of its image."""
-        return f"{self.name}:{self.digest[:12]}"
+    def tags(self) -> list[str]:
+        """The names of its image; NeuROS's own are the ``latest``, too, for use by hand."""
+        own = [f"{self.name}:latest"] if self.is_own else []
+        return [f"{self.name}:{self.digest[:12]}", *own]
 
     def __str__(self) -> str:
         return str(self.folder)

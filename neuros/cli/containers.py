@@ -1,0 +1,196 @@
+"""``neuros containers``: builds the images that nodes run in, shows and removes them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuros.errors import EnvironmentFault, UsageError
+
+if TYPE_CHECKING:
+    from neuros.launch.docker.recipes import Recipe
+
+STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
+"""What the examples need."""
+
+_EPILOG = """\
+exit codes:
+  0    done
+  2    wrong usage
+  3    invalid project
+  4    no engine, or an image cannot be built: nothing half-built gets a name
+  130  ended by Ctrl+C
+"""
+
+
+def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    containers = commands.add_parser(
+        "containers",
+        help="build, list and remove the images that nodes run in",
+        description="Build, list and remove the images that nodes run in.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = containers.add_subparsers(title="actions", metavar="ACTION", required=True)
+    build = actions.add_parser("build", help="build what is missing or out of date")
+    build.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="a container, an image of your own, or a project (a folder or file) for all that its"
+        f" nodes need (default: {' '.join(STANDARD)})",
+    )
+    add_build_options(build)
+    build.add_argument(
+        "--build-arg",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a build argument of the Dockerfiles, as VARIANT=cuda of neuros_tensorflow",
+    )
+    build.add_argument(
+        "--if-engine", action="store_true", help="where there is no engine, say so, and that is all"
+    )
+    build.set_defaults(command=_build)
+    actions.add_parser("list", help="show NeuROS's images").set_defaults(command=_list)
+    remove = actions.add_parser("remove", help="remove images that NeuROS has built")
+    remove.add_argument("names", nargs="*", metavar="NAME", help="of containers (default: all)")
+    remove.set_defaults(command=_remove)
+
+
+def add_build_options(parser: argparse.ArgumentParser) -> None:
+    """The options that ``install.py`` has, too."""
+    add = parser.add_argument
+    add(
+        "--base-image",
+        action="append",
+        default=[],
+        metavar="[NAME=]IMAGE",
+        help="begin the image of container NAME (default: neuros_python) from IMAGE",
+    )
+    add("--wheelhouse", metavar="DIR", help="take all Python packages from a folder of wheels")
+    add("--ca-bundle", metavar="FILE", help="certificates (PEM) that builds are to trust")
+    add("--pull", action="store_true", help="ask for the newest version of base images")
+
+
+def _build(options: argparse.Namespace) -> int:
+    from neuros.installation.progress import Progress
+    from neuros.launch.docker.building import ImageBuilder, Wishes
+    from neuros.launch.docker.context import surroundings
+    from neuros.launch.docker.engine import connect
+    from neuros.launch.docker.wheelhouse import served
+
+    wishes = Wishes(
+        logs=_cache() / "builds",
+        bases=dict(_pair(text, "neuros_python") for text in options.base_image),
+        arguments=dict(_pair(text, None) for text in options.build_arg),
+        pull=options.pull,
+    )
+    recipes, images = _wanted(options.names or STANDARD)
+    wheelhouse = _file_or_folder(options.wheelhouse, "--wheelhouse", is_folder=True)
+    bundle = _file_or_folder(options.ca_bundle, "--ca-bundle", is_folder=False)
+    try:
+        connection = connect(timeout_s=None)
+    except EnvironmentFault as fault:
+        if not options.if_engine:
+            raise
+        print(f"no containers are built, so projects run as processes: {fault}")
+        return 0
+    with ExitStack() as stack:
+        engine = stack.enter_context(closing(connection))
+        wheels = stack.enter_context(served(wheelhouse)) if wheelhouse else ""
+        around = surroundings(engine, os.environ, bundle, wheels)
+        builder = ImageBuilder(engine, around, wishes, Progress(sys.stdout))
+        builder.build(recipes)
+        for image in images:
+            builder.add_to(image)
+    return 0
+
+
+def _list(options: argparse.Namespace) -> int:
+    from neuros.launch.docker.engine import connect
+    from neuros.launch.docker.inventory import inventory
+    from neuros.launch.docker.recipes import OWN_FOLDER, names_in
+
+    with closing(connect()) as engine:
+        images = inventory(engine)
+    for image in images:
+        state = "" if image.is_current else "  (its recipe has changed)"
+        size = f"{image.size_bytes / 1e6:6.0f} MB"
+        print(f"{image.container:20} {size}  Python {image.python}  {image.tags[0]}{state}")
+    for name in names_in(OWN_FOLDER):
+        if all(image.container != name for image in images):
+            print(f"{name:20} not built")
+    return 0
+
+
+def _remove(options: argparse.Namespace) -> int:
+    from neuros.launch.docker.engine import connect
+    from neuros.launch.docker.inventory import remove_images
+
+    with closing(connect()) as engine:
+        for tag in remove_images(engine, options.names):
+            print(f"removed {tag}")
+    return 0
+
+
+def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
+    """The recipes, and the images without one, that are behind names, folders and projects."""
+    from neuros.launch.docker.recipes import find_recipe
+
+    recipes: list[Recipe] = []
+    images: list[str] = []
+    for name in names:
+        for container, project_folder in _containers(name):
+            recipe = find_recipe(container, project_folder)
+            if recipe:
+                recipes.append(recipe)
+            else:
+                images.append(container)
+    return recipes, list(dict.fromkeys(images))
+
+
+def _containers(name: str) -> list[tuple[str, Path | None]]:
+    """What a name stands for: containers, each with the folder of its project."""
+    from neuros.cli.projects import WORKSPACE
+    from neuros.launch.docker.recipes import OWN_FOLDER, names_in
+    from neuros.project.load import load_project
+
+    path = Path(name).absolute()
+    if name in names_in(OWN_FOLDER) or not path.exists():
+        return [(name, None)]
+    if path.is_dir() and path.name in names_in(path.parent):
+        return [(path.name, path.parent.parent)]
+    project = load_project(path, workspace=WORKSPACE).project
+    return [(node.container, project.folder) for node in project.nodes]
+
+
+def _pair(text: str, key: str | None) -> tuple[str, str]:
+    """``NAME=IMAGE``; with a ``key`` to assume, ``IMAGE`` is enough."""
+    name, separator, value = text.partition("=")
+    if separator and name and value:
+        return name, value
+    if key is None or separator or not text:
+        raise UsageError(f"'{text}' is not KEY=VALUE")
+    return key, text
+
+
+def _file_or_folder(text: str | None, option: str, *, is_folder: bool) -> Path | None:
+    """The path of an option that was given, if there is such a thing."""
+    if text is None:
+        return None
+    path = Path(text).absolute()
+    if not (path.is_dir() if is_folder else path.is_file()):
+        raise UsageError(f"{option} {text}: there is no such {'folder' if is_folder else 'file'}")
+    return path
+
+
+def _cache() -> Path:
+    """Where NeuROS keeps what it can make again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"

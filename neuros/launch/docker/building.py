@@ -1,0 +1,191 @@
+"""Builds the images of recipes: parents first, what is current not again, a tag for the whole only.
+
+Each image is built without a name, is run once to see that it can run nodes, gets what it lacks for
+that (the recipe ``neuros_python`` on top of it), and its tag last. The classic builder is used,
+which every engine has.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from docker import DockerClient
+from docker.errors import APIError, ImageNotFound
+
+from neuros.errors import EnvironmentFault
+from neuros.installation.progress import Progress
+from neuros.launch.docker.build_steps import BuildSteps, pulled
+from neuros.launch.docker.context import Surroundings
+from neuros.launch.docker.dockerfile import images_in, on_images
+from neuros.launch.docker.engine import engine_faults
+from neuros.launch.docker.images import (
+    CONTAINER,
+    DIGEST,
+    FOLDER,
+    added_tag,
+    built_image,
+    labels_of_python,
+)
+from neuros.launch.docker.recipes import BASE_ARGUMENT, Recipe, bare_name, in_order
+
+_BASE = "neuros.image.base"
+_ARGUMENTS = "neuros.image.arguments"
+_FROM = "neuros.image.from"
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user wants of the builds.
+
+    Attributes:
+        logs: the folder for what the engine says.
+        bases: base images by container name, in place of those in the Dockerfiles.
+        arguments: build arguments for all Dockerfiles.
+        pull: whether the newest version of base images is asked for.
+    """
+
+    logs: Path
+    bases: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    pull: bool = False
+
+
+class ImageBuilder:
+    """Builds images, with a line about each."""
+
+    def __init__(
+        self, engine: DockerClient, around: Surroundings, wishes: Wishes, progress: Progress
+    ) -> None:
+        self._engine, self._around = engine, around
+        self._wishes, self._progress = wishes, progress
+
+    def build(self, recipes: Iterable[Recipe]) -> None:
+        """Build what is missing or out of date of these and of what they begin from.
+
+        Raises:
+            EnvironmentFault: at the first that cannot be built; those before it are kept.
+        """
+        for recipe in in_order(recipes, self._wishes.bases):
+            with engine_faults(f"image '{recipe.name}' cannot be built"):
+                self._bring_up_to_date(recipe)
+
+    def add_to(self, name: str) -> None:
+        """Build, on an image that the user has, one that can run nodes; nothing where it can.
+
+        Raises:
+            EnvironmentFault: if there is no such image, or it can never run nodes.
+        """
+        started_s = time.monotonic()
+        with engine_faults(f"image '{name}' cannot be used"):
+            try:
+                image = self._engine.images.get(name)
+            except ImageNotFound:
+                raise EnvironmentFault(
+                    f"there is neither a folder containers/{name} nor an image '{name}': docker"
+                    f" pull {name}, or correct the name"
+                ) from None
+            steps = self._steps(name)
+            made, python = steps.able(image.id)
+            if made == image.id:
+                self._progress.step(f"{name}: can run nodes as it is")
+                return
+            labels = {CONTAINER: name, **labels_of_python(python)}
+            steps.finish(made, [added_tag(image)], labels)
+            self._report(f"{name}: what nodes need was added, as {added_tag(image)}", started_s)
+
+    def _steps(self, name: str) -> BuildSteps:
+        log = self._wishes.logs / f"{name.replace('/', '_')}.log"
+        return BuildSteps(self._engine, self._around, self._progress, name, log)
+
+    def _bring_up_to_date(self, recipe: Recipe) -> None:
+        started_s = time.monotonic()
+        old = built_image(recipe, self._engine)
+        labels = self._labels(recipe, old)
+        base = labels[_BASE]
+        if self._wishes.pull and not base:
+            self._pull_bases(recipe)
+        steps = self._steps(recipe.name)
+        begin = {
+            parent.name: built_image(parent, self._engine).id  # type: ignore[union-attr]
+            for parent in recipe.parents_on(base or None)
+        }
+        arguments = json.loads(labels[_ARGUMENTS])
+        if base and base not in begin:
+            arguments[BASE_ARGUMENT] = self._base(recipe, base, steps)
+        labels[_FROM] = json.dumps({**begin, "": arguments.get(BASE_ARGUMENT, "")})
+        if old is not None and not self._wishes.pull and _is_as_wanted(old, labels):
+            self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
+            return
+        text = on_images(recipe.dockerfile, begin)
+        made, python = steps.able(steps.build(recipe.folder, text, arguments))
+        steps.finish(made, recipe.tags, {**labels, **labels_of_python(python)})
+        self._forget(recipe, old)
+        self._report(f"{recipe.name}: built", started_s, self._engine.images.get(recipe.tags[0]))
+
+    def _labels(self, recipe: Recipe, old: Any | None) -> dict[str, str]:
+        """What the image is to be; what was wanted of it last time is wanted again."""
+        wanted = old.labels if old is not None else {}
+        arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | dict(self._wishes.arguments)
+        return {
+            CONTAINER: recipe.name,
+            FOLDER: str(recipe.folder),
+            DIGEST: recipe.digest,
+            _BASE: self._wishes.bases.get(recipe.name, wanted.get(_BASE, "")),
+            _ARGUMENTS: json.dumps(arguments, sort_keys=True),
+        }
+
+    def _base(self, recipe: Recipe, base: str, steps: BuildSteps) -> str:
+        """The id of the image that the user wants to begin with.
+
+        In place of a recipe's image it must be able to do what that can: run nodes.
+        """
+        image = pulled(self._engine, base, newest=self._wishes.pull)
+        replaces_recipe = len(recipe.parents_on(base)) < len(recipe.parents)
+        return steps.able(image.id)[0] if replaces_recipe else str(image.id)
+
+    def _pull_bases(self, recipe: Recipe) -> None:
+        parents = {parent.name for parent in recipe.parents}
+        for image in images_in(recipe.dockerfile):
+            if bare_name(image) not in parents and image != "scratch":
+                self._progress.detail(f"{recipe.name}: pulling {image}")
+                pulled(self._engine, image, newest=True)
+
+    def _forget(self, recipe: Recipe, old: Any | None) -> None:
+        """Remove what was built from this folder before, unless somebody uses it.
+
+        Labels are inherited, so only names that were given here say what is ours.
+        """
+        stale = [
+            tag
+            for image in self._engine.images.list(
+                name=recipe.name, filters={"label": f"{FOLDER}={recipe.folder}"}
+            )
+            for tag in image.tags
+            if tag not in recipe.tags and tag.startswith(f"{recipe.name}:")
+        ]
+        with contextlib.suppress(ImageNotFound):
+            if old is not None and not self._engine.images.get(old.id).tags:
+                stale.append(old.id)
+        for name in stale:
+            with contextlib.suppress(APIError):
+                self._engine.images.remove(name)
+
+    def _report(self, text: str, started_s: float, image: Any | None = None) -> None:
+        size = f", {_size(image)}" if image is not None else ""
+        self._progress.step(f"{text} in {time.monotonic() - started_s:.1f} s{size}")
+
+
+def _is_as_wanted(image: Any, labels: Mapping[str, str]) -> bool:
+    return all(image.labels.get(key) == labels[key] for key in (DIGEST, _BASE, _ARGUMENTS, _FROM))
+
+
+def _size(image: Any) -> str:
+    return f"{image.attrs['Size'] / 1e6:.0f} MB"

@@ -1,0 +1,104 @@
+"""What goes to the engine for one build: files, Dockerfile, arguments, network."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+from docker import DockerClient
+
+from neuros.launch.docker.recipes import files_of
+
+CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
+"""Where a build finds the certificates that the user gives; it is taken away at the end."""
+
+_CERTIFICATES_IN_CONTEXT = ".neuros-ca-bundle.pem"
+_CERTIFICATE_VARIABLES = ("PIP_CERT", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "FTP_PROXY", "NO_PROXY", "ALL_PROXY")
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+_NO_FILES: Mapping[str, bytes] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What all builds on this machine need, whatever they build.
+
+    Attributes:
+        arguments: build arguments; the engine keeps proxies out of the images' history.
+        network: of the build, ``None`` for the engine's default.
+        ca_bundle: certificates to trust besides, PEM.
+        wheels: the address of a wheelhouse, or "".
+    """
+
+    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    network: str | None = None
+    ca_bundle: bytes = b""
+    wheels: str = ""
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """What has to lie beside every Dockerfile for it."""
+        return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
+
+    @property
+    def lines(self) -> str:
+        """What every stage of a Dockerfile has to declare for it."""
+        lines = []
+        if self.ca_bundle:
+            lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
+            lines += [f"ARG {name}={CERTIFICATES}" for name in _CERTIFICATE_VARIABLES]
+        if self.wheels:
+            lines += ["ARG PIP_NO_INDEX=1", f"ARG PIP_FIND_LINKS={self.wheels}"]
+        return "\n".join(lines)
+
+
+def surroundings(
+    engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
+) -> Surroundings:
+    """What this machine's environment, and the engine, ask for.
+
+    A wheelhouse leaves proxies out, and packages of the operating system.
+    """
+    proxies = {
+        name: environ[name]
+        for upper in _PROXIES
+        for name in (upper, upper.lower())
+        if environ.get(name)
+    }
+    is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
+    has_bridge = any(network.name == "bridge" for network in engine.networks.list())
+    return Surroundings(
+        arguments={"SYSTEM_PACKAGES": ""} if wheels else proxies,
+        network="host" if wheels or is_here or not has_bridge else None,
+        ca_bundle=ca_bundle.read_bytes() if ca_bundle else b"",
+        wheels=wheels,
+    )
+
+
+def context_of(
+    folder: Path | None, dockerfile: str, further: Mapping[str, bytes] = _NO_FILES
+) -> io.BytesIO:
+    """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files."""
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        for file in files_of(folder) if folder else ():
+            if file.name != "Dockerfile" or file.parent != folder:
+                tar.add(file, str(file.relative_to(folder or file)), filter=_anonymous)
+        for name, content in {"Dockerfile": dockerfile.encode(), **further}.items():
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o644
+            tar.addfile(entry, io.BytesIO(content))
+    archive.seek(0)
+    return archive
+
+
+def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+    """Readable by all, whatever the umask of whoever wrote it was."""
+    entry.uid = entry.gid = 0
+    entry.uname = entry.gname = ""
+    entry.mode = 0o755 if entry.mode & 0o111 else 0o644
+    return entry
