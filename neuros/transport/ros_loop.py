@@ -6,8 +6,8 @@ and past its deadline it goes on while events keep coming. So it is always given
 stopped from inside when a timer is due.
 
 Events of the engines wait in a deque of their own, since passing each of them through C++ would
-cost more than the engine itself. One task in the executor's queue (the *pump*) stands for them, so
-that both queues take turns. A loop-back is only handled first thing in a turn: then everything
+cost more than the engine itself. One turn in the executor's queue stands for them, so that both
+queues take turns. A loop-back is only handled first thing in a turn: then everything
 that ROS had waiting when it was posted has been seen.
 """
 
@@ -21,13 +21,13 @@ from typing import Any
 from rclpy.context import Context
 from rclpy.node import Node as RosNode
 
-from neuros.transport.executors import make_executor
+from neuros.transport.executors import Turn, make_executor
 
 Event = Callable[[], None]
 
 # How long events of engines may keep those of ROS waiting, besides the event that runs. A turn
-# costs 5 to 25 us, more with cold caches: 1 ms makes that a few per cent, and no node that shares
-# its process with others can count on less.
+# costs 2 to 10 us, more with cold caches: 1 ms makes that a per cent or less, and no node that
+# shares its process with others can count on less.
 _TURN_NS = 1_000_000
 _LONG_S = 3600.0
 
@@ -56,7 +56,8 @@ class RosLoop:
         self._on_failure = on_failure
         self._waker = _Waker()
         self._events: deque[tuple[Event, bool]] = deque()
-        self._has_posted_pump = False
+        self._turn = Turn(self._take_turn)
+        self._has_posted_turn = False
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
         self._is_stopping = False
@@ -77,14 +78,14 @@ class RosLoop:
     def post(self, event: Event) -> None:
         """Handle ``event`` after all that already wait."""
         self._events.append((event, False))
-        if not self._has_posted_pump:
-            self._post_pump()
+        if not self._has_posted_turn:
+            self._post_turn()
 
     def post_loop_back(self, event: Event) -> None:
         """Handle ``event`` after all that already wait, those of ROS included."""
         self._events.append((event, True))
-        if not self._has_posted_pump:
-            self._post_pump()
+        if not self._has_posted_turn:
+            self._post_turn()
 
     def post_from_thread(self, event: Event) -> None:
         """Like :meth:`post`, from any thread."""
@@ -146,12 +147,12 @@ class RosLoop:
     def _wake(self) -> None:
         self._waker.wake(None)
 
-    def _post_pump(self) -> None:
-        self._has_posted_pump = True
-        self._executor.create_task(self._pump)
+    def _post_turn(self) -> None:
+        self._has_posted_turn = True
+        self._executor.create_task(self._turn)
 
-    def _pump(self) -> None:
-        self._has_posted_pump = False
+    def _take_turn(self) -> None:
+        self._has_posted_turn = False
         events = self._events
         end_ns = time.monotonic_ns() + _TURN_NS
         is_first = True
@@ -167,8 +168,8 @@ class RosLoop:
                 self._on_failure(error)
             if time.monotonic_ns() > end_ns:
                 break
-        if events and not self._has_posted_pump:
-            self._post_pump()
+        if events and not self._has_posted_turn:
+            self._post_turn()
         if self._timers:
             self._check_timers()
 

@@ -17,7 +17,7 @@ from std_msgs.msg import Int32
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import choose_domain
-from neuros.transport.executors import EXECUTOR_VARIABLE, WaitSetExecutor, make_executor
+from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
@@ -106,6 +106,52 @@ def test_a_loop_back_comes_after_all_that_ros_has_waiting(
     assert seen == [0, 1, 2, 3, 4, "loop-back"]
 
 
+@pytest.mark.parametrize("is_busy", [True, False], ids=["busy", "idle"])
+def test_so_does_one_that_ros_has_caused(is_busy: bool, loop: Loop, context: rclpy.Context) -> None:
+    """Whether or not events of engines have kept the loop busy all the time."""
+    node = RosNode("node", context=context)
+    loop.loop.add_node(node)
+    seen: list[object] = []
+    causes: list[int] = []
+    subscriptions = [
+        node.create_subscription(Int32, "numbers", lambda message: seen.append(message.data), 10),
+        node.create_subscription(Int32, "causes", loop.loop.guarded(lambda _: cause()), 10),
+    ]
+    numbers, beginnings = (node.create_publisher(Int32, t, 10) for t in ("numbers", "causes"))
+
+    def cause() -> None:
+        causes.append(len(seen))
+        for number in range(3):
+            numbers.publish(Int32(data=number))
+        time.sleep(0.2)  # as above
+        loop.loop.post_loop_back(loop_back)
+
+    def loop_back() -> None:
+        seen.append("loop-back")
+        if len(causes) < 4:
+            beginnings.publish(Int32())
+        else:
+            loop.loop.stop()
+
+    def begin() -> None:
+        if all(s.get_publisher_count() for s in subscriptions) and all(
+            p.get_subscription_count() for p in (numbers, beginnings)
+        ):
+            beginnings.publish(Int32())
+            if is_busy:
+                keep_busy()
+        else:
+            loop.loop.post(begin)
+
+    def keep_busy() -> None:
+        loop.loop.post(keep_busy)
+
+    loop.loop.post(begin)
+    loop.run()
+    node.destroy_node()
+    assert seen == [0, 1, 2, "loop-back"] * 4
+
+
 def test_another_thread_wakes_and_stops_a_loop_that_has_nothing_to_do(loop: Loop) -> None:
     seen: list[threading.Thread] = []
 
@@ -154,6 +200,15 @@ def test_with_an_events_executor_that_has_changed_too(
     monkeypatch.setattr(f"{EVENTS}.EventsExecutor", lambda *, context: object())
     executor = make_executor(context)
     assert isinstance(executor, WaitSetExecutor)
+    executor.shutdown(0)
+
+
+def test_a_turn_stands_in_the_queue_itself_and_no_task_for_it(context: rclpy.Context) -> None:
+    """What a loop-back costs depends on that; it goes on working where rclpy changes."""
+    turn = Turn(lambda: None)
+    executor = make_executor(context)
+    assert executor.create_task(turn) is turn
+    assert isinstance(executor.create_task(lambda: None), rclpy.task.Task)
     executor.shutdown(0)
 
 
