@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -205,11 +206,11 @@ class NodeRuntime:
 
     def post(self, event: Callable[[], None]) -> None:
         """Queue a delivery of the node to itself."""
-        self._middleware.loop.post(lambda: self._guard(event))
+        self._middleware.loop.post(partial(self._guard, event))
 
     def post_loop_back(self, event: Callable[[], None]) -> None:
         """Queue the loop-back."""
-        self._middleware.loop.post_loop_back(lambda: self._guard(event))
+        self._middleware.loop.post_loop_back(partial(self._guard, event))
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""
