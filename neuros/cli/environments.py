@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from neuros.installation.progress import Progress
@@ -44,9 +44,23 @@ def _make(pythons: Pythons) -> None:
     run_id = os.urandom(8).hex()
     guardian = Guardian.start(run_id)
     try:
-        pythons.make(Progress(sys.stdout), {RUN_ID: run_id})
+        pythons.make(Progress(_Output()), {RUN_ID: run_id})
     finally:
         guardian.finish()
+
+
+class _Output:
+    """Standard output. A run goes on if nobody reads it any more, and so does this."""
+
+    def isatty(self) -> bool:
+        return os.isatty(1)
+
+    def write(self, text: str) -> None:
+        with suppress(OSError):
+            os.write(1, text.encode(errors="replace"))
+
+    def flush(self) -> None:
+        """There is no buffer."""
 
 
 @contextmanager

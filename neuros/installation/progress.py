@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import shutil
 import time
-from typing import TextIO
+from typing import Protocol
 
 _QUIET_S = 10.0
+
+
+class Stream(Protocol):
+    """Where progress goes: a text file, or what can do the same."""
+
+    def isatty(self) -> bool: ...
+    def write(self, text: str, /) -> object: ...
+    def flush(self) -> object: ...
 
 
 class Progress:
     """One line per step, with the time since the start; on a terminal, details in place."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: Stream) -> None:
         self._stream, self._is_terminal = stream, stream.isatty()
         self._start = self._last = time.monotonic()
 

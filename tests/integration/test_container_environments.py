@@ -273,6 +273,18 @@ def test_what_is_interrupted_never_looks_whole(
     assert len(project.left()) == 2
 
 
+def test_an_environment_is_made_whether_or_not_somebody_reads_about_it(project: Project) -> None:
+    make_slow_package(project.index, "neuros_colour", "1.0", "NAME = 'red'")
+    project.node("last", "slow", "neuros_colour")
+    with project.start() as running:
+        wait_until(lambda: project.builds() == 1)
+        assert running.process.stdout is not None
+        running.process.stdout.close()
+        (project.index / "go").touch()
+        running.process.wait(60.0)
+    wait_until(lambda: len(project.left()) == 2)
+
+
 def test_in_one_process_the_node_is_named_whose_software_is_not_here(project: Project) -> None:
     project.node("last", "other", "neuros_colour<2")
     run = project.launch("--backend", "in-process")
