@@ -114,9 +114,10 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _list(options: argparse.Namespace) -> int:
+    from neuros.launch.containers import OWN_FOLDER
     from neuros.launch.docker.engine import connect
     from neuros.launch.docker.inventory import inventory
-    from neuros.launch.docker.recipes import OWN_FOLDER, names_in
+    from neuros.launch.docker.recipes import names_in
 
     with closing(connect()) as engine:
         images = inventory(engine)
@@ -159,7 +160,8 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.cli.projects import WORKSPACE
-    from neuros.launch.docker.recipes import OWN_FOLDER, names_in
+    from neuros.launch.containers import OWN_FOLDER
+    from neuros.launch.docker.recipes import names_in
     from neuros.project.load import load_project
 
     path = Path(name).absolute()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 FOLDER = "containers"
-_NAME = re.compile(r"\w[\w.-]*")
-_OWN = Path(__file__).resolve().parents[2] / FOLDER
+OWN_FOLDER = Path(__file__).resolve().parents[2] / FOLDER
+"""NeuROS's own; they are part of the source checkout."""
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 
 
 @dataclass(frozen=True)
@@ -29,16 +32,23 @@ class ContainerFolder:
         return self.folder / "requirements.txt"
 
 
-def find_container(name: str, project: Path, own: Path = _OWN) -> ContainerFolder | None:
-    """The folder of the container of that name, or ``None``: it is an image from elsewhere.
+def bare_name(container: str) -> str:
+    """``neuros_nest:latest`` as ``neuros_nest``: folders have no versions."""
+    return container.removesuffix(":latest")
 
-    ``containers/<name>/`` in the folder ``project`` goes before the one in ``own``. A tag
-    (``name:tag``) plays no part in it.
-    """
-    name = name.partition(":")[0]
-    if not _NAME.fullmatch(name):  # it is the address of an image, with slashes
+
+def folder_of(name: str, places: Iterable[Path]) -> Path | None:
+    """The first folder of that name in ``places``; ``None`` where it can only be an image."""
+    if not _NAME.fullmatch(name):
         return None
-    for folder, is_own in ((project / FOLDER / name, False), (own / name, True)):
-        if folder.is_dir():
-            return ContainerFolder(name, folder, is_own)
-    return None
+    return next((place / name for place in places if (place / name).is_dir()), None)
+
+
+def find_container(name: str, project: Path, own: Path = OWN_FOLDER) -> ContainerFolder | None:
+    """The folder of a container, or ``None``.
+
+    ``containers/<name>/`` in the folder ``project`` goes before the one in ``own``.
+    """
+    name = bare_name(name)
+    folder = folder_of(name, [project / FOLDER, own])
+    return ContainerFolder(name, folder, folder.parent == own) if folder else None

@@ -21,6 +21,7 @@ from docker.errors import APIError, ImageNotFound
 
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
+from neuros.launch.containers import bare_name
 from neuros.launch.docker.build_steps import BuildSteps, pulled
 from neuros.launch.docker.context import Surroundings
 from neuros.launch.docker.dockerfile import images_in, on_images
@@ -33,7 +34,7 @@ from neuros.launch.docker.images import (
     built_image,
     labels_of_python,
 )
-from neuros.launch.docker.recipes import BASE_ARGUMENT, Recipe, bare_name, in_order
+from neuros.launch.docker.recipes import BASE_ARGUMENT, Recipe, in_order
 
 _BASE = "neuros.image.base"
 _ARGUMENTS = "neuros.image.arguments"

@@ -8,17 +8,14 @@ engine.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.containers import FOLDER, OWN_FOLDER, bare_name, folder_of
 from neuros.launch.docker.dockerfile import images_in
-
-OWN_FOLDER = Path(__file__).resolve().parents[3] / "containers"
-"""NeuROS's recipes; they are part of the source checkout."""
 
 BASE = "neuros_python"
 """The recipe that makes an image with Python one that runs nodes."""
@@ -81,11 +78,6 @@ class Recipe:
         return str(self.folder)
 
 
-def bare_name(container: str) -> str:
-    """``neuros_nest:latest`` as ``neuros_nest``: recipes have no versions."""
-    return container.removesuffix(":latest")
-
-
 def find_recipe(
     container: str, project_folder: Path | None = None, own_folder: Path = OWN_FOLDER
 ) -> Recipe | None:
@@ -94,14 +86,12 @@ def find_recipe(
     Raises:
         EnvironmentFault: for a folder that holds none, or recipes that go round in a circle.
     """
-    places = [own_folder] if project_folder is None else [project_folder / "containers", own_folder]
+    places = [own_folder] if project_folder is None else [project_folder / FOLDER, own_folder]
     return _find(bare_name(container), places, ())
 
 
 def _find(name: str, places: list[Path], children: tuple[str, ...]) -> Recipe | None:
-    if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
-        return None
-    folder = next((place / name for place in places if (place / name).is_dir()), None)
+    folder = folder_of(name, places)
     if folder is None:
         return None
     if name in children:

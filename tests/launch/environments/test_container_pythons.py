@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.containers import find_container
+from neuros.launch.containers import ContainerFolder, find_container
 from neuros.launch.environments.choice import HERE, Choice, choose
 from neuros.launch.environments.interpreters import find_python, wanted_version
 from neuros.launch.environments.pythons import Pythons, require_one_python
@@ -67,15 +67,15 @@ class TestFolders:
         own = tmp_path / "own"
         for folder in (own / "snn", own / "robot", tmp_path / "containers" / "snn"):
             folder.mkdir(parents=True)
-        snn, robot = (find_container(name, tmp_path, own) for name in ("snn:2", "robot"))
+        snn, robot = (find_container(name, tmp_path, own) for name in ("snn:latest", "robot"))
         assert snn is not None
         assert robot is not None
         assert (snn.folder, snn.is_own) == (tmp_path / "containers" / "snn", False)
         assert (robot.folder, robot.is_own) == (own / "robot", True)
 
-    @pytest.mark.parametrize("name", ["absent", "..", "registry.org/snn", "", "."])
+    @pytest.mark.parametrize("name", ["absent", "..", "registry.org/snn", "", ".", "snn:2"])
     def test_other_names_are_images_from_elsewhere(self, tmp_path: Path, name: str) -> None:
-        (tmp_path / "containers").mkdir()
+        (tmp_path / "containers" / "snn").mkdir(parents=True)
         assert find_container(name, tmp_path, tmp_path / "own") is None
 
 
@@ -147,6 +147,15 @@ class TestChoices:
         assert choice.path == Path(sys.executable)
         assert "prefers Python {}.{} (".format(*OTHER) in choice.notice
         assert choice.notice.endswith("it gets Python {}.{}".format(*HERE))
+
+    def test_of_neuros_own_containers_any_version_here_does(self, project: Project) -> None:
+        folder = project.folder / "neuros_snn"
+        folder.mkdir()
+        (folder / "requirements.txt").write_text("jsonschema==1.0")
+        for is_own in (True, False):
+            container = ContainerFolder("neuros_snn", folder, is_own)
+            choice = choose(container, project.folder / "cache", project.environ)
+            assert (choice.path == Path(sys.executable)) == is_own
 
     def test_another_content_is_another_environment(self, project: Project) -> None:
         keys = set()
