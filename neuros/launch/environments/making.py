@@ -92,9 +92,18 @@ def _add_links(choice: Choice) -> None:
     folder = choice.entry.folder
     site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
     (site_packages / "neuros").symlink_to(PACKAGE, target_is_directory=True)
-    if not choice.is_layered:
-        return
-    # The wheels of ROS 2 look for their libraries and files below the prefix of their Python.
+    if choice.is_layered:
+        rows = [str(path) for path in packages_here()]
+        if _is_here(_BOOTSTRAPPER):
+            _link_libraries(folder, site_packages)
+            rows.append(f"import {_BOOTSTRAPPER}")
+        # Lines of a .pth file come behind what is in the environment itself.
+        layer = "".join(f"{row}\n" for row in rows)
+        (site_packages / "neuros_layer.pth").write_text(layer, "utf-8")
+
+
+def _link_libraries(folder: Path, site_packages: Path) -> None:
+    """The wheels of ROS 2 look for their libraries and files below the prefix of their Python."""
     prefix = Path(sys.prefix)
     libraries = [path for path in (prefix / "lib").iterdir() if not path.name.startswith("python")]
     for path in (*libraries, prefix / "share"):
@@ -103,11 +112,6 @@ def _add_links(choice: Choice) -> None:
             link.symlink_to(path)
     for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
         (site_packages / path.name).symlink_to(path)
-    rows = [str(path) for path in packages_here()]
-    if _is_here(_BOOTSTRAPPER):
-        rows.append(f"import {_BOOTSTRAPPER}")
-    # Lines of a .pth file come behind what is in the environment itself.
-    (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
 
 
 def _is_here(package: str) -> bool:
