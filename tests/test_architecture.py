@@ -79,6 +79,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "launch.docker": {"docker", "requests"},
     "launch.environments.requirements": {"packaging"},
+    "cli.sessions": {"tabulate"},
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate"},
     "testing": {"pytest", "hypothesis"},
 }

@@ -17,10 +17,17 @@ class Console:
     Args:
         logs: the log files to show, by name.
         is_enough: whether the user wants no more of it (asked while it waits).
+        translate: from what nodes say to what the user knows (names of paths).
     """
 
-    def __init__(self, logs: Mapping[str, Path], is_enough: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        logs: Mapping[str, Path],
+        is_enough: Callable[[], bool],
+        translate: Callable[[str], str] = str,
+    ) -> None:
         self._screen = Screen(sys.stdout)
+        self._translate = translate
         self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
         colours = sys.stdout is not None and wants_colours(sys.stdout, os.environ)
         self._tail = LogTail(logs, self.write, colours)
@@ -29,8 +36,8 @@ class Console:
         self._patience_s: float | None = None
 
     def write(self, text: str) -> None:
-        """Write as it is."""
-        self._screen.write(text)
+        """Write as it is, but for the names of paths."""
+        self._screen.write(self._translate(text))
         if self._is_finishing:
             self._screen.finish(self._is_enough, self._patience_s)
 

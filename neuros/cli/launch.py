@@ -27,6 +27,7 @@ from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.outcome import Outcome
+from neuros.launch.sessions import Session, guardian_environment, this_process
 from neuros.launch.supervisor import Supervisor
 from neuros.observe.report import run_record, run_table
 from neuros.project.model import NodeFile
@@ -73,17 +74,21 @@ class _Run:
         logs = {file.node.name: run_folder / file.node.name / "node.log" for file in files}
         if plan.backend == "in-process":
             logs["host"] = run_folder / "host.log"
-        self._console = Console(logs, lambda: bool(signals))
+        self._console = Console(logs, lambda: bool(signals), self._as_here)
 
     def execute(self, options: argparse.Namespace) -> int:
         """Start, supervise, clean up, report."""
         started, started_s = time.time(), time.monotonic()
-        guardian = Guardian.start(self._run_id, self._domain)
+        guardian = Guardian.start(
+            self._run_id, self._domain, guardian_environment(self._session(started))
+        )
         guardian.remove_later(self._run_folder / SOCKET_NAME)
         observation = self._observation(options)
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self._run_folder}")
+            for severity, notice in self._plan.back_end.notices:
+                self._console.log(severity, notice)
             supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
             supervisor.run()
@@ -98,6 +103,7 @@ class _Run:
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
+            outcome.reason = self._as_here(outcome.reason)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s)
             record |= {
@@ -130,10 +136,26 @@ class _Run:
             is_one_process=is_one_process,
         )
 
+    def _as_here(self, text: str) -> str:
+        """With the names that paths have on this machine."""
+        return self._plan.back_end.as_here(text, self._files[0].folders)
+
+    def _session(self, started: float) -> Session:
+        """What `neuros ps` shows of it."""
+        return Session(
+            self._run_id,
+            self._plan.project.name,
+            self._plan.backend,
+            tuple(file.node.name for file in self._files),
+            str(self._run_folder),
+            started,
+            this_process(),
+        )
+
     def _supervisor(self, guardian: Guardian) -> Supervisor:
         return Supervisor(
             self._files,
-            self._plan.launcher(self._domain.id, guardian.watch),
+            self._plan.launcher(self._domain.id, guardian),
             self._environment(),
             self._run_folder,
             self._console,
@@ -160,6 +182,8 @@ def _dry_run(plan: Plan, domain: DomainLock, output: str | None) -> int:
     print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
     for line in (*plan.pythons.notices, *plan.pythons.describe()):
         print(line)
+    for _, notice in plan.back_end.notices:
+        print(notice)
     for line in plan.launcher(domain.id).describe(plan.node_files(folders_of(plan, folder))):
         print(line)
     return 0

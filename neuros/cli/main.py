@@ -27,6 +27,7 @@ from neuros.cli.benchmark import add_benchmark
 from neuros.cli.containers import add_containers
 from neuros.cli.doctor import add_doctor
 from neuros.cli.observation import add_observation
+from neuros.cli.sessions import add_sessions
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -94,6 +95,7 @@ def parser() -> argparse.ArgumentParser:
     _add_graph(commands)
     add_doctor(commands)
     add_containers(commands)
+    add_sessions(commands)
     add_benchmark(commands)
     _add_node(commands)
     return result
@@ -127,9 +129,10 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     launch.add_argument(
         "--backend",
         choices=("auto", "docker", "process", "in-process"),
-        default="auto",
+        default=os.environ.get("NEUROS_BACKEND") or "auto",
         help="where nodes run: each in a container, each in a process, or all in one process"
-        " (default: auto; docker is not built in yet, so auto is process)",
+        " (default: NEUROS_BACKEND, else auto: docker where an engine has the images, and else"
+        " process)",
     )
     launch.add_argument(
         "--duration",

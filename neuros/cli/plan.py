@@ -6,17 +6,17 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 
+from neuros.cli.back_end import BackEnd, choose_back_end
 from neuros.cli.projects import load
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
-from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.guardian import Guardian
 from neuros.launch.placement import Cores, place
-from neuros.launch.process import ProcessLauncher
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
@@ -39,11 +39,16 @@ class Plan:
 
     project: Project
     names: tuple[str, ...]
-    backend: str
+    back_end: BackEnd
     duration: Duration
     is_verbose: bool
     is_placed: bool = True
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
+
+    @property
+    def backend(self) -> str:
+        """The name of the back end."""
+        return self.back_end.name
 
     @property
     def is_partial(self) -> bool:
@@ -77,19 +82,16 @@ class Plan:
         # The first domain that runs pick is 1.
         return place(nodes, cores, os.environ, begin=max(domain_id - 1, 0))
 
-    def launcher(self, domain_id: int, on_started: Callable[[int], None] | None = None) -> Launcher:
-        """The launcher of the back end in a ROS domain; ``on_started`` hears of every process."""
-        command = [sys.executable, "-m", "neuros.cli", "node"]
+    def launcher(self, domain_id: int, guardian: Guardian | None = None) -> Launcher:
+        """The launcher of the back end in a ROS domain; ``guardian`` hears of all it starts."""
+        options: list[str] = []
         if self.duration.sim_s is not None:
-            command += ["--duration-sim", repr(self.duration.sim_s)]
+            options += ["--duration-sim", repr(self.duration.sim_s)]
         if self.is_verbose:
-            command.append("--debug")
-        if self.backend == "in-process":
-            return InProcessLauncher(
-                [*command, "--in-memory"], on_started, self.placement(domain_id)
-            )
-        placement = self.placement(domain_id)
-        return ProcessLauncher(command, on_started, placement, self.pythons.paths)
+            options.append("--debug")
+        return self.back_end.launcher(
+            options, self.placement(domain_id), self.pythons.paths, guardian
+        )
 
 
 def make_plan(options: argparse.Namespace) -> Plan:
@@ -100,13 +102,13 @@ def make_plan(options: argparse.Namespace) -> Plan:
     """
     duration = parse_duration(options.duration)
     project = load(options)
-    backend = choose_backend(options.backend)
-    names = _chosen_names(project, options.node, backend)
+    names = _chosen_names(project, options.node, options.backend)
+    back_end = choose_back_end(options.backend, project, names)
     is_placed = not options.no_placement
     nodes = [project.node(name) for name in names]
-    is_process = backend == "process"
+    is_process = back_end.name == "process"
     pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
-    plan = Plan(project, names, backend, duration, options.verbose, is_placed, pythons)
+    plan = Plan(project, names, back_end, duration, options.verbose, is_placed, pythons)
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
@@ -130,17 +132,6 @@ def parse_duration(text: str | None) -> Duration:
     return Duration(sim_s=seconds) if match[2] else Duration(wall_s=seconds)
 
 
-def choose_backend(wanted: str) -> str:
-    """The back end for ``--backend``.
-
-    Raises:
-        UsageError: for one that does not exist yet.
-    """
-    if wanted == "docker":
-        raise UsageError("--backend docker: not there yet; use process or in-process")
-    return "process" if wanted == "auto" else wanted
-
-
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     """Check that this machine can run the plan.
 
@@ -159,7 +150,7 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
         nodes = [plan.project.node(name) for name in plan.names]
         require_one_python(nodes, plan.project.folder, environ)
     is_local = environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
-    if plan.backend == "process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
+    if plan.backend != "in-process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(
             f"{len(plan.names)} processes are more than find each other with discovery on this"
             f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or set"
@@ -202,7 +193,7 @@ def _chosen_names(project: Project, wanted: Sequence[str], backend: str) -> tupl
             if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
                 raise UsageError(
                     f"-n leaves out one end of {connection}, which the in-process back end"
-                    " cannot reach; use --backend process"
+                    " cannot reach; use --backend docker or process"
                 )
     return chosen
 

@@ -24,7 +24,9 @@ import select
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock
@@ -56,14 +58,20 @@ class Guardian:
         self._orders = Orders(started_s=time.time())
 
     @classmethod
-    def start(cls, run_id: str, lock: DomainLock | None = None) -> Guardian:
+    def start(
+        cls,
+        run_id: str,
+        lock: DomainLock | None = None,
+        environment: Mapping[str, str] = MappingProxyType({}),
+    ) -> Guardian:
         """Start a guardian and wait until it is on duty.
 
         It holds ``lock``, too, so that nobody takes the domain before the last node is gone, and
-        removes the lock file in the end. Raises ``EnvironmentFault``.
+        removes the lock file in the end. ``environment`` is added to its own. Raises
+        ``EnvironmentFault``.
         """
         descriptor = lock.fileno() if lock else None
-        environment = {key: value for key, value in os.environ.items() if key != RUN_ID}
+        inherited = {key: value for key, value in os.environ.items() if key != RUN_ID}
         root = str(Path(__file__).resolve().parents[2])
         read_end, write_end = os.pipe()
         try:
@@ -73,7 +81,7 @@ class Guardian:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 cwd="/",
-                env=environment,
+                env={**inherited, **environment},
                 start_new_session=True,
                 pass_fds=() if descriptor is None else (descriptor,),
             )
@@ -105,6 +113,10 @@ class Guardian:
     def remove_later(self, path: Path) -> None:
         """Have a file, socket or folder removed once all processes of the run are gone."""
         self._tell("remove", os.fspath(path.absolute()))
+
+    def watch_containers(self, engine_socket: str) -> None:
+        """Have the run's containers removed from the engine that listens there."""
+        self._tell("engine", engine_socket)
 
     def finish(self, grace_s: float = 0.0) -> None:
         """Leave the rest to the guardian and wait for it.

@@ -21,6 +21,8 @@ KILL_DEADLINE_S = 20.0
 
 _GRACE_S = 4.5  # nodes have this long when the launcher died; all is gone within 6 s
 _POLL_S = 0.05
+_SETTLE_S = 0.5
+_REMOVE_S = 5.0
 
 
 class Orders:
@@ -32,6 +34,8 @@ class Orders:
         self.sessions: list[int] = []
         self.paths: list[str] = []
         self.locks: list[tuple[int, str]] = []
+        self.engines: list[str] = []
+        self.is_finished = False
 
     def take(self, order: str, value: object) -> None:
         if order == "session" and isinstance(value, int):
@@ -41,7 +45,9 @@ class Orders:
         elif order == "lock" and isinstance(value, list):
             self.locks.append((int(value[0]), str(value[1])))
         elif order == "grace" and isinstance(value, (int, float)):
-            self.grace_s = float(value)
+            self.grace_s, self.is_finished = float(value), True
+        elif order == "engine" and isinstance(value, str):
+            self.engines.append(value)
 
 
 def main(run_id: str) -> None:
@@ -76,6 +82,7 @@ def _import_the_rest() -> None:
         import shutil  # noqa: F401
 
         import neuros.launch.domain
+        import neuros.launch.leftover_containers
         import neuros.launch.shared_memory  # noqa: F401
 
 
@@ -86,6 +93,7 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
         for pid in orders.sessions:
             processes.add_session(pid)
     _end_all(processes, orders.grace_s)
+    _remove_containers(run_id, orders)
 
     from pathlib import Path
 
@@ -109,6 +117,15 @@ def _end_all(processes: RunProcesses, grace_s: float) -> None:
             pause_s = _POLL_S / 5
         time.sleep(max(0.001, min(pause_s, abs(kill_at - time.monotonic()))))
         pause_s = min(_POLL_S, pause_s * 2)
+
+
+def _remove_containers(run_id: str, orders: Orders) -> None:
+    """What a killed launcher had asked the engine for may still be on its way."""
+    for engine in orders.engines:
+        from neuros.launch.leftover_containers import remove_containers
+
+        settle_s = 0.0 if orders.is_finished else _SETTLE_S
+        remove_containers(engine, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
 
 
 def _kill(processes: Mapping[int, int]) -> None:

@@ -95,10 +95,13 @@ def end_now(hosts: Sequence[HostProcess]) -> None:
         host.wait(5.0)
 
 
-def _in_words(code: int) -> str:
-    if code >= 0:
-        return f"exit code {code}"
+def signal_in_words(number: int) -> str:
+    """What a signal has done to a process."""
     try:
-        return f"killed by {signal.Signals(-code).name}"
+        return f"killed by {signal.Signals(number).name}"
     except ValueError:  # a real-time signal
-        return f"killed by signal {-code}"
+        return f"killed by signal {number}"
+
+
+def _in_words(code: int) -> str:
+    return f"exit code {code}" if code >= 0 else signal_in_words(-code)

@@ -15,19 +15,21 @@ from neuros.project.model import NodeFile
 
 # One thread each: more threads than free cores make numerical libraries slower, not faster, and
 # simulators differ in the last bit with their number.
-_DEFAULTS = {
+DEFAULTS = {
     "PYTHONUNBUFFERED": "1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-# Runs the scripts one after another, each with the log of its node for output; the shell passes
+# Runs the scripts one after another, each with the log of its node for output, by themselves where
+# they may be executed (seen from where they run, which may be a container); the shell passes
 # SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the host of it: same
 # process id, nothing in between.
 _SCRIPTS = """\
 run() {
   name=$1 script=$2 log=$3; shift 3
-  "$@" >>"$log" 2>&1 & wait "$!"; code=$?
+  [ -x "$script" ] || set -- "$@" /bin/sh
+  "$@" "$script" >>"$log" 2>&1 & wait "$!"; code=$?
   if [ "$code" -ne 0 ]; then
     echo "[FATAL] [$(date +%s.%N)] [$name]: script $script failed: exit code $code"
     exit 1
@@ -59,7 +61,7 @@ def node_environment(node: NodeFile) -> dict[str, str]:
 
 def host_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
     """The environment of a host: ``base`` (the launcher's own) with ``added`` on top."""
-    return {**_DEFAULTS, **without_mark(base), **added}
+    return {**DEFAULTS, **without_mark(base), **added}
 
 
 def start_environment(
@@ -96,18 +98,19 @@ def host_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[st
 
 def script_failure(log: Path) -> str | None:
     """What the last line of a host's log says of a script that failed, if that is what it says."""
+    match = _SCRIPT_FAILED.fullmatch(last_line(log))
+    return match and f"script {match['script']} of '{match['node']}' failed: {match['how']}"
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log, empty if there is none."""
     with contextlib.suppress(OSError), open(log, "rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
         lines = file.read().decode(errors="replace").splitlines()
-        match = _SCRIPT_FAILED.fullmatch(lines[-1]) if lines else None
-        if match:
-            return f"script {match['script']} of '{match['node']}' failed: {match['how']}"
-    return None
+        return lines[-1] if lines else ""
+    return ""
 
 
 def _script_line(node: NodeFile, script: Path) -> str:
     variables = [f"{key}={value}" for key, value in node_environment(node).items()]
-    start = [str(script)] if os.access(script, os.X_OK) else ["/bin/sh", str(script)]
-    return shlex.join(
-        ["run", node.node.name, str(script), str(log_file(node)), "env", *variables, *start]
-    )
+    return shlex.join(["run", node.node.name, str(script), str(log_file(node)), "env", *variables])

@@ -13,6 +13,8 @@ from typing import NamedTuple
 RUN_ID = "NEUROS_RUN_ID"
 """The environment variable that every process of a run inherits."""
 
+_NODE_FOLDER = b"NEUROS_RUN_DIR="
+
 
 class _Process(NamedTuple):  # a dataclass would take the guardian 10 ms to import
     """One line of ``/proc/<pid>/stat``; ``start`` (clock ticks) tells it from a later namesake."""
@@ -60,15 +62,35 @@ class RunProcesses:
         }
         return dict(self._known)
 
+    def nodes(self) -> dict[int, str]:
+        """Process ids of those that were started for one node, and the name of that node."""
+        found: dict[int, str] = {}
+        for pid in self.alive():
+            for variable in environ_of(pid):
+                if variable.startswith(_NODE_FOLDER):
+                    found[pid] = os.fsdecode(variable.rpartition(b"/")[2])
+        return found
+
     def _is_member(self, process: _Process, processes: dict[int, _Process]) -> bool:
         if self._known.get(process.pid) == process.start:
             return True
         start = self._sessions.get(process.session)
         if start is not None and _is_same_leader(processes.get(process.session), start):
             return True
-        with contextlib.suppress(OSError), open(f"/proc/{process.pid}/environ", "rb") as file:
-            return self._mark in file.read().split(b"\0")
-        return False
+        return self._mark in environ_of(process.pid)
+
+
+def environ_of(pid: int) -> list[bytes]:
+    """The environment that a process was started with, empty if it cannot be read."""
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/environ", "rb") as file:
+        return file.read().split(b"\0")
+    return []
+
+
+def started_at(pid: int) -> int | None:
+    """When a process started, in clock ticks since boot; ``None`` if there is none."""
+    process = _read(pid)
+    return None if process is None or process.is_gone else process.start
 
 
 def _is_same_leader(leader: _Process | None, start: int) -> bool:

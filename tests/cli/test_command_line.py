@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from neuros.cli.back_end import BackEnd
 from neuros.cli.main import main
 from neuros.cli.plan import (
     Duration,
@@ -105,7 +106,6 @@ def test_what_does_not_work_yet_is_not_offered(capsys: pytest.CaptureFixture[str
         ([".", "--duration", "soon"], "--duration soon: give seconds"),
         ([".", "--duration", "0"], "--duration 0: give seconds"),
         ([".", "-d", "300"], "-d/--domain-id: '300' is no ROS domain id"),
-        ([".", "--backend", "docker"], "--backend docker: not there yet"),
         ([".", "--backend", "in-process", "-n", "a"], "-n leaves out one end of a.o -> b.x"),
         ([".", "-o", "plugin.py"], "-o plugin.py: is not an empty folder"),
         ([".", "-o", "."], "-o .: is not an empty folder"),
@@ -302,7 +302,7 @@ def test_a_given_run_folder_is_taken_exactly(tmp_path: Path) -> None:
 def plan_of(count: int, backend: str) -> Plan:
     nodes = tuple(Node(f"node{i}", "neuros_python", Path("plugin.py")) for i in range(count))
     project = Project("many", nodes, (), Path("project.json"))
-    return Plan(project, tuple(n.name for n in nodes), backend, Duration(), False)
+    return Plan(project, tuple(n.name for n in nodes), BackEnd(backend), Duration(), False)
 
 
 def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_named() -> None:

@@ -18,6 +18,7 @@ from ros_program import RosProgram
 from std_msgs.msg import Int32
 from std_srvs.srv import SetBool, Trigger
 
+from containers import require_containers
 from neuros.launch.domain import choose_domain
 
 PROJECTS = Path(__file__).parent / "back_ends"
@@ -55,8 +56,10 @@ def hooks(finished: Finished, node: str) -> dict[str, int]:
     return {name: hook["executions"] for name, hook in books.items()}
 
 
-@pytest.fixture(params=BACKENDS)
+@pytest.fixture(params=[*BACKENDS, "docker"])
 def back_end(request: pytest.FixtureRequest) -> str:
+    if request.param == "docker":
+        require_containers()
     return str(request.param)
 
 
@@ -128,9 +131,9 @@ def test_the_times_of_a_node_add_up(pipeline):
         assert node["report"] == "final"
 
 
-def test_a_reproducible_project_sends_the_same_bytes_on_every_back_end(run):
+def test_a_reproducible_project_sends_the_same_bytes_on_every_back_end(pipeline, run):
     digests = {read(run(back_end, "pipeline"), "sink/digest") for back_end in BACKENDS}
-    assert len(digests) == 1
+    assert digests == {read(pipeline, "sink/digest")}
 
 
 # ------------------------------------------------------------------ joins

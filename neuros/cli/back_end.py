@@ -1,0 +1,109 @@
+"""Where nodes run: the choice of ``--backend``, and the launcher that follows from it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.launch.docker.layout import as_here, inside
+from neuros.launch.guardian import Guardian
+from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.placement import Cores
+from neuros.launch.process import ProcessLauncher
+from neuros.ports import Launcher
+from neuros.project.model import Folders, Node, NodeFile, Project
+
+if TYPE_CHECKING:
+    from neuros.launch.docker.launcher import Containers
+
+BACK_ENDS = ("auto", "docker", "process", "in-process")
+BACK_END_VARIABLE = "NEUROS_BACKEND"
+_COMMAND = (sys.executable, "-m", "neuros.cli", "node")
+
+
+@dataclass(frozen=True)
+class BackEnd:
+    """A back end, and what the user should know of the choice: ``(severity, text)``."""
+
+    name: str
+    notices: tuple[tuple[str, str], ...] = ()
+    containers: Containers | None = None
+
+    def as_seen(self, file: NodeFile) -> NodeFile:
+        """The node with all paths as it sees them itself."""
+        return inside(file) if self.containers else file
+
+    def as_here(self, text: str, folders: Folders) -> str:
+        """What a node has said, with the names that its paths have on this machine."""
+        return as_here(text, folders) if self.containers else text
+
+    def launcher(
+        self,
+        options: Sequence[str],
+        placement: Mapping[str, Cores],
+        pythons: Mapping[str, Path],
+        guardian: Guardian | None = None,
+    ) -> Launcher:
+        """Starts nodes; ``options`` are those of the command ``node``.
+
+        ``pythons``: of nodes that run as a process on another one than this.
+        """
+        if self.containers:
+            from neuros.launch.docker.launcher import DockerLauncher
+
+            watch = guardian.watch_containers if guardian else None
+            return DockerLauncher(self.containers, options, watch, placement)
+        on_started = guardian.watch if guardian else None
+        if self.name == "in-process":
+            return InProcessLauncher([*_COMMAND, *options, "--in-memory"], on_started, placement)
+        return ProcessLauncher([*_COMMAND, *options], on_started, placement, pythons)
+
+
+def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> BackEnd:
+    """The back end for ``--backend``.
+
+    Raises:
+        EnvironmentFault: if containers are wanted, and the engine or an image is not there.
+    """
+    nodes = [node for node in project.nodes if node.name in names]
+    if wanted not in BACK_ENDS:  # argparse lets a default pass
+        raise UsageError(f"{BACK_END_VARIABLE}={wanted}: choose one of {', '.join(BACK_ENDS)}")
+    if wanted in ("docker", "auto"):
+        try:
+            containers = _containers(project, nodes)
+        except EnvironmentFault as fault:
+            if wanted == "docker":
+                raise
+            return BackEnd("process", (_why_not(fault), *_ignored(nodes)))
+        notices = tuple(("WARN", each.notice) for each in containers.images.values() if each.notice)
+        return BackEnd("docker", notices, containers)
+    return BackEnd(wanted, tuple(_ignored(nodes)))
+
+
+def _containers(project: Project, nodes: Sequence[Node]) -> Containers:
+    if find_spec("docker") is None:
+        raise EnvironmentFault("the Python package docker is not installed: run install.py")
+    from neuros.launch.docker.launcher import find_containers
+
+    return find_containers(dict.fromkeys(node.container for node in nodes), project.folder)
+
+
+def _why_not(fault: EnvironmentFault) -> tuple[str, str]:
+    """One line on why ``auto`` is not docker."""
+    reason, *others = str(fault).splitlines()
+    reason = reason.removesuffix(", or run without containers: --backend process")
+    more = f" (and {len(others)} more)" if others else ""
+    return "INFO", f"each node runs in a process, not in a container: {reason}{more}"
+
+
+def _ignored(nodes: Sequence[Node]) -> Sequence[tuple[str, str]]:
+    """One line on limits that nobody keeps."""
+    limited = [node.name for node in nodes if any(vars(node.resources).values())]
+    if not limited:
+        return ()
+    return [("INFO", f"resources of {', '.join(limited)}: only --backend docker keeps to them")]

@@ -1,0 +1,105 @@
+"""``neuros ps`` and ``neuros stop``: the runs of this user."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from datetime import datetime
+
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.launch.sessions import Session, sessions
+
+_SHOWN = 8  # digits of a run's id
+_AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
+_GIVE_UP_S = 30.0
+_POLL_S = 0.05
+
+
+def add_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add both commands to the parser."""
+    ps = commands.add_parser(
+        "ps",
+        help="show the runs of this user",
+        description="Show the nodes of all runs of this user on this machine.",
+    )
+    ps.set_defaults(command=_ps)
+    stop = commands.add_parser(
+        "stop",
+        help="stop a run, as Ctrl+C does",
+        description="Stop runs of this user, as Ctrl+C in their terminal does, and wait for it.",
+    )
+    stop.add_argument(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help="as `neuros ps` shows it (its first digits are enough), or a project; can be left out"
+        " where there is one run only",
+    )
+    stop.add_argument("--all", action="store_true", help="stop all runs of this user")
+    stop.set_defaults(command=_stop)
+
+
+def _ps(_: argparse.Namespace) -> int:
+    found = sessions()
+    if not found:
+        print("nothing is running")
+        return 0
+    from tabulate import tabulate
+
+    rows = [row for session in found for row in _rows(session)]
+    print(tabulate(rows, headers=["run", "project", "node", "back end", "since", "state"]))
+    return 0
+
+
+def _rows(session: Session) -> list[list[str]]:
+    since = datetime.fromtimestamp(session.since).strftime("%Y-%m-%d %H:%M:%S")
+    head = [session.run[:_SHOWN], session.project]
+    return [
+        [*head, node, session.backend, since, state] for node, state in session.states().items()
+    ]
+
+
+def _stop(options: argparse.Namespace) -> int:
+    chosen = _chosen(options.runs, sessions(), is_all=options.all)
+    if not chosen:
+        print("nothing is running")
+    for session in chosen:
+        session.interrupt()
+    _await_end(chosen)
+    for session in chosen:
+        print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
+    return 0
+
+
+def _chosen(names: Sequence[str], found: Sequence[Session], *, is_all: bool) -> Sequence[Session]:
+    if is_all or (not names and len(found) <= 1):
+        return found
+    shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in found)
+    if not names:
+        raise UsageError(f"several runs: name one of {shown}, or give --all")
+    for name in names:
+        if not any(_is_named(session, name) for session in found):
+            raise UsageError(f"no run of yours is called '{name}'; there are {shown or 'none'}")
+    return [session for session in found if any(_is_named(session, name) for name in names)]
+
+
+def _is_named(session: Session, name: str) -> bool:
+    return session.project == name or (bool(name) and session.run.startswith(name))
+
+
+def _await_end(chosen: Sequence[Session]) -> None:
+    """Until the guardians have gone, and with them all that they guard."""
+    begin_s = time.monotonic()
+    waiting, has_insisted = {session.run for session in chosen}, False
+    while waiting := waiting & {session.run for session in sessions()}:
+        waited_s = time.monotonic() - begin_s
+        if waited_s > _AGAIN_S and not has_insisted:
+            has_insisted = True
+            for session in chosen:
+                if session.run in waiting:
+                    session.interrupt()  # the second one kills at once
+        if waited_s > _GIVE_UP_S:
+            left = ", ".join(sorted(run[:_SHOWN] for run in waiting))
+            raise EnvironmentFault(f"not ended after {_GIVE_UP_S:g} s: {left}: see `neuros ps`")
+        time.sleep(_POLL_S)

@@ -1,0 +1,201 @@
+"""The Docker back end: one container per node."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from docker import DockerClient
+
+from neuros.errors import EnvironmentFault
+from neuros.launch.docker.container import RunningContainer
+from neuros.launch.docker.engine import connect, engine_faults
+from neuros.launch.docker.images import Image, images_for
+from neuros.launch.docker.settings import User, container_settings
+from neuros.launch.docker.watch import ContainerWatch
+from neuros.launch.host_command import log_file
+from neuros.launch.placement import Cores, on_cores
+from neuros.launch.run_processes import RUN_ID
+from neuros.project.model import NodeFile
+from neuros.project.resources import memory_text
+
+_MOST_AT_ONCE = 16
+
+
+@dataclass(frozen=True)
+class Containers:
+    """The engine, and the image of every container that nodes name."""
+
+    engine: DockerClient
+    images: Mapping[str, Image]
+
+
+def find_containers(names: Iterable[str], project_folder: Path | None) -> Containers:
+    """What containers of these names are started from.
+
+    Raises:
+        EnvironmentFault: if there is no engine, or an image is not there.
+    """
+    engine = connect()
+    try:
+        return Containers(engine, images_for(names, project_folder, engine))
+    except BaseException:
+        engine.close()
+        raise
+
+
+class DockerLauncher:
+    """Starts one container per node (:class:`neuros.ports.Launcher`).
+
+    Args:
+        options: of the command ``node``, as ``--debug``.
+        on_started: is told the socket of the engine before the first container is made there.
+        placement: the cores of each node, by name; the kernel places those that are not in it.
+    """
+
+    def __init__(
+        self,
+        containers: Containers,
+        options: Sequence[str] = (),
+        on_started: Callable[[str], None] | None = None,
+        placement: Mapping[str, Cores] = MappingProxyType({}),
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._engine = containers.engine
+        self._images = containers.images
+        self._options = tuple(options)
+        self._on_started = on_started
+        self._placement = placement
+        self._environ = environ
+
+    def start(
+        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+    ) -> Sequence[RunningContainer]:
+        """Start a container per node, side by side, all or none. Raises ``EnvironmentFault``."""
+        if self._on_started:
+            self._on_started(engine_socket(self._engine))
+        with engine_faults("the engine's events cannot be listened to"):
+            watch = ContainerWatch(self._engine, environment.get(RUN_ID, ""))
+        watch.start()
+        with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
+            work = [threads.submit(self._start_one, node, environment, watch) for node in nodes]
+        faults = [fault for each in work if (fault := each.exception())]
+        started = [each.result() for each in work if not each.exception()]
+        if not faults:
+            return started
+        watch.close()
+        for container in started:
+            container.kill()
+        others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
+        if others:
+            raise others[0]
+        raise EnvironmentFault("\n".join(dict.fromkeys(map(str, faults))))
+
+    def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
+        """One line per container."""
+        return [self._description(node) for node in nodes]
+
+    def _start_one(
+        self, file: NodeFile, environment: Mapping[str, str], watch: ContainerWatch
+    ) -> RunningContainer:
+        name, mem_bytes = file.node.name, file.node.resources.mem_bytes
+        with engine_faults(f"the container of node '{name}' cannot be started"):
+            container = self._engine.containers.create(**self._settings(file, environment))
+            container.start()
+        return RunningContainer(
+            name,
+            str(container.id),
+            self._engine,
+            watch,
+            log=log_file(file),
+            mem_bytes=mem_bytes,
+        )
+
+    def _settings(self, file: NodeFile, environment: Mapping[str, str]) -> dict[str, Any]:
+        return container_settings(
+            file,
+            self._images[file.node.container],
+            user_for(file, self._environ),
+            self._options,
+            environment,
+            cores=self._placement.get(file.node.name),
+            launcher_pid=os.getpid(),
+        )
+
+    def _description(self, file: NodeFile) -> str:
+        node, image = file.node, self._images[file.node.container]
+        command = shlex.join([*image.start, "-m", "neuros.cli", "node", *self._options])
+        facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
+        where = on_cores(self._placement.get(node.name))
+        return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
+
+
+def engine_socket(engine: DockerClient) -> str:
+    """The Unix socket of the engine.
+
+    Raises:
+        EnvironmentFault: if it is reached in another way. It may be on another machine then, where
+            the folders of the project and of the run are not.
+    """
+    path = getattr(engine.api.get_adapter(engine.api.base_url), "socket_path", None)
+    if path is None:
+        raise EnvironmentFault(
+            f"the Docker engine at {engine.api.base_url} may be on another machine: set"
+            " DOCKER_HOST to the socket of one on this machine (unix:///var/run/docker.sock)"
+        )
+    return str(path)
+
+
+def user_for(file: NodeFile, environ: Mapping[str, str]) -> User:
+    """The caller, as far as a node is let in to what belongs to the caller.
+
+    Raises:
+        EnvironmentFault: if a device of the node is not there.
+    """
+    groups = {_group_of(file, device) for device in file.node.access.devices}
+    key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
+    return User(
+        os.getuid(),
+        os.getgid(),
+        tuple(sorted(groups.intersection(os.getgroups()))),
+        environ,
+        key if file.node.access.display and key.is_file() else None,
+    )
+
+
+def _group_of(file: NodeFile, device: str) -> int:
+    try:
+        return os.stat(device).st_gid
+    except OSError as error:
+        raise EnvironmentFault(
+            f"node '{file.node.name}' asks for the device {device}: {error.strerror}: is it plugged"
+            f" in? Another one: --set nodes.{file.node.name}.devices='[\"/dev/...\"]'"
+        ) from error
+
+
+def _limits(file: NodeFile) -> list[str]:
+    resources = file.node.resources
+    facts = []
+    if resources.mem_bytes is not None:
+        facts.append(f"memory {memory_text(resources.mem_bytes)}")
+    if resources.cpus is not None:
+        facts.append(f"cpus {resources.cpus:g}")
+    if resources.pids is not None:
+        facts.append(f"pids {resources.pids}")
+    return facts
+
+
+def _openings(file: NodeFile) -> list[str]:
+    access = file.node.access
+    facts = [f"device {device}" for device in access.devices]
+    if access.gpus:
+        facts.append(f"gpus {' '.join(access.gpus)}")
+    if access.display:
+        facts.append("display")
+    return facts

@@ -1,0 +1,201 @@
+"""What the engine is told of a container: a pure function of the node, the image and the user.
+
+By default a container is locked down: the caller's user id and no capability, nothing gained by
+programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
+goes with it. It sees the project and the workspace, which it can read, and the run folder, which
+it can write.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import neuros
+from neuros.launch.docker.images import Image
+from neuros.launch.docker.layout import FOLDERS, LIBRARY, XAUTHORITY, inside
+from neuros.launch.host_command import (
+    DEFAULTS,
+    host_arguments,
+    log_file,
+    node_environment,
+    node_folder,
+)
+from neuros.launch.leftover_containers import RUN_LABEL
+from neuros.launch.placement import THREAD_VARIABLES, Cores, thread_limits
+from neuros.launch.run_processes import RUN_ID
+from neuros.project.model import NodeFile
+
+# Shared memory carries packets only between processes of one user that share both (docs/docker.md).
+NETWORK_MODE = "host"
+IPC_MODE = "host"
+
+MOST_PIDS = 4096
+"""Processes and threads of a node that sets no limit: what keeps a fork bomb to its container."""
+
+PASSED_ON = (
+    *("LANG", "LC_ALL", "TZ", *THREAD_VARIABLES),
+    *("MUJOCO_GL", "NEUROS_EXECUTOR", "RCUTILS_CONSOLE_OUTPUT_FORMAT", "ROS_STATIC_PEERS"),
+)
+"""What a container gets of the launcher's environment; the rest of it stays outside."""
+
+_X11 = "/tmp/.X11-unix"
+_TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
+# What the engine keeps (`docker logs`) says where the rest is: the node writes its log itself, so
+# that nothing passes through the engine, and nothing is lost when that or the launcher dies.
+_START = 'echo "the output of this node is in $1"; log=$0; shift; exec "$@" >>"$log" 2>&1'
+
+
+@dataclass(frozen=True)
+class User:
+    """Whose rights a container has, and what of the user's session it may be let in to.
+
+    Attributes:
+        groups: further groups, those that own the devices of nodes.
+        environ: the environment of the launcher.
+        xauthority: the file with the key to the display that it names.
+    """
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...] = ()
+    environ: Mapping[str, str] = field(default_factory=dict)
+    xauthority: Path | None = None
+
+    @property
+    def display(self) -> str:
+        """The X11 display, as in ``DISPLAY``; empty if there is none."""
+        return self.environ.get("DISPLAY", "")
+
+
+def container_settings(
+    file: NodeFile,
+    image: Image,
+    user: User,
+    options: Sequence[str],
+    environment: Mapping[str, str],
+    *,
+    cores: Cores | None = None,
+    launcher_pid: int = 0,
+) -> dict[str, Any]:
+    """The arguments of ``docker.containers.create`` for a node.
+
+    Args:
+        file: the node with the paths of this machine.
+        options: of the command ``node``, as ``--debug``.
+        environment: what the run adds to that of each node.
+        launcher_pid: said in a label.
+    """
+    node, resources = file.node, file.node.resources
+    run_id = environment.get(RUN_ID, "")
+    settings: dict[str, Any] = {
+        "image": image.id,
+        "name": container_name(file, run_id),
+        "entrypoint": start_command(file, image, options),
+        "command": [],
+        "environment": _environment(file, user, environment, cores),
+        "working_dir": str(FOLDERS.run),
+        "labels": _labels(file, run_id, launcher_pid),
+        "mounts": _mounts(file, user),
+        "user": f"{user.uid}:{user.gid}",
+        "group_add": [str(group) for group in user.groups],
+        "cap_drop": ["ALL"],
+        "security_opt": ["no-new-privileges"],
+        "read_only": True,
+        "tmpfs": {"/tmp": _TMP},
+        "init": True,
+        "network_mode": NETWORK_MODE,
+        "ipc_mode": IPC_MODE,
+        "pids_limit": resources.pids or MOST_PIDS,
+        "auto_remove": True,
+    }
+    if resources.mem_bytes is not None:
+        # Without swap: a node that pages is no better than one that has ended, and does not say so.
+        settings |= {"mem_limit": resources.mem_bytes, "memswap_limit": resources.mem_bytes}
+    if resources.cpus is not None:
+        settings["nano_cpus"] = int(resources.cpus * 1e9)
+    if cores:
+        settings["cpuset_cpus"] = ",".join(map(str, cores))
+    if node.access.devices:
+        settings["devices"] = [f"{device}:{device}:rw" for device in node.access.devices]
+    if node.access.gpus:
+        settings["device_requests"] = [_gpu_request(node.access.gpus)]
+    return settings
+
+
+def container_name(file: NodeFile, run_id: str) -> str:
+    """What a container is called: unique, and to be recognised in ``docker ps``."""
+    return f"neuros-{file.node.name}-{run_id[:8]}"
+
+
+def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
+    """What a container executes, whatever the image would execute by itself."""
+    seen = inside(file)
+    command = [*image.start, "-m", "neuros.cli", "node", *options]
+    return [
+        *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
+        *host_arguments(command, [seen]),
+    ]
+
+
+def _environment(
+    file: NodeFile, user: User, added: Mapping[str, str], cores: Cores | None
+) -> dict[str, str]:
+    environment = {
+        **DEFAULTS,
+        **{key: user.environ[key] for key in PASSED_ON if key in user.environ},
+        "HOME": "/tmp",
+        "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
+        **(thread_limits([file.node]) if cores else {}),
+        **node_environment(inside(file)),
+        **added,
+        "PYTHONPATH": str(LIBRARY),
+        "ROS_LOG_DIR": str(FOLDERS.run),
+    }
+    if file.node.access.display and user.display:
+        environment["DISPLAY"] = user.display
+        if "NEUROS_GUI" in user.environ:
+            environment.setdefault("NEUROS_GUI", user.environ["NEUROS_GUI"])
+        if user.xauthority:
+            environment["XAUTHORITY"] = str(XAUTHORITY)
+    return environment
+
+
+def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
+    return {
+        RUN_LABEL: run_id,
+        "neuros.node": file.node.name,
+        "neuros.project": str(file.folders.project),
+        "neuros.run_folder": str(file.folders.run),
+        "neuros.launcher": str(launcher_pid),
+    }
+
+
+def _mounts(file: NodeFile, user: User) -> list[dict[str, Any]]:
+    package = Path(neuros.__file__).resolve().parent
+    own = node_folder(file) / "node.json"
+    mounts = [
+        _mount(package, LIBRARY / package.name),
+        _mount(file.folders.project, FOLDERS.project),
+        _mount(file.folders.run, FOLDERS.run, read_only=False),
+        # In a folder that it may write to; but what it was told stays as it was.
+        _mount(own, node_folder(inside(file)) / own.name),
+    ]
+    if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
+        mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))
+    if file.node.access.display and user.display:
+        mounts.append(_mount(Path(_X11), Path(_X11)))
+        if user.xauthority:
+            mounts.append(_mount(user.xauthority, XAUTHORITY))
+    return mounts
+
+
+def _mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
+    return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
+
+
+def _gpu_request(gpus: Sequence[str]) -> dict[str, Any]:
+    chosen = {"count": -1} if tuple(gpus) == ("all",) else {"device_ids": list(gpus)}
+    return {**chosen, "capabilities": [["gpu"]]}

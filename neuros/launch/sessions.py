@@ -1,0 +1,87 @@
+"""The runs of this user on this machine, on whatever back end.
+
+Each run has a guardian from before its first process until after its last: where a guardian is,
+there is a run. So nothing is written down that could be out of date; what the guardian guards
+stands in its environment, which only its user can read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+
+from neuros.launch.run_processes import RunProcesses, environ_of, started_at
+
+_VARIABLE = "NEUROS_GUARDED_RUN"
+
+
+@dataclass(frozen=True)
+class Session:
+    """A run, as its launcher described it.
+
+    Attributes:
+        run: its id.
+        folder: the run folder.
+        since: Unix time, in seconds.
+        launcher: process id, and when that process started (clock ticks since boot): later
+            processes may have the same number.
+    """
+
+    run: str
+    project: str
+    backend: str
+    nodes: tuple[str, ...]
+    folder: str
+    since: float
+    launcher: tuple[int, int]
+
+    @property
+    def is_led(self) -> bool:
+        """Whether its launcher is there; if not, the guardian is about to end it."""
+        pid, start = self.launcher
+        return started_at(pid) == start
+
+    def states(self) -> Mapping[str, str]:
+        """How each node is: running, ending (its launcher has gone), or not running."""
+        processes = RunProcesses(self.run)
+        there = set(processes.nodes().values())
+        if self.backend == "in-process" and processes.alive():
+            there = set(self.nodes)
+        up = "running" if self.is_led else "ending"
+        return {node: up if node in there else "not running" for node in self.nodes}
+
+    def interrupt(self) -> None:
+        """Ask its launcher to end it, as Ctrl+C does."""
+        if self.is_led:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.launcher[0], signal.SIGINT)
+
+
+def guardian_environment(session: Session) -> dict[str, str]:
+    """What makes a guardian known as that of a run."""
+    return {_VARIABLE: json.dumps(asdict(session))}
+
+
+def this_process() -> tuple[int, int]:
+    """The number of this process, and when it started."""
+    return os.getpid(), started_at(os.getpid()) or 0
+
+
+def sessions() -> list[Session]:
+    """All runs of this user, oldest first."""
+    return sorted(_found(), key=lambda session: session.since)
+
+
+def _found() -> Iterator[Session]:
+    mark = f"{_VARIABLE}=".encode()
+    for name in filter(str.isdigit, os.listdir("/proc")):
+        for variable in environ_of(int(name)):
+            if variable.startswith(mark):
+                fields = json.loads(variable.removeprefix(mark))
+                fields["nodes"] = tuple(fields["nodes"])
+                fields["launcher"] = tuple(fields["launcher"])
+                yield Session(**fields)

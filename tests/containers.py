@@ -1,0 +1,83 @@
+"""Tests in containers: what they need, and that they leave nothing.
+
+Without an engine, or without NeuROS's images in it, they are skipped and say why. On a machine for
+continuous integration (``CI`` is set) that is a failure: there they have to run.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import pytest
+from docker import DockerClient
+
+from neuros.errors import EnvironmentFault
+from neuros.launch.docker.engine import connect
+from neuros.launch.docker.images import images_for
+
+IMAGES = ("neuros_python", "neuros_mujoco", "neuros_nest")
+
+
+def require_containers(*names: str) -> None:
+    """Skip the test, or let it fail, where containers of these names cannot be started."""
+    reason = _why_not(names or IMAGES[:1])
+    if reason and os.environ.get("CI"):
+        pytest.fail(reason)
+    if reason:
+        pytest.skip(reason)
+
+
+@cache
+def _why_not(names: tuple[str, ...]) -> str:
+    try:
+        with connected() as engine:
+            images_for(names, None, engine)
+    except EnvironmentFault as fault:
+        return str(fault)
+    return ""
+
+
+@contextmanager
+def connected() -> Iterator[DockerClient]:
+    """The engine."""
+    engine = connect()
+    try:
+        yield engine
+    finally:
+        engine.close()
+
+
+def wait_until(condition: Callable[[], object], deadline_s: float = 10.0) -> float:
+    """Until it holds; returns how long that took, in seconds, and fails after the deadline."""
+    start_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start_s < deadline_s, "deadline passed"
+        time.sleep(0.02)
+    return time.monotonic() - start_s
+
+
+@contextmanager
+def nothing_left(folder: Path) -> Iterator[DockerClient]:
+    """The engine; afterwards no container of a run below ``folder``, and no new volume, is there.
+
+    Other runs on this machine, and their containers, do not matter.
+    """
+
+    def things() -> set[str]:
+        volumes = engine.api.volumes()["Volumes"] or []
+        containers = engine.api.containers(all=True, filters={"label": "neuros.run_folder"})
+        return {volume["Name"] for volume in volumes} | {
+            f"{container['Names'][0]} ({container['Status']})"
+            for container in containers
+            if Path(container["Labels"]["neuros.run_folder"]).is_relative_to(folder)
+        }
+
+    with connected() as engine:
+        before = things()
+        yield engine
+        wait_until(lambda: not things() - before)

@@ -1,0 +1,325 @@
+"""Runs in containers, as a user starts them: what a node may and sees there, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from container_bench import (
+    GONE_WITHIN_S,
+    HOLDS_THE_GIL,
+    RUNS,
+    ContainerBench,
+    container_bench,
+)
+from engine_proxy import EngineProxy
+from launching import Finished, Running, launch
+
+from containers import require_containers, wait_until
+from neuros.launch.docker.engine import connect
+from neuros.launch.docker.launcher import engine_socket
+
+LOOKS = """
+@neuros_initialise()
+def look(node):
+    status = pathlib.Path("/proc/self/status").read_text()
+    facts = dict(line.split(":", 1) for line in status.splitlines())
+    def writes(path):
+        try:
+            pathlib.Path(path).touch()
+        except OSError as error:
+            return error.strerror
+        return "yes"
+    seen = {
+        "user": [os.getuid(), os.getgid()],
+        "capabilities": [int(facts[key], 16) for key in ("CapEff", "CapPrm", "CapBnd")],
+        "no new privileges": facts["NoNewPrivs"].strip(),
+        "writes": {p: writes(p) for p in ("/x", "/neuros/project/x", "/neuros/workspace/x",
+                                          str(node.run_dir / "node.json"), "/tmp/x",
+                                          str(node.run_dir / "x"), "x")},
+        "engine": os.path.exists("/var/run/docker.sock"),
+        "environment": dict(os.environ),
+        "folder": os.getcwd(),
+        "cores": sorted(os.sched_getaffinity(0)),
+        "file": os.environ["FILE"] and open(os.environ["FILE"]).read(),
+        "device": os.path.exists("/dev/net/tun"),
+        "init": open("/proc/1/cmdline").read(),
+    }
+    (node.run_dir / "seen.json").write_text(json.dumps(seen))
+    node.shutdown("seen")
+"""
+NEEDS_MEMORY = """
+@neuros_tick(seconds=0.1)
+def grow(node):
+    node.set_user_data(bytearray(400 << 20))
+"""
+WRITES = """
+@neuros_tick(seconds=0.1)
+def write(node):
+    open("/usr/log", "w")
+"""
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[ContainerBench]:
+    require_containers()
+    with container_bench(tmp_path) as bench:
+        yield bench
+
+
+def last_line(finished: Finished) -> str:
+    return finished.said("neuros")[-1]
+
+
+# ------------------------------------------------------------------ what a node may
+
+
+def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bench.folder / "file").write_text("hello")
+    bench.project(
+        {"a": LOOKS},
+        a={
+            "environment": {"FILE": "#file", "MINE": 1},
+            "affinity": [min(os.sched_getaffinity(0))],
+            "resources": {"memory": "300m", "cpus": 0.5, "pids": 100},
+        },
+    )
+    monkeypatch.setenv("SECRET_OF_THE_USER", "1")
+    monkeypatch.setenv("LANG", "C.UTF-8")
+    finished = bench.launch()
+    assert finished.exit_code == 0, finished.output
+    assert finished.run_folder is not None
+    seen = json.loads((finished.run_folder / "a/seen.json").read_text())
+    assert seen["user"] == [os.getuid(), os.getgid()]
+    assert seen["capabilities"] == [0, 0, 0]
+    assert seen["no new privileges"] == "1"
+    refused = {path for path, answer in seen["writes"].items() if answer != "yes"}
+    assert refused == {
+        "/x",
+        "/neuros/project/x",
+        "/neuros/workspace/x",
+        "/neuros/run/a/node.json",
+    }
+    assert (finished.run_folder / "x").exists(), "the current folder is the run folder"
+    assert seen["folder"] == "/neuros/run"
+    assert not seen["engine"]
+    environment = seen["environment"]
+    assert "SECRET_OF_THE_USER" not in environment
+    assert environment["LANG"] == "C.UTF-8"
+    assert environment["MINE"] == "1"
+    assert environment["FILE"] == "/neuros/project/file"
+    assert seen["file"] == "hello"
+    assert seen["cores"] == [min(os.sched_getaffinity(0))]
+    assert not seen["device"]
+    assert "init" in seen["init"]
+
+
+def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
+    if not Path("/dev/net/tun").exists():
+        pytest.skip("there is no device here to let a container in to")
+    bench.project({"a": LOOKS}, a={"devices": ["/dev/net/tun"], "environment": {"FILE": ""}})
+    finished = bench.launch()
+    assert finished.run_folder is not None, finished.output
+    assert json.loads((finished.run_folder / "a/seen.json").read_text())["device"]
+
+
+def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
+    script = bench.folder / "before"
+    script.write_text("#!/usr/bin/env python3\nprint('a script in Python')\n")
+    script.chmod(0o755)
+    bench.project({"a": LOOKS}, a={"script": "before", "environment": {"FILE": ""}})
+    finished = bench.launch()
+    assert finished.exit_code == 0, finished.output
+    assert "a script in Python" in finished.output
+
+
+# ------------------------------------------------------------------ how it ends
+
+
+def test_a_node_that_needs_too_much_memory_is_named_with_its_limit(bench: ContainerBench) -> None:
+    bench.project({"a": NEEDS_MEMORY, "b": RUNS}, a={"resources": {"memory": "200m"}})
+    finished = bench.launch()
+    assert finished.exit_code == 1, finished.output
+    assert re.fullmatch(r"node 'a' .*: out of memory \(limit 200m\)", last_line(finished))
+
+
+def test_what_a_node_may_not_write_is_named_as_it_is_called_here(bench: ContainerBench) -> None:
+    bench.project({"a": WRITES})
+    finished = bench.launch()
+    assert finished.exit_code == 1, finished.output
+    assert "Read-only file system: '/usr/log'" in last_line(finished)
+    assert str(bench.folder / "a.py") in finished.output
+    assert finished.record["reason"] == last_line(finished)
+
+
+def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    bench.kill(running, "a", signal.SIGKILL)
+    finished = running.finish(10.0)
+    assert finished.exit_code == 1
+    assert last_line(finished) == "node 'a' ended unexpectedly: killed by SIGKILL"
+    assert bench.has_saved("b")
+
+
+def test_ctrl_c_ends_all_properly(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    running.signal(signal.SIGINT)
+    finished = running.finish(10.0)
+    assert finished.exit_code == 130
+    assert bench.has_saved("a", "b")
+    assert bench.left() == []
+
+
+def test_nodes_that_cannot_end_are_killed(bench: ContainerBench) -> None:
+    bench.project({"a": HOLDS_THE_GIL, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    running.signal(signal.SIGINT)
+    finished = running.finish(15.0)
+    assert "'a': not ended after 5 s, killed" in finished.output
+    assert finished.exit_code == 130
+    assert bench.has_saved("b")
+
+
+@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
+def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
+    bench: ContainerBench, plugin: str
+) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+    assert bench.has_saved("b") or bench.has_saved("a", "b")
+
+
+def test_also_when_it_is_killed_while_it_starts_them(bench: ContainerBench) -> None:
+    bench.project(dict.fromkeys("abcd", RUNS))
+    running = bench.start()
+    running.wait_for("run folder", 15.0)
+    wait_until(lambda: bench.left())
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+
+
+def test_when_the_engine_goes_away_the_run_ends_and_says_so(
+    bench: ContainerBench, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    engine = connect()
+    try:
+        real = engine_socket(engine)
+    finally:
+        engine.close()
+    bench.project({"a": RUNS, "b": RUNS})
+    with EngineProxy(real) as proxy:
+        running = bench.start(DOCKER_HOST=f"unix://{proxy.path}")
+        for node in ("a", "b"):
+            running.wait_for(f"[{node}]: running", 30.0)
+        proxy.close()
+        finished = running.finish(20.0)
+    assert finished.exit_code == 1
+    assert re.fullmatch(r"node '.' ended .*: the Docker engine went away .*", last_line(finished))
+    assert bench.has_saved("a", "b")
+
+
+def test_two_runs_at_once_do_not_meet(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    pair = [bench.start("--duration", "1"), bench.start("--duration", "1")]
+    finished = [running.finish(30.0) for running in pair]
+    assert [each.exit_code for each in finished] == [0, 0], finished
+    records = [json.loads(file.read_text()) for file in bench.folder.rglob("run.json")]
+    assert len({record["domain_id"] for record in records}) == 2
+
+
+# ------------------------------------------------------------------ what cannot be started
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"container": "no_such_image"}, "no_such_image"),
+        ({"resources": {"cpus": 4096}}, "node 'a' cannot be started: .*CPUs"),
+        ({"devices": ["/dev/no_such_thing"]}, "node 'a' asks for the device /dev/no_such_thing"),
+    ],
+    ids=["image", "cpus", "device"],
+)
+def test_what_is_not_there_is_said_in_one_sentence(
+    bench: ContainerBench, keys: dict[str, object], sentence: str
+) -> None:
+    bench.project({"a": RUNS, "b": RUNS}, a=keys)
+    finished = bench.launch()
+    assert finished.exit_code == 4, finished.output
+    (line,) = [line for line in finished.output.splitlines() if line.startswith("neuros: ")]
+    assert re.search(sentence, line)
+    assert "Traceback" not in finished.output
+    assert bench.left() == []
+
+
+def test_without_an_engine_auto_is_process_and_says_why(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS})
+    nowhere = {"DOCKER_HOST": f"unix://{bench.folder}/no.sock"}
+    finished = launch(
+        bench.folder, "--backend", "auto", "--duration", "0.2", cwd=bench.folder, **nowhere
+    )
+    assert finished.exit_code == 0, finished.output
+    assert finished.record["backend"] == "process"
+    (why,) = [text for text in finished.said("neuros") if "not in a container" in text]
+    assert "no Docker engine answers" in why
+    refused = launch(bench.folder, "--backend", "docker", cwd=bench.folder, **nowhere)
+    assert refused.exit_code == 4
+    assert "no Docker engine answers" in refused.output
+
+
+def test_with_an_engine_and_the_images_auto_is_docker(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS})
+    finished = launch(
+        bench.folder, "--backend", "auto", "--duration", "0.2", cwd=bench.folder, timeout_s=30.0
+    )
+    assert finished.exit_code == 0, finished.output
+    assert finished.record["backend"] == "docker"
+
+
+# ------------------------------------------------------------------ sessions
+
+
+def test_ps_shows_a_run_and_stop_ends_it(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    run = bench.session(running).run
+    rows = [line.split() for line in neuros("ps").splitlines() if line.startswith(run[:8])]
+    assert [(row[2], row[3], row[-1]) for row in rows] == [
+        ("a", "docker", "running"),
+        ("b", "docker", "running"),
+    ]
+    (container,) = bench.engine.containers.list(
+        filters={"label": [f"neuros.run={run}", "neuros.node=a"]}
+    )
+    assert container.labels["neuros.project"] == str(bench.folder)
+    assert f"stopped {run[:8]}" in neuros("stop", run[:8])
+    finished = finish_stopped(running)
+    assert finished.exit_code == 130
+    assert bench.has_saved("a", "b")
+
+
+def neuros(*arguments: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-m", "neuros.cli", *arguments],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=30.0,
+    ).stdout
+
+
+def finish_stopped(running: Running) -> Finished:
+    """It has ended already, as `stop` waits for that."""
+    return running.finish(3.0)

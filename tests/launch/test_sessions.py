@@ -1,0 +1,122 @@
+"""`neuros ps` and `neuros stop`: runs are seen by their guardians."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from launching import Running, start
+
+from neuros.launch.guardian import Guardian
+from neuros.launch.sessions import Session, guardian_environment, sessions, this_process
+
+PLUGIN = """
+from neuros.hooks import neuros_tick
+@neuros_tick(seconds=0.1)
+def beat(node):
+    if not node.get_user_data():
+        node.set_user_data("beating")
+        node.get_logger().info("running")
+"""
+PROJECT = """
+{"nodes": [{"name": "a", "container": "neuros_python", "plugin": "plugin.py"},
+           {"name": "b", "container": "neuros_python", "plugin": "plugin.py"}],
+ "connections": []}
+"""
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    """A run of this process, that has a guardian and nothing else."""
+    session = Session(
+        *(secrets.token_hex(8), "demo", "process", ("a",), "/runs/1", time.time(), this_process())
+    )
+    guardian = Guardian.start(session.run, None, guardian_environment(session))
+    yield session
+    guardian.finish()
+    assert session not in sessions()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo/plugin.py").write_text(PLUGIN)
+    (tmp_path / "demo/project.json").write_text(PROJECT)
+    return tmp_path
+
+
+def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "neuros.cli", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30.0,
+        check=False,
+    )
+
+
+def run_of(running: Running) -> Session:
+    return next(each for each in sessions() if each.launcher[0] == running.process.pid)
+
+
+def test_a_run_is_there_as_long_as_its_guardian(session: Session) -> None:
+    assert session in sessions()
+    assert session.is_led
+    assert session.states() == {"a": "not running"}
+
+
+def test_another_process_with_the_number_of_the_launcher_is_not_the_launcher() -> None:
+    stale = Session("1", "demo", "process", (), "/runs/1", 0.0, (os.getpid(), 1))
+    assert not stale.is_led
+    stale.interrupt()  # and it does not interrupt this test
+
+
+@pytest.mark.parametrize("back_end", ["process", "in-process"])
+def test_ps_shows_the_nodes_and_stop_ends_them_as_ctrl_c_does(folder: Path, back_end: str) -> None:
+    with start(folder / "demo", "--backend", back_end, cwd=folder) as running:
+        running.wait_for("[b]: running", 30.0)
+        run = run_of(running).run
+        shown = [line.split() for line in neuros("ps").stdout.splitlines()]
+        rows = [row for row in shown if row[0] == run[:8]]
+        assert [(row[1], row[2], row[3], row[-1]) for row in rows] == [
+            ("demo", "a", back_end, "running"),
+            ("demo", "b", back_end, "running"),
+        ]
+        stopped = neuros("stop", run[:8])
+        assert stopped.returncode == 0
+        assert stopped.stdout.startswith(f"stopped {run[:8]} (demo); run folder {folder}")
+        finished = running.finish(3.0)
+    assert finished.exit_code == 130
+    assert "ended by Ctrl+C" in finished.output
+
+
+def test_a_run_whose_launcher_was_killed_is_ending_until_nothing_is_left(folder: Path) -> None:
+    holding = PLUGIN.replace('"running")', '"running")\n        ctypes.PyDLL(None).sleep(60)')
+    (folder / "demo/plugin.py").write_text("import ctypes\n" + holding)
+    with start(folder / "demo", "--backend", "process", cwd=folder) as running:
+        for node in ("a", "b"):
+            running.wait_for(f"[{node}]: running", 30.0)
+        session = run_of(running)
+        assert session.states() == {"a": "running", "b": "running"}
+        running.signal(signal.SIGKILL)
+        running.process.wait()
+        assert session.states() == {"a": "ending", "b": "ending"}
+        deadline_s = time.monotonic() + 15.0
+        while session in sessions():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+    assert set(session.states().values()) == {"not running"}
+
+
+def test_a_run_that_is_not_there_is_wrong_usage(session: Session) -> None:
+    refused = neuros("stop", "nonsense")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("neuros: no run of yours is called 'nonsense'; there are ")
+    assert f"{session.run[:8]} (demo)" in refused.stderr
