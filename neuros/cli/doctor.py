@@ -40,10 +40,17 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _findings(*, proves: bool) -> Iterator[Finding]:
+    from neuros.cli.containers import STANDARD
+    from neuros.doctor.containers import look_at_containers
     from neuros.doctor.delivery import prove_delivery
     from neuros.doctor.machine import look_at_machine
 
     yield from look_at_machine(os.environ)
-    if proves:
-        yield prove_delivery("process")
-        yield prove_delivery("in-process")
+    has_base = False
+    for finding in look_at_containers(STANDARD, os.environ):
+        has_base |= finding.state is State.GOOD and finding.text.startswith("neuros_python:")
+        yield finding
+    if not proves:
+        return
+    for backend in ("in-process", "process", *(["docker"] if has_base else [])):
+        yield prove_delivery(backend)

@@ -1,0 +1,32 @@
+"""The doctor, where there is an engine: versions, images, and packets between two containers."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from containers import require_containers
+from neuros.doctor.containers import look_at_containers
+from neuros.doctor.delivery import prove_delivery
+from neuros.doctor.findings import State
+
+
+@pytest.fixture(autouse=True)
+def _with_containers() -> None:
+    require_containers()
+
+
+def test_engine_and_images_are_named_with_their_versions() -> None:
+    engine, image, missing = look_at_containers(["neuros_python", "no_such_image"], os.environ)
+    assert engine.state is image.state is State.GOOD
+    assert engine.text.startswith("engine ")
+    assert image.text.startswith("neuros_python:")
+    assert missing.state is State.ABSENT
+    assert "'no_such_image'" in missing.text
+
+
+def test_images_pass_from_container_to_container() -> None:
+    finding = prove_delivery("docker")
+    assert finding.state is State.GOOD, finding
+    assert "docker: packets arrived: 20 of 20 on camera.image -> eye.image" in finding.text
