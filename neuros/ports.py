@@ -7,6 +7,7 @@ supervisor use it (floor 5), the command line picks it (floor 6).
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -63,6 +64,13 @@ class Transport(Protocol):
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender that every taker has started on the packets up to ``position``."""
+
+    @property
+    def digests(self) -> Mapping[Connection, array[int]]:
+        """By connection, a digest of every packet sent or received on it, in that order.
+
+        Whoever reads them takes them away. Connections of which none are kept are left out.
+        """
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""

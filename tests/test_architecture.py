@@ -74,13 +74,13 @@ MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
 # What is not named here has none; a part of a room may have less than the room.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
-    "transport": {"rclpy", "rpyutils"} | MESSAGES,
+    "transport": {"rclpy", "rpyutils", "xxhash"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "launch.docker": {"docker", "requests"},
     "launch.environments.requirements": {"packaging"},
     "cli.sessions": {"tabulate"},
-    "observe": {"rosbags", "psutil", "matplotlib", "tabulate"},
+    "observe": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
     "testing": {"pytest", "hypothesis"},
 }
 # The core is pure: no threads, no wall clock, no files.

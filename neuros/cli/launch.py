@@ -98,14 +98,14 @@ class _Run:
             raise
         finally:
             observed, faults = observation.finish()
-            for fault in faults:
+            for fault in (*outcome.faults, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
-            record = run_record(self._plan.project, self._files, outcome, wall_s)
+            record = run_record(self._plan.project, self._files, outcome, wall_s, self._run_folder)
             record |= {
                 "backend": self._plan.backend,
                 "domain_id": self._domain.id,

@@ -28,6 +28,7 @@ from neuros.cli.containers import add_containers
 from neuros.cli.doctor import add_doctor
 from neuros.cli.observation import add_observation
 from neuros.cli.sessions import add_sessions
+from neuros.cli.verify import add_verify
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -97,6 +98,7 @@ def parser() -> argparse.ArgumentParser:
     add_containers(commands)
     add_sessions(commands)
     add_benchmark(commands)
+    add_verify(commands)
     _add_node(commands)
     return result
 
@@ -188,6 +190,7 @@ def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     node.add_argument("node_files", nargs="+")
     node.add_argument("--in-memory", action="store_true")
     node.add_argument("--duration-sim", type=float)
+    node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
     node.set_defaults(command=_node)
 

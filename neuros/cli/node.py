@@ -32,7 +32,13 @@ def run_node(options: argparse.Namespace) -> int:
     ) -> Middleware:
         from neuros.transport.ros_process import RosProcess
 
-        middleware = RosProcess(files, on_failure, in_memory=options.in_memory, debug=options.debug)
+        middleware = RosProcess(
+            files,
+            on_failure,
+            in_memory=options.in_memory,
+            digests=options.digests,
+            debug=options.debug,
+        )
         leave.has_leftovers = lambda: middleware.has_leftovers
         return middleware
 

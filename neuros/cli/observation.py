@@ -31,6 +31,13 @@ def add_observation(launch: argparse.ArgumentParser) -> None:
         " system_load.csv in the run folder, once per second",
     )
 
+    launch.add_argument(
+        "--digests",
+        action="store_true",
+        help="also in process, keep a digest of every packet for `neuros verify`; each packet is"
+        " serialised for it there (on the other back ends digests are always kept)",
+    )
+
 
 def check_observation(options: argparse.Namespace) -> None:
     """Whether what is asked for is installed. Raises ``EnvironmentFault``."""

@@ -44,6 +44,7 @@ class Plan:
     is_verbose: bool
     is_placed: bool = True
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
+    has_digests: bool = False
 
     @property
     def backend(self) -> str:
@@ -89,6 +90,8 @@ class Plan:
             options += ["--duration-sim", repr(self.duration.sim_s)]
         if self.is_verbose:
             options.append("--debug")
+        if self.has_digests and self.backend == "in-process":  # elsewhere they are always kept
+            options.append("--digests")
         return self.back_end.launcher(
             options, self.placement(domain_id), self.pythons.paths, guardian
         )
@@ -108,7 +111,16 @@ def make_plan(options: argparse.Namespace) -> Plan:
     nodes = [project.node(name) for name in names]
     is_process = back_end.name == "process"
     pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
-    plan = Plan(project, names, back_end, duration, options.verbose, is_placed, pythons)
+    plan = Plan(
+        project,
+        names,
+        back_end,
+        duration,
+        options.verbose,
+        is_placed,
+        pythons,
+        has_digests=options.digests,
+    )
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)

@@ -265,7 +265,7 @@ class Engine:
             if isinstance(hook, Source):
                 result: Any = hook.take()
             else:
-                result = self._effects.call(hook, self._exchange.take(hook))
+                result = self._effects.call(hook, self._exchange.take(hook, start_ns))
         finally:
             self.executing = None
             end_ns = self._clock()
@@ -273,7 +273,7 @@ class Engine:
             hook.busy_ns += end_ns - start_ns
             self.since_ns = end_ns
         for output, packet in hook.packets_of(result):
-            self._exchange.send(output, packet)
+            self._exchange.send(output, packet, self.since_ns)
         if isinstance(hook, Source):
             hook.accept()
         elif hook.spec.kind is HookKind.INITIALISE:

@@ -42,11 +42,12 @@ class Exchange:
         if not inlet.mailboxes:
             self._acknowledge(inlet)
 
-    def take(self, hook: Hook) -> list[Any]:
+    def take(self, hook: Hook, now_ns: int) -> list[Any]:
         """The arguments of a hook that starts now; their senders are told."""
         touched: list[Inlet] = []
         arguments = [slot.take(touched) for slot in hook.slots]
         for inlet in touched:
+            inlet.taken_ns.append(now_ns)
             self._acknowledge(inlet)
         return arguments
 
@@ -57,13 +58,13 @@ class Exchange:
                 mailbox.inlet.remove(mailbox)
                 self._acknowledge(mailbox.inlet)
 
-    def send(self, output: Output, packet: Any) -> None:
-        """Send a packet on all connections of an output, or on its external topic."""
+    def send(self, output: Output, packet: Any, now_ns: int) -> None:
+        """Send a packet now on all connections of an output, or on its external topic."""
         if output.port.external_topic is not None:
             self._effects.send_external(output.port, packet)
             return
         for outlet in output.outlets:
-            outlet.spend()
+            outlet.spend(now_ns)
         for connection in output.to_itself:
             self._send_to_itself(connection, packet)
         if output.elsewhere:

@@ -11,6 +11,7 @@ not a mere "one more", it is cumulative; a repeated or late one does no harm.
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
 from neuros.core.accounting import Rest, State
@@ -27,6 +28,7 @@ class Outlet:
     Attributes:
         is_blocked: whether nothing may be sent on it now.
         is_registered: whether its receiver is known to be there.
+        sent_ns: when each packet was sent, until somebody takes the times away.
         hooks: those with this outlet among their outputs; each counts its blocked outlets.
     """
 
@@ -40,6 +42,7 @@ class Outlet:
         "is_reliable",
         "rest",
         "sent",
+        "sent_ns",
         "window",
     )
 
@@ -51,6 +54,7 @@ class Outlet:
         self.is_registered = False
         self.is_blocked = False
         self.sent = 0
+        self.sent_ns = array("q")
         self.acknowledged = 0
         self.acknowledged_ns: int | None = None
         self.hooks: list[Hook] = []
@@ -60,9 +64,10 @@ class Outlet:
         """Packets sent and not acknowledged yet; 0 where nobody acknowledges."""
         return self.sent - self.acknowledged if self.is_reliable else 0
 
-    def spend(self) -> None:
+    def spend(self, now_ns: int) -> None:
         """Count a packet that is sent now."""
         self.sent += 1
+        self.sent_ns.append(now_ns)
         if (
             self.is_reliable
             and self.sent - self.acknowledged >= self.window

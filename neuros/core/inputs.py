@@ -8,6 +8,7 @@ input is fed by several connections.
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +52,10 @@ class Inlet:
         capacity: unread packets per mailbox.
         is_lossless: whether a full mailbox is a fault of the sender rather than a discard.
         is_acknowledged: whether the sender waits for acknowledgements.
+
+    Attributes:
+        taken, taken_ns: the position of each packet that a hook has started on, and when that was,
+            until somebody takes these away.
     """
 
     __slots__ = (
@@ -68,6 +73,8 @@ class Inlet:
         "received",
         "settled",
         "skipped",
+        "taken",
+        "taken_ns",
     )
 
     def __init__(
@@ -94,6 +101,8 @@ class Inlet:
         self.acknowledged = 0
         self.settled = 0
         self.skipped: set[int] = set()
+        self.taken = array("q")
+        self.taken_ns = array("q")
 
     @property
     def is_external(self) -> bool:
@@ -130,6 +139,7 @@ class Inlet:
         if not mailbox.packets:
             mailbox.slot.on_emptied()
         mailbox.position = mailbox.passed = position
+        self.taken.append(position)
         mailbox.discards_in_a_row = 0
         if len(self.mailboxes) == 1:
             self.settled = position

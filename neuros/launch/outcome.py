@@ -40,6 +40,7 @@ class Outcome:
         ending_s: when the end was asked for first: what comes after is draining and finalising.
         ended_s: when all processes had ended.
         is_signalled: whether the user has asked for the end by a signal, be it after another cause.
+        faults: what could not be recorded, though the run went on.
         failures: one line for each, in the order in which they became known.
     """
 
@@ -52,12 +53,15 @@ class Outcome:
     ending_s: float | None = None
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
     is_signalled: bool = False
 
     def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
         if not self.has_final_report(name):
             self.reports[name] = report
+            if report.get("fault") and report["fault"] not in self.faults:
+                self.faults.append(report["fault"])
             self.timelines.setdefault(name, []).extend(report.get("timeline", ()))
             self.report_times_s[name] = now_s
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 from neuros.observe.load_table import load_table
@@ -29,7 +30,11 @@ class Ended(Protocol):
 
 
 def run_record(
-    project: Project, files: Sequence[NodeFile], ended: Ended, wall_s: float
+    project: Project,
+    files: Sequence[NodeFile],
+    ended: Ended,
+    wall_s: float,
+    run_folder: Path,
 ) -> dict[str, Any]:
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
@@ -45,8 +50,12 @@ def run_record(
         "sim_s": sim_s,
         "running_s": running_s,
         "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
-        "timeline": {name: _timeline(points, ended) for name, points in ended.timelines.items()},
-        "connections": [_connection(c, ended.reports, running_s) for c in _connections(files)],
+        "timeline": {
+            name: _timeline(points, ended) for name, points in ended.timelines.items() if points
+        },
+        "connections": [
+            _connection(c, ended.reports, running_s, run_folder) for c in _connections(files)
+        ],
         "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
         "expanded_project": project_to_json(project),
     }
@@ -111,8 +120,13 @@ def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[floa
 
 
 def _connection(
-    connection: Connection, reports: Mapping[str, Any], running_s: float | None
+    connection: Connection,
+    reports: Mapping[str, Any],
+    running_s: float | None,
+    run_folder: Path,
 ) -> dict[str, Any]:
+    from neuros.observe.packets import packet_figures, read_packets
+
     key = str(connection)
     outgoing = _ledger(reports, connection.source_node, "outgoing").get(key, {})
     incoming = _ledger(reports, connection.destination_node, "incoming").get(key, {})
@@ -120,12 +134,17 @@ def _connection(
     sent, received = outgoing.get("sent"), incoming.get("received")
     return {
         "connection": key,
+        "index": connection.index,
         "discard_limit": connection.discard_limit,
         "queue_size": connection.queue_size,
         "sent": sent,
         "rate_hz": sent / running_s if sent is not None and running_s else None,
         "lost": None if sent is None or received is None else sent - received,
         **{field: incoming.get(field) for field in fields},
+        **packet_figures(
+            read_packets(run_folder, connection),
+            may_lose=not connection.is_reliable and sent != received,
+        ),
     }
 
 

@@ -18,6 +18,7 @@ from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Logger, Middleware
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.runtime.handle import NodeHandle
+from neuros.runtime.packet_books import PacketBooks
 from neuros.runtime.plugin import describe, load_plugin, plugin_traceback
 from neuros.runtime.scope import Stage
 from neuros.runtime.timeline import Timeline
@@ -71,6 +72,7 @@ class NodeRuntime:
         self._closers: list[Callable[[], None]] = []
         self._specs: Sequence[HookSpec] = ()
         self.engine: Engine | None = None
+        self._books: PacketBooks | None = None
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
         self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
         self._stage.enter(self._scope)
@@ -111,6 +113,7 @@ class NodeRuntime:
             self._clock,
             types,
         )
+        self._books = PacketBooks(self.engine, self._transport.digests, self.run_dir)
         self._say_what_is_special(self.engine)
 
     def start(self) -> None:
@@ -275,6 +278,11 @@ class NodeRuntime:
 
     # ------------------------------------------------------------------ reports
 
+    def write_books(self) -> None:
+        """Write out when packets were sent and taken. Any thread."""
+        if self._books is not None:
+            self._books.write()
+
     def report(self) -> dict[str, Any]:
         """State and counters. Any thread."""
         now_ns = self._clock()
@@ -289,6 +297,7 @@ class NodeRuntime:
             "timeline": self._timeline.take() if self._timeline is not None else [],
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "ledger": None if engine is None else snapshot(engine, now_ns),
+            "fault": None if self._books is None else self._books.failure,
         }
 
     def probe(self) -> dict[str, Any]:

@@ -112,6 +112,7 @@ class NodeProcess:
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
+            node.write_books()
             self._tell("report", **node.report(), is_final=is_final)
 
     def explain(self) -> None:

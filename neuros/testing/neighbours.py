@@ -76,6 +76,6 @@ class Neighbours:
     def _send_waiting(self, connection: Connection) -> None:
         outlet, waiting = self._outlets[connection], self._waiting[connection]
         while waiting and not outlet.is_blocked:
-            outlet.spend()
+            outlet.spend(0)
             node = self._hub.inboxes[connection.destination_node]
             self._hub.post(partial(node.on_packet, connection, waiting.popleft()))

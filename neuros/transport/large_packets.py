@@ -131,7 +131,7 @@ class LargeInput:
             ProtocolError: if the parcel is broken, or its segment cannot be read.
         """
         self._received += 1
-        if data[_OPTIONS] != _MARK:
+        if not is_parcel(data):
             return self._plain.decode(data)
         try:
             message, place = _contents(data)
@@ -166,6 +166,16 @@ class LargeInput:
     def close(self) -> None:
         """Give up the shared memory."""
         self._reader.close()
+
+
+def is_parcel(data: bytes) -> bool:
+    """Whether these bytes are a parcel, and not a whole message."""
+    return data[_OPTIONS] == _MARK
+
+
+def message_of(parcel: bytes) -> bytes:
+    """The serialised message in a parcel, with empty buffers."""
+    return _contents(parcel)[0]
 
 
 @cache

@@ -6,6 +6,7 @@ given from outside, which is also what makes it the deterministic transport of t
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,6 +31,9 @@ class MemoryHub:
     """Joins the nodes of one process.
 
     ``post`` queues an event; ``copy(packet)`` must share nothing with ``packet``.
+
+    Attributes:
+        received: where the digests of what is received go, by connection.
     """
 
     def __init__(
@@ -39,6 +43,7 @@ class MemoryHub:
     ) -> None:
         self.post = post
         self.copy = copy
+        self.received: dict[Connection, array[int]] = {}
         self.inboxes: dict[str, Inbox] = {}
         self._waiting: list[Connection] = []
 
@@ -65,15 +70,29 @@ class MemoryHub:
 
 
 class MemoryTransport:
-    """Carries the packets of one node to the others in the same process."""
+    """Carries the packets of one node to the others in the same process.
 
-    def __init__(self, file: NodeFile, hub: MemoryHub, outside: Outside) -> None:
+    ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
+    serialised for one, which is not done here otherwise.
+    """
+
+    def __init__(
+        self,
+        file: NodeFile,
+        hub: MemoryHub,
+        outside: Outside,
+        digest: Callable[[Any], int] | None = None,
+    ) -> None:
         self._name = file.node.name
         self._connections = file.connections
         self._hub = hub
         self._outside = outside
         self._is_open = False
         self._given_up: list[Any] = []
+        self._digest = digest
+        elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
+        self.digests = {c: array("Q") for c in elsewhere} if digest is not None else {}
+        hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
         }
@@ -92,6 +111,11 @@ class MemoryTransport:
         """Give each receiver a copy, but the last one the packet itself if it is unshared."""
         if not self._is_open:
             return
+        if self._digest is not None:
+            digest = self._digest(packet)
+            for connection in connections:
+                self.digests[connection].append(digest)
+                self._channels[connection].announce(digest)
         *others, last = connections
         for connection in others:
             self._channels[connection].send(self._hub.copy(packet))
@@ -154,12 +178,17 @@ class _Channel:
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 
-    __slots__ = ("_connection", "_hub", "_packets")
+    __slots__ = ("_connection", "_digests", "_hub", "_packets")
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
         self._connection = connection
         self._packets: deque[Any] = deque(maxlen=connection.window)
+        self._digests: deque[int] = deque(maxlen=connection.window)
+
+    def announce(self, digest: int) -> None:
+        """The digest of the packet that is sent next."""
+        self._digests.append(digest)
 
     def send(self, packet: Any) -> None:
         if len(self._packets) < self._connection.window:
@@ -167,5 +196,7 @@ class _Channel:
         self._packets.append(packet)
 
     def _deliver(self) -> None:
+        if self._digests:
+            self._hub.received[self._connection].append(self._digests.popleft())
         inbox = self._hub.inboxes[self._connection.destination_node]
         inbox.on_packet(self._connection, self._packets.popleft())

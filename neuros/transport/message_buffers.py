@@ -54,6 +54,20 @@ class MessageBuffers:
             found.append(buffer)
         return found
 
+    def views(self, packet: Any) -> Sequence[memoryview]:
+        """The bytes of the buffers of a message, where they lie; of what is no buffer, none."""
+        try:
+            values = self._get(packet)
+        except AttributeError:
+            return ()
+        views: list[memoryview] = []
+        for value in values:
+            if isinstance(value, StoredBuffer):
+                views.append(value.view())
+            elif isinstance(value, array):
+                views.append(memoryview(value).cast("B"))
+        return views
+
     def leave_out(self, packet: Any) -> Any:
         """A message like this one with empty buffers, which shares all else with it."""
         twin = _shallow(packet, self._kind)

@@ -185,6 +185,12 @@ class StoredBuffer:
             del self._array[:]
         raise Overwritten(f"packet {self._generation} of {mapping.name} has been overwritten")
 
+    def view(self) -> memoryview:
+        """The bytes where they are: nothing is copied, and they may be overwritten."""
+        if self._mapping is None:
+            return memoryview(self._array).cast("B")
+        return self._mapping.bytes[self._at : self._at + self._length]
+
 
 class _Mapping:
     """A segment in this process's memory."""

@@ -6,6 +6,7 @@ A connection has three topics below ``/neuros/<source>/<output>/<destination>/<i
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,7 @@ from neuros.core.node_ports import EXTERNAL_DEPTH
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_carriers import LargeCarriers
 from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
@@ -39,6 +41,7 @@ class _Way:
 
     publish: Callable[[bytes], None]
     carrier: Encoder
+    digest: Digest
     count_readers: Callable[[], int]
 
 
@@ -53,6 +56,7 @@ class RosTransport:
         self._ways: dict[Connection, _Way] = {}
         self._acknowledgements: dict[Connection, Callable[[bytes], None]] = {}
         self._external: dict[str, Publisher] = {}
+        self.digests = make_digests(file.connections)
         self._registrations: list[Registration] = []
         self._large = LargeCarriers(file, ros_node.get_logger().warning)
         self._is_open = False
@@ -80,13 +84,15 @@ class RosTransport:
         """Publish a packet on the data topics of these connections, serialised once."""
         if not self._is_open:
             return
-        encoded: dict[Encoder, bytes] = {}
+        encoded: dict[Encoder, tuple[bytes, int]] = {}
         for connection in connections:
             way = self._ways[connection]
-            data = encoded.get(way.carrier)
-            if data is None:
-                data = encoded[way.carrier] = way.carrier.encode(packet)
-            way.publish(data)
+            found = encoded.get(way.carrier)
+            if found is None:
+                data = way.carrier.encode(packet)
+                found = encoded[way.carrier] = (data, way.digest(packet, data))
+            way.publish(found[0])
+            self.digests[connection].append(found[1])
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
@@ -119,7 +125,10 @@ class RosTransport:
             kind, f"{connection.topic}/data", data_qos(connection)
         )
         self._ways[connection] = _Way(
-            data.handle.publish_raw, message_carrier(kind), data.get_subscription_count
+            data.handle.publish_raw,
+            message_carrier(kind),
+            digest_for(kind),
+            data.get_subscription_count,
         )
         subscriptions = []
         if connection.is_reliable:
@@ -158,7 +167,12 @@ class RosTransport:
             kind,
             f"{connection.topic}/data",
             data_qos(connection),
-            _decoding(self._large.decoder(connection), partial(inbox.on_packet, connection)),
+            _decoding(
+                self._large.decoder(connection),
+                partial(inbox.on_packet, connection),
+                digest_for(kind),
+                self.digests[connection],
+            ),
             is_raw=True,
         )
         self._registrations.append(
@@ -196,7 +210,7 @@ class RosTransport:
             message_class(port.type),
             str(port.external_topic),
             qos,
-            _decoding(
+            _delivering(
                 message_carrier(message_class(port.type)), partial(inbox.on_external_packet, port)
             ),
             is_raw=True,
@@ -234,16 +248,24 @@ def data_qos(connection: Connection) -> QoSProfile:
     )
 
 
-def _decoding(carrier: Decoder, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
+def _decoding(
+    carrier: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
+) -> Callable[[bytes], None]:
     """What receives bytes: it delivers the packet, unless that was lost on its way."""
     decode = carrier.decode
 
     def receive(data: bytes) -> None:
         packet = decode(data)
         if packet is not None:
+            digests.append(digest(packet, data))
             deliver(packet)
 
     return receive
+
+
+def _delivering(carrier: Decoder, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
+    decode = carrier.decode
+    return lambda data: deliver(decode(data))
 
 
 def _call(function: Callable[[Connection], None], connection: Connection) -> Callable[[], None]:

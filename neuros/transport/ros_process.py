@@ -16,6 +16,7 @@ from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
+from neuros.transport.digests import digest_of
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
@@ -34,6 +35,8 @@ _CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service",
 class RosProcess:
     """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
 
+    ``digests``: in memory, too, where a packet is serialised only for that.
+
     Attributes:
         has_leftovers: whether :meth:`close` has left ROS as it was. Python would destroy it at its
             own end, so the process has to leave without that (``os._exit``).
@@ -45,6 +48,7 @@ class RosProcess:
         on_failure: Callable[[BaseException], None],
         *,
         in_memory: bool,
+        digests: bool = False,
         debug: bool = False,
     ) -> None:
         self.has_leftovers = False
@@ -60,6 +64,7 @@ class RosProcess:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._loop = RosLoop(self._context, on_failure)
+        self._has_digests = digests
         self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
         self._ros_nodes: dict[str, RosNode] = {}
         self._own_entities: dict[str, set[int]] = {}
@@ -80,7 +85,8 @@ class RosProcess:
             transport = RosTransport(file, ros_node, self._loop)
         else:
             outside = RosOutside(file, ros_node, self._loop)
-            transport = MemoryTransport(file, self._hub, outside)
+            digest = digest_of if self._has_digests else None
+            transport = MemoryTransport(file, self._hub, outside, digest)
         self._transports.append(transport)
         return transport
 

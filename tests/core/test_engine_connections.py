@@ -101,7 +101,7 @@ def test_an_external_output_never_blocks():
 def test_outstanding_is_sent_minus_acknowledged():
     outlet = Outlet(wire(OUT, 3))
     for _ in range(3):
-        outlet.spend()
+        outlet.spend(0)
     outlet.credit(2, now_ns=0)
     assert outlet.outstanding == 1
 

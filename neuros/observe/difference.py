@@ -1,0 +1,143 @@
+"""Whether two runs carried the same packets, and if not, where they parted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from neuros.observe.packets import Numbers, Packets, read_packets
+from neuros.observe.past_run import PastRun
+
+MessageOf: TypeAlias = Callable[[Path, str, int], Any]
+"""From a run folder, a connection and a place (from 1) to the packet; ``None`` if unrecorded."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a comparison has shown.
+
+    Attributes:
+        difference: where the runs parted first, in a sentence; ``None`` if they are identical.
+        remarks: what differs and may, and what could not be compared.
+        compared: packets that were found equal.
+    """
+
+    difference: str | None
+    remarks: tuple[str, ...]
+    compared: int
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """One connection on which they part; ``at_ns`` (in run A) tells which was the first."""
+
+    at_ns: float
+    text: str
+
+
+def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
+    """Compare what was sent on every connection, and what hooks took on those that lose nothing.
+
+    Of connections that may lose packets it depends on the moment which ones hooks get: that is
+    told as a remark.
+    """
+    found: list[_Difference] = []
+    remarks: list[str] = []
+    compared = 0
+    names = [*a.connections, *(name for name in b.connections if name not in a.connections)]
+    for name in names:
+        if name not in a.connections or name not in b.connections:
+            only = "A" if name in a.connections else "B"
+            found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
+            continue
+        in_a, in_b = (read_packets(run.folder, run.connection(name)) for run in (a, b))
+        missing = [
+            run.folder
+            for run, packets in zip((a, b), (in_a, in_b), strict=True)
+            if run.connections[name]["sent"] and not len(packets.sent)
+        ]
+        if missing:
+            remarks.append(
+                f"{name}: not compared, since {' and '.join(map(str, missing))} has no digests of"
+                " it (in process they are kept with --digests, and never of packets that a node"
+                " sends to itself)"
+            )
+            continue
+        difference = _sent(name, (a.folder, b.folder), in_a, in_b, message_of)
+        compared += _first_difference(in_a.sent, in_b.sent)
+        taken = _taken(name, in_a, in_b)
+        if difference is not None:
+            found.append(difference)
+        elif taken is not None and a.connections[name]["discard_limit"] == 0:
+            found.append(taken)
+        elif taken is not None:
+            remarks.append(f"{taken.text}: as a connection may that loses packets")
+    first = min(found, key=lambda difference: difference.at_ns, default=None)
+    others = len(found) - 1
+    if others > 0:
+        remarks.append(f"{others} more connection{'s' if others > 1 else ''} differ, later on")
+    return Verdict(None if first is None else first.text, tuple(remarks), compared)
+
+
+def _sent(
+    name: str, folders: tuple[Path, Path], in_a: Packets, in_b: Packets, message_of: MessageOf
+) -> _Difference | None:
+    place = _first_difference(in_a.sent, in_b.sent)
+    if place == len(in_a.sent) == len(in_b.sent):
+        return None
+    at_ns = float(in_a.sent_ns[place]) if place < len(in_a.sent_ns) else np.inf
+    if place == len(in_a.sent) or place == len(in_b.sent):
+        shorter, longer = ("A", "B") if len(in_a.sent) < len(in_b.sent) else ("B", "A")
+        text = f"{name}: run {shorter} ends after packet {place}, run {longer} has more"
+        return _Difference(at_ns, f"{text} ({abs(len(in_a.sent) - len(in_b.sent))})")
+    number = place + 1
+    messages = [message_of(folder, name, number) for folder in folders]
+    text = f"{name}: packet {number} differs"
+    if None in messages:
+        return _Difference(at_ns, f"{text} (which field, only --record can tell)")
+    fields = [*differing_fields(*messages)]
+    return _Difference(at_ns, f"{text} in {fields[0] if fields else 'nothing that was recorded'}")
+
+
+def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+    a, b = in_a.consumed, in_b.consumed
+    place = _first_difference(a, b)
+    if place == len(a) == len(b):
+        return None
+    at_ns = float(in_a.taken_ns[place]) if place < len(in_a.taken_ns) else np.inf
+    if place in (len(a), len(b)):
+        what = f"hooks took {len(a)} packets in run A, and {len(b)} in run B"
+    else:
+        what = f"the packet that hooks took as number {place + 1} is another one"
+    return _Difference(at_ns, f"{name}: {what}")
+
+
+def _first_difference(a: Numbers, b: Numbers) -> int:
+    """The first place at which they differ, from 0; where one ends, at the latest."""
+    common = min(len(a), len(b))
+    unequal = np.flatnonzero(a[:common] != b[:common])
+    return int(unequal[0]) if len(unequal) else common
+
+
+def differing_fields(a: Any, b: Any, name: str = "") -> Iterator[str]:
+    """What differs between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
+    fields = getattr(a, "__dataclass_fields__", None)
+    if fields:
+        for field in fields:
+            if not field.startswith("__"):
+                inner = f"{name}.{field}" if name else field
+                yield from differing_fields(getattr(a, field), getattr(b, field), inner)
+        return
+    if isinstance(a, np.ndarray | list | tuple) and not isinstance(b, str):
+        if len(a) != len(b):
+            yield f"{name}: {len(a)} elements in A, {len(b)} in B"
+            return
+        for place, (left, right) in enumerate(zip(a, b, strict=True)):
+            yield from differing_fields(left, right, f"{name}[{place}]")
+        return
+    if not (a == b or (a != a and b != b)):  # NaN is what it was
+        yield f"{name}: {a!r} in A, {b!r} in B"

@@ -1,0 +1,89 @@
+"""When every packet was sent and taken, and its digest: written beside the node's log.
+
+``<node>/packets/<index of the connection>.<what>`` are files of 8-byte numbers, in the byte order
+of the machine, one per packet:
+
+========= ==========================================================================
+sent_ns   at the sender: monotonic time at which the hook that returned it had ended
+digests   at the sender: of each packet sent; at the receiver: of each received
+taken     at the receiver: the position (from 1) of a packet that a hook has started on
+taken_ns  when that was
+========= ==========================================================================
+
+An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
+out once per second.
+"""
+
+from __future__ import annotations
+
+import threading
+from array import array
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from neuros.core.engine import Engine
+from neuros.project.model import Connection
+
+FOLDER = "packets"
+
+MOST_ENTRIES = 8_000_000
+"""Of a file, 64 MB; what comes later is counted and not listed."""
+
+
+class PacketBooks:
+    """Writes the books of one node.
+
+    Args:
+        folder: the node's own.
+        digests: by connection, those since they were last written; empty if there are none.
+
+    Attributes:
+        failure: why nothing more is written, ``None`` while all is well.
+    """
+
+    def __init__(
+        self, engine: Engine, digests: Mapping[Connection, array[int]], folder: Path
+    ) -> None:
+        self._engine = engine
+        self._digests = digests
+        self._folder = folder / FOLDER
+        self._written: dict[str, int] = {}
+        self._lock = threading.Lock()
+        self.failure: str | None = None
+
+    def write(self) -> None:
+        """Write what has come since the last time. Any thread, but the node's own hooks go on."""
+        with self._lock:
+            for name, entries in self._all():
+                # Each is one step for the interpreter: what is appended meanwhile stays for later.
+                count = len(entries)
+                data = entries[:count].tobytes()
+                del entries[:count]
+                if data and name and self.failure is None:
+                    self._append(name, data)
+
+    def _all(self) -> Iterator[tuple[str, array[Any]]]:
+        for connection, outlet in self._engine.outlets.items():
+            yield f"{connection.index}.sent_ns", outlet.sent_ns
+        for key, inlet in self._engine.inlets.items():
+            # Nobody knows when a packet of an external topic was sent: only room is made.
+            name = f"{key.index}." if isinstance(key, Connection) else ""
+            yield name and f"{name}taken", inlet.taken
+            yield name and f"{name}taken_ns", inlet.taken_ns
+        for connection, digests in self._digests.items():
+            yield f"{connection.index}.digests", digests
+
+    def _append(self, name: str, data: bytes) -> None:
+        room = MOST_ENTRIES * 8 - self._written.get(name, 0)
+        data = data[: max(0, room)]
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with open(self._folder / name, "ab") as file:
+                file.write(data)
+        except OSError as error:
+            self.failure = (
+                f"{self._folder} could not be written to ({error.strerror}): latencies and digests"
+                " end there"
+            )
+        self._written[name] = self._written.get(name, 0) + len(data)

@@ -1,0 +1,77 @@
+"""A number per packet that differs where packets differ: 64 bits of XXH3 over what is serialised.
+
+It is the same however the packet travelled. The buffers of a large packet are not part of the bytes
+that are published, so the packet without them is digested, and then each buffer where it lies. XXH3
+is no cryptographic hash: it tells runs apart, not forgers from the honest. It was taken for its
+speed (a camera's 921,600 bytes in 0.03 ms, where BLAKE2b takes 1.6 ms and CRC-32 0.4 ms).
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, TypeAlias
+
+from xxhash import xxh3_64, xxh3_64_intdigest
+
+from neuros.project.model import Connection
+from neuros.transport.carriers import message_carrier
+from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
+from neuros.transport.message_buffers import MessageBuffers, message_buffers
+
+Digest: TypeAlias = Callable[[Any, bytes], int]
+"""From a packet, and the bytes that it travels as, to its digest."""
+
+Digests: TypeAlias = "dict[Connection, array[int]]"
+
+
+def make_digests(connections: Sequence[Connection]) -> Digests:
+    """An empty list of digests for each connection to or from another node."""
+    return {c: array("Q") for c in connections if c.source_node != c.destination_node}
+
+
+@cache
+def digest_for(kind: type) -> Digest:
+    """What digests messages of a class."""
+    buffers = message_buffers(kind)
+    if buffers is None:
+        return lambda packet, data: int(xxh3_64_intdigest(data))
+    return _LargeDigest(kind, buffers)
+
+
+def digest_of(packet: Any) -> int:
+    """The digest of a packet that does not travel as bytes."""
+    kind: Any = type(packet)
+    buffers = message_buffers(kind)
+    if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
+        return _digest(message_carrier(kind).encode(buffers.leave_out(packet)), buffers, packet)
+    return int(xxh3_64_intdigest(message_carrier(kind).encode(packet)))
+
+
+class _LargeDigest:
+    """Digests messages that can be large."""
+
+    def __init__(self, kind: type, buffers: MessageBuffers) -> None:
+        self._plain = message_carrier(kind)
+        self._buffers = buffers
+
+    def __call__(self, packet: Any, data: bytes) -> int:
+        if is_parcel(data):
+            return _digest(message_of(data), self._buffers, packet)
+        if len(data) < LARGE_BYTES or _size(self._buffers.views(packet)) < LARGE_BYTES:
+            return int(xxh3_64_intdigest(data))
+        rest = self._plain.encode(self._buffers.leave_out(packet))
+        return _digest(rest, self._buffers, packet)
+
+
+def _digest(rest: bytes, buffers: MessageBuffers, packet: Any) -> int:
+    state = xxh3_64(rest)
+    for view in buffers.views(packet):
+        state.update(len(view).to_bytes(8, "little"))
+        state.update(view)
+    return int(state.intdigest())
+
+
+def _size(views: Sequence[memoryview]) -> int:
+    return sum(map(len, views))

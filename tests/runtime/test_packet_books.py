@@ -1,0 +1,96 @@
+"""The lists of packets that a node writes."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from neuros.core.flow import Outlet
+from neuros.core.inputs import Inlet
+from neuros.project.model import Connection
+from neuros.runtime import packet_books
+from neuros.runtime.packet_books import PacketBooks
+
+LEAVING = Connection("node", "out", "other", "in", 0, index=3)
+ARRIVING = Connection("other", "out", "node", "in", 0, index=4)
+
+
+@pytest.fixture
+def node() -> Any:
+    """What an engine has of its connections: one each way, and an external topic."""
+    inlets = {key: Inlet(key, str(key), "in", 1) for key in (ARRIVING, "topic")}
+    return SimpleNamespace(outlets={LEAVING: Outlet(LEAVING)}, inlets=inlets)
+
+
+def numbers(folder: Path, name: str) -> list[int]:
+    found = array("q")
+    found.frombytes((folder / "packets" / name).read_bytes())
+    return list(found)
+
+
+def test_what_was_noted_is_written_and_taken_away(tmp_path: Path, node: Any) -> None:
+    digests = {LEAVING: array("Q", [7]), ARRIVING: array("Q", [8])}
+    node.outlets[LEAVING].spend(1000)
+    node.inlets[ARRIVING].taken.append(1)
+    node.inlets[ARRIVING].taken_ns.append(2000)
+    PacketBooks(node, digests, tmp_path).write()
+    written = {path.name: numbers(tmp_path, path.name) for path in (tmp_path / "packets").iterdir()}
+    assert written == {
+        "3.sent_ns": [1000],
+        "3.digests": [7],
+        "4.digests": [8],
+        "4.taken": [1],
+        "4.taken_ns": [2000],
+    }
+    assert not node.outlets[LEAVING].sent_ns
+    assert not digests[LEAVING]
+
+
+def test_what_comes_later_goes_behind_it(tmp_path: Path, node: Any) -> None:
+    books = PacketBooks(node, {}, tmp_path)
+    for time_ns in (1, 2, 3):
+        node.outlets[LEAVING].spend(time_ns)
+        books.write()
+    assert numbers(tmp_path, "3.sent_ns") == [1, 2, 3]
+
+
+def test_a_node_that_sends_nothing_has_no_files(tmp_path: Path, node: Any) -> None:
+    PacketBooks(node, {}, tmp_path).write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_external_topics_nothing_is_kept(tmp_path: Path, node: Any) -> None:
+    node.inlets["topic"].taken.append(1)
+    node.inlets["topic"].taken_ns.append(5)
+    PacketBooks(node, {}, tmp_path).write()
+    assert list(tmp_path.iterdir()) == []
+    assert not node.inlets["topic"].taken
+
+
+def test_a_file_does_not_grow_for_ever(
+    tmp_path: Path, node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packet_books, "MOST_ENTRIES", 2)
+    books = PacketBooks(node, {}, tmp_path)
+    for time_ns in (1, 2, 3):
+        node.outlets[LEAVING].spend(time_ns)
+        books.write()
+    assert numbers(tmp_path, "3.sent_ns") == [1, 2]
+    assert not node.outlets[LEAVING].sent_ns
+
+
+def test_a_full_disk_is_noted_and_the_run_goes_on(tmp_path: Path, node: Any) -> None:
+    (tmp_path / "packets").mkdir()
+    (tmp_path / "packets/3.sent_ns").symlink_to("/dev/full")
+    books = PacketBooks(node, {}, tmp_path)
+    node.outlets[LEAVING].spend(1)
+    books.write()
+    assert books.failure is not None
+    assert "No space left on device" in books.failure
+    node.outlets[LEAVING].spend(2)
+    books.write()
+    assert not node.outlets[LEAVING].sent_ns
