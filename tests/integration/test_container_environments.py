@@ -65,6 +65,7 @@ class Project:
     @property
     def environment(self) -> dict[str, str]:
         return {
+            "NEUROS_BACKEND": "process",
             "PIP_NO_INDEX": "1",
             "PIP_FIND_LINKS": str(self.index),
             "PIP_NO_CACHE_DIR": "1",
@@ -122,7 +123,7 @@ def run_conflict(example: Path, cwd: Path, **environment: str) -> Finished:
     cache = str(cwd / "cache")
     return launch(
         example,
-        *("--set", command),
+        *("--backend", "process", "--set", command),
         cwd=cwd,
         timeout_s=240.0,
         XDG_CACHE_HOME=cache,
