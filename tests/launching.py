@@ -22,7 +22,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -142,12 +142,21 @@ class Running:
         return bool(data)
 
 
-def start(project: Path | str, *arguments: str, cwd: Path, **environment: str) -> Running:
-    """Start ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd``; ``-o`` is relative to it."""
+def start(
+    project: Path | str,
+    *arguments: str,
+    cwd: Path,
+    through: Sequence[str] = (),
+    **environment: str,
+) -> Running:
+    """Start ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd``; ``-o`` is relative to it.
+
+    ``through`` is a command that executes the one that follows it, with the same process id.
+    """
     inherited = {key: value for key, value in os.environ.items() if key not in _UNWANTED}
     before = _run_folders(cwd)
     process = subprocess.Popen(
-        [sys.executable, "-m", "neuros.cli", "launch", str(project), *arguments],
+        [*through, sys.executable, "-m", "neuros.cli", "launch", str(project), *arguments],
         cwd=cwd,
         env={**inherited, **environment},
         stdin=subprocess.DEVNULL,

@@ -5,6 +5,11 @@ participant to the first 32 of the domain only: of 64 processes some never find 
 NeuROS takes the range ``SYSTEM_DEFAULT`` instead, which leaves transports to the settings, and has
 settings with the same meaning and room for all 120 participants of a domain. ROS programs of the
 user with the ranges ``LOCALHOST`` and ``SUBNET`` find such nodes, and are found.
+
+They use UDP alone. Fast DDS takes shared memory wherever both ends offer it on one host, and then
+delivers nothing, without a word, if they do not share user and IPC namespace; and its files are
+what many processes that start at once trip over. Large packets have shared memory of NeuROS's own,
+which asks first (``large_packets.py``).
 """
 
 from __future__ import annotations

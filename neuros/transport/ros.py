@@ -28,6 +28,7 @@ from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.silent_topics import warn_of_silence
 
 _ANNOUNCE_S = 0.02
 
@@ -199,14 +200,18 @@ class RosTransport:
                 self._external[port.name] = self._ros_node.create_publisher(
                     message_class(port.type), port.external_topic, EXTERNAL_DEPTH
                 )
-        for port in self._node.inputs:
-            if port.external_topic is not None:
-                self._open_external_input(port, inbox)
+        heard = {
+            port: self._open_external_input(port, inbox)
+            for port in self._node.inputs
+            if port.external_topic is not None
+        }
+        if heard:
+            warn_of_silence(self._ros_node, heard, self._loop.guard)
 
-    def _open_external_input(self, port: Port, inbox: Inbox) -> None:
+    def _open_external_input(self, port: Port, inbox: Inbox) -> Subscription:
         # A best-effort reader matches reliable and best-effort writers.
         qos = QoSProfile(depth=EXTERNAL_DEPTH, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        self._subscribe(
+        return self._subscribe(
             message_class(port.type),
             str(port.external_topic),
             qos,

@@ -41,6 +41,13 @@ def test_another_range_is_left_to_ros(environ: dict[str, str]) -> None:
     assert dds_environment(environ) == {PROFILES_VARIABLE: str(PROFILES)}
 
 
+def test_on_this_machine_packets_go_by_udp_alone() -> None:
+    tree = ElementTree.parse(LOCAL_PROFILES)
+    assert [each.text for each in tree.iter(f"{NAMESPACE}type")] == ["UDPv4"]
+    (others,) = tree.iter(f"{NAMESPACE}useBuiltinTransports")
+    assert others.text == "false"
+
+
 def test_a_file_of_the_users_own_wins() -> None:
     assert dds_environment({**LOCAL, PROFILES_VARIABLE: "/home/me/dds.xml"}) == {}
 
@@ -54,8 +61,8 @@ def test_only_what_stays_on_this_machine_is_repaired_late() -> None:
     it that long after a publication."""
     assert duration_ms(PROFILES, "nackSupressionDuration") < 5
     assert duration_ms(PROFILES, "heartbeatResponseDelay") is None
-    assert duration_ms(LOCAL_PROFILES, "nackSupressionDuration") == 50
-    assert duration_ms(LOCAL_PROFILES, "heartbeatResponseDelay") == 50
+    assert duration_ms(LOCAL_PROFILES, "nackSupressionDuration") == 20
+    assert duration_ms(LOCAL_PROFILES, "heartbeatResponseDelay") == 20
 
 
 def duration_ms(file: Path, name: str) -> float | None:

@@ -1,0 +1,32 @@
+"""An external topic on which a node hears nobody is named, with the reason if there is one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from launching import BACKENDS, start
+from ros_program import RosProgram
+
+from neuros.launch.domain import choose_domain
+from neuros.transport.messages import message_class
+
+PROJECT = Path(__file__).parent / "external_topics"
+
+
+@pytest.mark.parametrize("back_end", BACKENDS)
+def test_topics_that_nobody_serves_are_named(back_end: str, tmp_path: Path) -> None:
+    with (
+        choose_domain(None, {}, False) as domain,
+        RosProgram(domain_id=domain.id) as program,
+        start(PROJECT, "--backend", back_end, "-d", str(domain.id), cwd=tmp_path) as running,
+    ):
+        string, integer = map(message_class, ("std_msgs/msg/String", "std_msgs/msg/Int32"))
+        program.node.create_publisher(string, "/heard", 10)
+        program.node.create_publisher(integer, "/mistaken", 10)
+        # The inputs are looked at in this order.
+        running.wait_for("input 'unheard': nobody publishes on /unheard", 60.0)
+    assert (
+        "input 'mistaken': /mistaken is published as std_msgs/msg/Int32, not as std_msgs/msg/String"
+    ) in running.output
+    assert "input 'heard'" not in running.output
