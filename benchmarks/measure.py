@@ -2,13 +2,15 @@
 
 Machines differ, and one machine differs from minute to minute. So nothing is measured alone: each
 *round* measures all candidates of a group one after the other, every other round in the opposite
-order, and two candidates are compared within the rounds.
+order, and two candidates are compared within the rounds. A round may be cut into *slices*, shorter
+measurements there and back (A B B A): what changes steadily meanwhile hits both alike.
 """
 
 from __future__ import annotations
 
+import statistics
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Union
 
@@ -130,11 +132,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Group:
-    """Candidates that are measured in the same rounds, and the rows that follow from them."""
+    """Candidates that are measured in the same rounds, and the rows that follow from them.
+
+    Attributes:
+        slices: how often each is measured in a round; the round has the means.
+    """
 
     candidates: Mapping[str, Measurement]
     cases: tuple[Case, ...]
     rounds: int = MINIMUM_PAIRS
+    slices: int = 1
 
     def only(self, text: str) -> Group:
         """The part that is needed for the rows whose names contain ``text``."""
@@ -171,11 +178,19 @@ class Run:
     def measure(self, rounds: int, say: Callable[[str], None]) -> Iterator[None]:
         """Measure; yields after each candidate, what was measured by then is in ``rounds``."""
         for number in range(rounds):
-            names = self._names()
             self.rounds.append({})
-            for name in reversed(names) if number % 2 else names:
-                self._measure_once(name, f"  {number + 1}/{rounds} {name}: ", say)
-                yield
+            slices: dict[str, list[dict[str, float]]] = {}
+            for piece in range(self.group.slices):
+                # A candidate that failed has lost the whole round.
+                names = [n for n in self._names() if len(slices.get(n, ())) == piece]
+                for name in reversed(names) if (number + piece) % 2 else names:
+                    figures = self._measure_once(name, f"  {number + 1}/{rounds} {name}: ", say)
+                    if figures is not None:
+                        measured = slices.setdefault(name, [])
+                        measured.append(figures)
+                        if len(measured) == self.group.slices:
+                            self.rounds[-1][name] = _means(measured)
+                    yield
 
     def _names(self) -> list[str]:
         """The candidates that are worth a try, and that some row still has use for."""
@@ -185,9 +200,11 @@ class Run:
         needed = frozenset[str]().union(*(case.candidates for case in cases))
         return [name for name in self.group.candidates if name in needed]
 
-    def _measure_once(self, name: str, label: str, say: Callable[[str], None]) -> None:
+    def _measure_once(
+        self, name: str, label: str, say: Callable[[str], None]
+    ) -> dict[str, float] | None:
         if name in self.unavailable:
-            return
+            return None
         try:
             figures = self.group.candidates[name]()
         except Unavailable as reason:
@@ -198,8 +215,13 @@ class Run:
             say(f"{label}FAILED: {_describe(error).splitlines()[-1]}")
         else:
             named = figures if isinstance(figures, Mapping) else {"value": figures}
-            self.rounds[-1][name] = {key: float(value) for key, value in named.items()}
             say(label + ", ".join(f"{value:.4g}" for value in named.values()))
+            return {key: float(value) for key, value in named.items()}
+        return None
+
+
+def _means(slices: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {key: statistics.fmean(each[key] for each in slices) for key in slices[0]}
 
 
 def _describe(error: Exception) -> str:

@@ -79,6 +79,27 @@ def test_every_other_round_runs_the_other_way_round() -> None:
     assert "".join(order) == "abccbaabc"
 
 
+def test_a_round_in_slices_goes_there_and_back_and_has_the_means() -> None:
+    order: list[str] = []
+
+    def noted(name: str, *values: float) -> Measurement:
+        following = iter(values)
+        return lambda: order.append(name) or next(following)  # type: ignore[func-returns-value]
+
+    candidates = {"a": noted("a", 1, 3, 10, 20), "b": noted("b", 2, 2, 5, 5)}
+    group = Group(candidates, (versus("r", "a", "b"),), rounds=2, slices=2)
+    row = row_named(results_of(group), "r")
+    assert "".join(order) == "abba" + "baab"
+    assert (row.values, row.references) == ((2.0, 15.0), (2.0, 5.0))
+
+
+def test_a_failure_in_one_slice_costs_the_round() -> None:
+    a = failing(RuntimeError("once"), 1.0, 1.0, 1.0)
+    group = Group({"a": a, "b": constant(2)}, (versus("r", "a", "b"),), rounds=2, slices=2)
+    row = row_named(results_of(group), "r")
+    assert row.values == (1.0,)
+
+
 def test_the_rounds_of_a_group_can_be_overridden() -> None:
     group = Group({"a": constant(1)}, (Case("r", "us", Figure("a")),), rounds=7)
     assert len(row_named(results_of(group), "r").values) == 7
