@@ -18,10 +18,13 @@ from pathlib import Path
 
 import pytest
 
+from neuros import installation
+from neuros.cli.main import parser
 from neuros.errors import EnvironmentFault
+from neuros.installation.containers import build_arguments, build_containers
 from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
-from neuros.installation.packages import explain_failure
+from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -286,6 +289,47 @@ class TestLaunchScript:
         assert done.stdout == f"{copy} a b --dry-run [/my/lib] [/my/modules]\n"
 
 
+class TestContainers:
+    """The options of ``install.py`` are those of the command that it hands over to."""
+
+    def arguments(self, *given: str) -> list[str]:
+        parsed = installation.parse_options(given, ["mujoco", "nest", "plot"])
+        return list(build_arguments(parsed))
+
+    def test_where_none_is_named_a_machine_without_docker_is_all_right(self) -> None:
+        assert self.arguments() == ["containers", "build", "--if-engine"]
+
+    def test_those_that_are_named_have_to_be_built(self) -> None:
+        assert self.arguments("--containers", "a", "b") == ["containers", "build", "a", "b"]
+
+    def test_every_option_is_one_of_the_command(self, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").touch()
+        given = ["--base-image", "debian:12", "--base-image", "a=debian:13", "--pull"]
+        given += ["--wheelhouse", str(tmp_path), "--ca-bundle", str(tmp_path / "ca.pem")]
+        understood = vars(parser().parse_args(self.arguments(*given)))
+        assert understood["base_image"] == ["debian:12", "a=debian:13"]
+        assert understood["wheelhouse"] == str(tmp_path)
+        assert understood["ca_bundle"] == str(tmp_path / "ca.pem")
+        assert understood["pull"]
+
+    def test_a_wheelhouse_and_certificates_are_for_pip_as_well(self, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").touch()
+        given = ["--wheelhouse", str(tmp_path), "--ca-bundle", str(tmp_path / "ca.pem")]
+        settings = pip_settings(installation.parse_options(given, ["mujoco", "nest", "plot"]))
+        assert settings == {
+            "PIP_NO_INDEX": "1",
+            "PIP_FIND_LINKS": str(tmp_path),
+            "PIP_CERT": str(tmp_path / "ca.pem"),
+        }
+
+    def test_what_cannot_be_built_is_the_exit_code(self, tmp_path: Path) -> None:
+        python = tmp_path / "python"
+        python.write_text('#!/bin/sh\necho "$@"; exit 4\n')
+        python.chmod(0o755)
+        parsed = installation.parse_options([], ["mujoco", "nest", "plot"])
+        assert build_containers(python, parsed) == 4
+
+
 class TestInstallScript:
     def test_help_names_every_exit_code(self, tmp_path: Path) -> None:
         done = run_script(ROOT / "install.py", "--help", cwd=tmp_path)
@@ -296,6 +340,21 @@ class TestInstallScript:
         done = run_script(ROOT / "install.py", "--extras", "numpy", cwd=tmp_path)
         assert done.returncode == 2
         assert "no such extra: numpy (there are mujoco, nest," in done.stderr
+
+    @pytest.mark.parametrize(
+        ("arguments", "complaint"),
+        [
+            (["--containers", "a", "--no-containers"], "not allowed with argument --containers"),
+            (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: there is no such folder"),
+            (["--ca-bundle", "nowhere"], "--ca-bundle nowhere: there is no such file"),
+        ],
+    )
+    def test_what_contradicts_itself_or_is_not_there_is_wrong_usage(
+        self, arguments: list[str], complaint: str, tmp_path: Path
+    ) -> None:
+        done = run_script(ROOT / "install.py", "-y", *arguments, cwd=tmp_path)
+        assert done.returncode == 2
+        assert complaint in done.stderr
 
     @pytest.mark.parametrize("script", ["install.py", "launch.py"])
     def test_an_old_python_can_read_it(self, script: str) -> None:

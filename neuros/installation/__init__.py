@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
+from neuros.installation.containers import build_containers
 from neuros.installation.environment import Environment, extras_of
 from neuros.installation.machine import Machine, system_install
-from neuros.installation.packages import explain_failure
+from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
 
 STANDARD_EXTRAS = ("mujoco", "nest", "plot")
@@ -31,13 +32,16 @@ def main(arguments: Sequence[str], root: str) -> int:
         SystemExit: from argparse, with 2 for wrong arguments and 0 for ``--help``.
     """
     folder, progress = Path(root), Progress(sys.stdout)
-    options = _options(arguments, extras_of((folder / "pyproject.toml").read_text("utf-8")))
+    options = parse_options(arguments, extras_of((folder / "pyproject.toml").read_text("utf-8")))
     try:
         Machine.here().require_support()
-        environment = Environment(folder, options.extras, progress)
+        environment = Environment(folder, options.extras, progress, pip_settings(options))
         if not (options.yes or environment.is_installed or _agrees(environment.folder)):
             return 130
         environment.install()
+        if not options.no_containers and (code := build_containers(environment.python, options)):
+            progress.fail("install.py: NeuROS is installed, but not all images were built")
+            return code
         if options.test:
             progress.step("installed; running the checks and tests")
             return subprocess.call([str(environment.python), str(folder / "tests" / "run")])
@@ -55,11 +59,17 @@ def main(arguments: Sequence[str], root: str) -> int:
     return 0
 
 
-def _options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespace:
+def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespace:
+    """What the command line of ``install.py`` says; ``known`` are the extras that there are.
+
+    Raises:
+        SystemExit: from argparse, with 2 for wrong arguments and 0 for ``--help``.
+    """
     further = [extra for extra in known if extra not in STANDARD_EXTRAS]
     parser = argparse.ArgumentParser(
         prog="install.py",
-        description="Make .venv and install NeuROS into it, with MuJoCo, NEST and Matplotlib.",
+        description="Make .venv and install NeuROS into it, with MuJoCo, NEST and Matplotlib;"
+        " where there is a Docker engine, build the images that nodes run in.",
         epilog="Exit codes: 0 installed, 1 a test failed, 2 usage, 4 something is missing on this "
         "machine, 130 cancelled.",
     )
@@ -69,6 +79,7 @@ def _options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespa
     )
     parser.add_argument("--dev", action="store_true", help="the same as --extras dev")
     parser.add_argument("--test", action="store_true", help="then run all checks and tests")
+    _add_container_options(parser)
     options = parser.parse_args(arguments)
     extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
     extras.update(DEVELOPER_EXTRAS if options.dev else ())
@@ -76,7 +87,45 @@ def _options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespa
     if unknown := sorted(extras - set(known)):
         parser.error(f"no such extra: {', '.join(unknown)} (there are {', '.join(known)})")
     options.extras = sorted(extras)
+    if options.wheelhouse and not Path(options.wheelhouse).is_dir():
+        parser.error(f"--wheelhouse {options.wheelhouse}: there is no such folder")
+    if options.ca_bundle and not Path(options.ca_bundle).is_file():
+        parser.error(f"--ca-bundle {options.ca_bundle}: there is no such file")
     return options
+
+
+def _add_container_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group(
+        "containers", "Where Docker is, the images that nodes run in are built, too."
+    )
+    which = group.add_mutually_exclusive_group()
+    which.add_argument(
+        "--containers",
+        nargs="+",
+        metavar="NAME",
+        help="build these: NeuROS's, images of your own, or all that a project (a folder) needs"
+        " (default: neuros_python, neuros_mujoco, neuros_nest)",
+    )
+    which.add_argument("--no-containers", action="store_true", help="build none")
+    group.add_argument(
+        "--base-image",
+        action="append",
+        default=[],
+        metavar="[NAME=]IMAGE",
+        help="begin the image of container NAME (default: neuros_python) from IMAGE",
+    )
+    group.add_argument(
+        "--pull", action="store_true", help="ask for the newest version of base images"
+    )
+    offline = parser.add_argument_group("where PyPI cannot be reached as usual")
+    offline.add_argument(
+        "--wheelhouse",
+        metavar="DIR",
+        help="take all Python packages, also for containers, from a folder of wheels",
+    )
+    offline.add_argument(
+        "--ca-bundle", metavar="FILE", help="certificates (PEM) to trust, also in containers"
+    )
 
 
 def _agrees(folder: Path) -> bool:

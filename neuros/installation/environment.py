@@ -11,9 +11,10 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
 from neuros.installation import packages
@@ -76,11 +77,20 @@ class Environment:
     Attributes:
         folder: ``.venv`` in the source tree.
         extras: what is installed beside the core; NEST is left out where there is none.
+
+    ``pip_settings`` are added to the environment of pip.
     """
 
-    def __init__(self, root: Path, extras: Sequence[str], progress: Progress) -> None:
+    def __init__(
+        self,
+        root: Path,
+        extras: Sequence[str],
+        progress: Progress,
+        pip_settings: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self.folder, self.extras = root / ".venv", tuple(extras)
         self._root, self._progress = root, progress
+        self._pip_settings = pip_settings
         self._stamp = self.folder / "neuros.json"
 
     @property
@@ -187,7 +197,7 @@ class Environment:
 
     def _fill(self) -> None:
         self._stamp.unlink(missing_ok=True)
-        packages.install(self.python, self._root, self.extras, self._progress)
+        packages.install(self.python, self._root, self.extras, self._progress, self._pip_settings)
 
     def _prove(self) -> list[str]:
         """Use every part in a process of its own; one sentence for each that fails."""

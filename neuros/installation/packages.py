@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, other_python, system_install
@@ -16,14 +18,35 @@ from neuros.installation.progress import Progress
 LOG = "neuros-install.log"
 """What pip wrote, in ``.venv``."""
 
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+
 PIP_INSTALL = (
     *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
     *("--progress-bar", "off", "--prefer-binary"),
 )
 
 
-def install(python: Path, root: Path, extras: Sequence[str], progress: Progress) -> None:
+def pip_settings(options: argparse.Namespace) -> dict[str, str]:
+    """What the options ``--wheelhouse`` and ``--ca-bundle`` mean to pip, as its environment."""
+    settings: dict[str, str] = {}
+    if options.wheelhouse:
+        folder = str(Path(options.wheelhouse).absolute())
+        settings |= {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": folder}
+    if options.ca_bundle:
+        settings["PIP_CERT"] = str(Path(options.ca_bundle).absolute())
+    return settings
+
+
+def install(
+    python: Path,
+    root: Path,
+    extras: Sequence[str],
+    progress: Progress,
+    settings: Mapping[str, str] = _NOTHING,
+) -> None:
     """Install the source tree at ``root``, editable, with its extras, for ``python`` (in a venv).
+
+    ``settings`` are added to the environment of pip.
 
     Raises:
         EnvironmentFault: with a sentence for the user; pip's own output is in a log file.
@@ -36,9 +59,11 @@ def install(python: Path, root: Path, extras: Sequence[str], progress: Progress)
             f"{need_bytes / 1e9:.1f} GB: make room (df -h)"
         )
     log, names = folder / LOG, f"[{','.join(extras)}]"
-    progress.step(f"installing neuros{names} from PyPI (log: {log})")
+    source = settings.get("PIP_FIND_LINKS", "PyPI")
+    progress.step(f"installing neuros{names} from {source} (log: {log})")
     command = [str(python), *PIP_INSTALL, "--editable", f".{names}"]
-    output = run_pip(command, root, log, progress, clean_environment(os.environ))
+    environ = {**clean_environment(os.environ), **settings}
+    output = run_pip(command, root, log, progress, environ)
     if output is not None:
         rows = [row.strip() for row in output.splitlines()]
         errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
@@ -91,7 +116,10 @@ def explain_failure(text: str) -> str | None:
     """One sentence, cause and remedy, for what pip or the operating system wrote, where known."""
     sentence = explain_machine(text)
     if sentence is None and re.search("No matching distribution|Could not find a version", text):
-        return f"a package does not exist for this Python: run {other_python()} install.py"
+        return (
+            f"a package does not exist for this Python: run {other_python()} install.py"
+            " (with --wheelhouse: or it is not in there)"
+        )
     return sentence
 
 

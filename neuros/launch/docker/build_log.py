@@ -19,8 +19,8 @@ _CAUSES = (
     ),
     (
         r"ERROR: No matching distribution found for (?P<what>\S+)",
-        "there is no package {what} for the Python of this image: correct the requirements.txt, or"
-        " take another Python with --base-image",
+        "there is no package {what} for the Python of this image (or it is not in the wheelhouse):"
+        " correct the requirements.txt, or take another Python with --base-image",
     ),
     (
         r"ERROR: ResolutionImpossible|have conflicting dependencies",

@@ -24,7 +24,7 @@ from neuros.installation.progress import Progress
 from neuros.launch.containers import bare_name
 from neuros.launch.docker.build_steps import BuildSteps, pulled
 from neuros.launch.docker.context import Surroundings
-from neuros.launch.docker.dockerfile import images_in, on_images
+from neuros.launch.docker.dockerfile import arguments_of, images_in, on_images
 from neuros.launch.docker.engine import engine_faults
 from neuros.launch.docker.images import (
     CONTAINER,
@@ -49,7 +49,7 @@ class Wishes:
     Attributes:
         logs: the folder for what the engine says.
         bases: base images by container name, in place of those in the Dockerfiles.
-        arguments: build arguments for all Dockerfiles.
+        arguments: build arguments for the Dockerfiles that declare them.
         pull: whether the newest version of base images is asked for.
     """
 
@@ -74,9 +74,12 @@ class ImageBuilder:
         Raises:
             EnvironmentFault: at the first that cannot be built; those before it are kept.
         """
-        for recipe in in_order(recipes, self._wishes.bases):
+        recipes = list(recipes)
+        with engine_faults("images cannot be built"):
+            bases = self._remembered_bases(recipes) | dict(self._wishes.bases)
+        for recipe in in_order(recipes, bases):
             with engine_faults(f"image '{recipe.name}' cannot be built"):
-                self._bring_up_to_date(recipe)
+                self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
 
     def add_to(self, name: str) -> None:
         """Build, on an image that the user has, one that can run nodes; nothing where it can.
@@ -106,51 +109,60 @@ class ImageBuilder:
         log = self._wishes.logs / f"{name.replace('/', '_')}.log"
         return BuildSteps(self._engine, self._around, self._progress, name, log)
 
-    def _bring_up_to_date(self, recipe: Recipe) -> None:
+    def _remembered_bases(self, recipes: Iterable[Recipe]) -> dict[str, str]:
+        """The base images that the user wanted when these were built last."""
+        built = {recipe.name: built_image(recipe, self._engine) for recipe in in_order(recipes)}
+        return {
+            name: base for name, old in built.items() if old and (base := old.labels.get(_BASE))
+        }
+
+    def _bring_up_to_date(self, recipe: Recipe, base: str) -> None:
         started_s = time.monotonic()
         old = built_image(recipe, self._engine)
-        labels = self._labels(recipe, old)
-        base = labels[_BASE]
+        labels = self._labels(recipe, base, old)
         if self._wishes.pull and not base:
             self._pull_bases(recipe)
-        steps = self._steps(recipe.name)
         begin = {
             parent.name: built_image(parent, self._engine).id  # type: ignore[union-attr]
             for parent in recipe.parents_on(base or None)
         }
-        arguments = json.loads(labels[_ARGUMENTS])
         if base and base not in begin:
-            arguments[BASE_ARGUMENT] = self._base(recipe, base, steps)
-        labels[_FROM] = json.dumps({**begin, "": arguments.get(BASE_ARGUMENT, "")})
+            begin[base] = str(pulled(self._engine, base, newest=self._wishes.pull).id)
+        labels[_FROM] = json.dumps(begin, sort_keys=True)
         if old is not None and not self._wishes.pull and _is_as_wanted(old, labels):
             self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
             return
+        steps = self._steps(recipe.name)
+        arguments = json.loads(labels[_ARGUMENTS])
+        if base:
+            arguments[BASE_ARGUMENT] = self._base(recipe, base, begin[base], steps)
         text = on_images(recipe.dockerfile, begin)
         made, python = steps.able(steps.build(recipe.folder, text, arguments))
         steps.finish(made, recipe.tags, {**labels, **labels_of_python(python)})
         self._forget(recipe, old)
         self._report(f"{recipe.name}: built", started_s, self._engine.images.get(recipe.tags[0]))
 
-    def _labels(self, recipe: Recipe, old: Any | None) -> dict[str, str]:
-        """What the image is to be; what was wanted of it last time is wanted again."""
+    def _labels(self, recipe: Recipe, base: str, old: Any | None) -> dict[str, str]:
+        """What the image is to be; arguments of last time count again."""
         wanted = old.labels if old is not None else {}
-        arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | dict(self._wishes.arguments)
+        known = arguments_of(recipe.dockerfile)
+        given = {key: value for key, value in self._wishes.arguments.items() if key in known}
+        arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | given
         return {
             CONTAINER: recipe.name,
             FOLDER: str(recipe.folder),
             DIGEST: recipe.digest,
-            _BASE: self._wishes.bases.get(recipe.name, wanted.get(_BASE, "")),
+            _BASE: base,
             _ARGUMENTS: json.dumps(arguments, sort_keys=True),
         }
 
-    def _base(self, recipe: Recipe, base: str, steps: BuildSteps) -> str:
-        """The id of the image that the user wants to begin with.
+    def _base(self, recipe: Recipe, base: str, image: str, steps: BuildSteps) -> str:
+        """The image that the user wants to begin with.
 
         In place of a recipe's image it must be able to do what that can: run nodes.
         """
-        image = pulled(self._engine, base, newest=self._wishes.pull)
         replaces_recipe = len(recipe.parents_on(base)) < len(recipe.parents)
-        return steps.able(image.id)[0] if replaces_recipe else str(image.id)
+        return steps.able(image)[0] if replaces_recipe else image
 
     def _pull_bases(self, recipe: Recipe) -> None:
         parents = {parent.name for parent in recipe.parents}

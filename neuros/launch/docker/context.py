@@ -17,7 +17,7 @@ CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
 """Where a build finds the certificates that the user gives; it is taken away at the end."""
 
 _CERTIFICATES_IN_CONTEXT = ".neuros-ca-bundle.pem"
-_CERTIFICATE_VARIABLES = ("PIP_CERT", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
+_TRUST = ("PIP_CERT", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
 _PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "FTP_PROXY", "NO_PROXY", "ALL_PROXY")
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 _NO_FILES: Mapping[str, bytes] = MappingProxyType({})
@@ -50,9 +50,9 @@ class Surroundings:
         lines = []
         if self.ca_bundle:
             lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
-            lines += [f"ARG {name}={CERTIFICATES}" for name in _CERTIFICATE_VARIABLES]
+            lines.append(f"ARG {' '.join(f'{name}={CERTIFICATES}' for name in _TRUST)}")
         if self.wheels:
-            lines += ["ARG PIP_NO_INDEX=1", f"ARG PIP_FIND_LINKS={self.wheels}"]
+            lines.append(f"ARG PIP_NO_INDEX=1 PIP_FIND_LINKS={self.wheels}")
         return "\n".join(lines)
 
 

@@ -40,6 +40,11 @@ def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
     return images
 
 
+def arguments_of(text: str) -> set[str]:
+    """The names of all build arguments that it declares."""
+    return set(re.findall(r"^[ \t]*ARG[ \t]+(\w+)", text, re.IGNORECASE | re.MULTILINE))
+
+
 def after_each_from(text: str, lines: str) -> str:
     """The Dockerfile with ``lines`` behind each ``FROM``: they count in all of its stages."""
     found = []

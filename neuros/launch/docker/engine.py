@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import Any
 import docker
 import requests
 from docker import DockerClient
+from docker.context import ContextAPI
 from docker.errors import APIError, DockerException
 
 from neuros.errors import EnvironmentFault
 
 OLDEST_API, OLDEST_ENGINE = (1, 41), "20.10"
 
+_USUAL_SOCKET = Path("/var/run/docker.sock")
+_USUAL_ADDRESS = f"unix://{_USUAL_SOCKET}"
 _TIMEOUT_S = 60.0
 _WITHOUT = "or run without containers: --backend process"
 
@@ -33,12 +37,13 @@ def connect(
         EnvironmentFault: where there is none, it may not be used, or it is too old.
     """
     given = dict(environ)
-    rootless = _rootless_socket(given)
-    if rootless:
-        given["DOCKER_HOST"] = rootless
-    where = given.get("DOCKER_HOST") or "its usual socket"
+    where = given.get("DOCKER_HOST", "")
     try:
-        # "auto" asks the engine, so that whatever is wrong shows here.
+        where = where or _address_of_context(given)
+        if where in ("", _USUAL_ADDRESS):
+            where = given["DOCKER_HOST"] = _usual_address(given)
+        _try_socket(where)
+        # "auto" asks the engine, so that whatever else is wrong shows here.
         engine = docker.from_env(version="auto", timeout=timeout_s, environment=given)
     except (DockerException, requests.RequestException, OSError, ValueError) as error:
         raise EnvironmentFault(_explain(error, where)) from error
@@ -73,13 +78,25 @@ def explain(text: str) -> str:
     return said
 
 
-def _rootless_socket(environ: Mapping[str, str]) -> str | None:
-    named = any(environ.get(key) for key in ("DOCKER_HOST", "DOCKER_CONTEXT"))
+def _usual_address(environ: Mapping[str, str]) -> str:
     folder = environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
-    socket = Path(folder) / "docker.sock"
-    if named or Path("/var/run/docker.sock").exists() or not socket.is_socket():
-        return None
-    return f"unix://{socket}"
+    rootless = Path(folder) / "docker.sock"
+    is_rootless = rootless.is_socket() and not _USUAL_SOCKET.exists()
+    return f"unix://{rootless if is_rootless else _USUAL_SOCKET}"
+
+
+def _address_of_context(environ: Mapping[str, str]) -> str:
+    """The address that ``docker context use`` has chosen, or ""."""
+    address = ContextAPI.kwargs_from_context(environment=environ).get("base_url", "")
+    return str(address).removeprefix("http+")
+
+
+def _try_socket(address: str) -> None:
+    """Raise the operating system's own error where a socket cannot be used."""
+    scheme, _, path = address.partition("://")
+    if scheme == "unix":
+        with socket.socket(socket.AF_UNIX) as tried:
+            tried.connect(path)
 
 
 def _explain(error: BaseException, where: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,7 +72,16 @@ def python_in(engine: DockerClient, image: str, name: str) -> PythonInImage:
         EnvironmentFault: if it has no Python that could ever run nodes.
     """
     with engine_faults(f"image '{name}' cannot be looked into"):
-        answers = _facts(_output(engine, image, name))
+        output = _output(engine, image, name)
+    return chosen(_facts(output), name)
+
+
+def chosen(answers: Sequence[Mapping[str, Any]], name: str) -> PythonInImage:
+    """Of what the Pythons of an image say about themselves, the one that nodes would run in.
+
+    Raises:
+        EnvironmentFault: if there is none that could ever run nodes.
+    """
     if not answers:
         raise EnvironmentFault(
             f"image '{name}' has no Python: take one with Python"
@@ -85,7 +95,7 @@ def python_in(engine: DockerClient, image: str, name: str) -> PythonInImage:
     return found
 
 
-def _refuse(found: PythonInImage, answer: dict[str, Any], name: str) -> None:
+def _refuse(found: PythonInImage, answer: Mapping[str, Any], name: str) -> None:
     """There are no wheels of rclpy for everything."""
     version = found.version
     if not answer["glibc"]:

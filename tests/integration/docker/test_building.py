@@ -1,0 +1,300 @@
+"""Images, built by a real engine through the command line, as ``install.py`` calls it."""
+
+from __future__ import annotations
+
+import os
+import re
+import uuid
+import zipfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from docker.errors import APIError
+
+from neuros.cli.main import main
+from neuros.errors import EnvironmentFault
+from neuros.launch.docker.engine import connect
+from neuros.launch.docker.images import image_for
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Any]:
+    """An engine that has NeuROS's base image."""
+    reason = ""
+    try:
+        engine = connect()
+    except EnvironmentFault as fault:
+        reason = str(fault)
+    else:
+        if not engine.images.list("neuros_python"):
+            reason = "the image of neuros_python is not built: run ./install.py"
+            engine.close()
+    if reason:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    yield engine
+    engine.close()
+
+
+class Bench:
+    """A project with one container of its own, whose name nobody else has."""
+
+    def __init__(self, folder: Path, engine: Any, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self.engine, self._capsys = folder, engine, capsys
+        self.name = f"test_{uuid.uuid4().hex[:10]}"
+        self.recipe = folder / "containers" / self.name
+        self.recipe.mkdir(parents=True)
+        self.wheels = folder / "wheels"
+        self.wheels.mkdir()
+
+    def write(self, dockerfile: str) -> None:
+        (self.recipe / "Dockerfile").write_text(dockerfile)
+
+    def require(self, *rows: str) -> None:
+        (self.recipe / "requirements.txt").write_text("\n".join(rows))
+
+    def wheel(self, name: str, version: str) -> None:
+        """Put a package with one module into the wheelhouse."""
+        about = f"{name}-{version}.dist-info"
+        files = {
+            f"{name}.py": f"version = '{version}'\n",
+            f"{about}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+            f"{about}/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        }
+        with zipfile.ZipFile(self.wheels / f"{name}-{version}-py3-none-any.whl", "w") as archive:
+            for file, content in files.items():
+                archive.writestr(file, content)
+            record = "".join(f"{file},,\n" for file in [*files, f"{about}/RECORD"])
+            archive.writestr(f"{about}/RECORD", record)
+
+    def build(self, *options: str) -> tuple[int, str, str]:
+        """The exit code, standard output, and the last line of standard error."""
+        code = main(["containers", "build", str(self.recipe), *options])
+        written = self._capsys.readouterr()
+        return code, written.out, (written.err.splitlines() or [""])[-1]
+
+    def containers(self, *arguments: str) -> str:
+        assert main(["containers", *arguments]) == 0
+        return self._capsys.readouterr().out
+
+    def run(self, *command: str) -> str:
+        """What a command prints in the image."""
+        image = image_for(self.name, self.folder, self.engine)
+        container = self.engine.containers.create(
+            image.id, entrypoint=[*command], network_mode="none"
+        )
+        try:
+            container.start()
+            container.wait()
+            return container.logs().decode()
+        finally:
+            container.remove(force=True)
+
+    def remove_images(self) -> None:
+        """Those with a name, and the steps of builds that failed, which the engine keeps."""
+        for tag in self.tags:
+            self.engine.images.remove(tag)
+        log = self.folder / "cache" / "neuros" / "builds" / f"{self.name}.log"
+        steps = re.findall(r"---> ([0-9a-f]{12})$", log.read_text() if log.exists() else "", re.M)
+        for step in steps[-1:]:
+            with suppress(APIError):  # it is in use, or is gone with the tag
+                if not self.engine.images.get(step).tags:
+                    self.engine.images.remove(step)
+
+    @property
+    def tags(self) -> list[str]:
+        return [tag for image in self.engine.images.list(self.name) for tag in image.tags]
+
+
+@pytest.fixture
+def bench(
+    tmp_path: Path,
+    engine: Any,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Bench]:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    containers_before = {each.id for each in engine.containers.list(all=True)}
+    bench = Bench(tmp_path, engine, capsys)
+    yield bench
+    bench.remove_images()
+    left = [
+        each
+        for each in engine.containers.list(all=True, ignore_removed=True)
+        if each.id not in containers_before
+        and each.labels.get("neuros.image.container") == bench.name
+    ]
+    assert not left
+
+
+PYTHON = "/opt/neuros/bin/python"
+
+
+class TestRequirements:
+    """A ``requirements.txt`` is enough; the wheels come from a folder."""
+
+    @pytest.fixture
+    def options(self, bench: Bench) -> tuple[str, ...]:
+        bench.wheel("neurosprobe", "1.0")
+        bench.wheel("neurosprobe", "2.0")
+        return ("--wheelhouse", str(bench.wheels))
+
+    def test_they_are_installed_beside_what_nodes_need(
+        self, bench: Bench, options: tuple[str, ...]
+    ) -> None:
+        bench.require("neurosprobe==1.0")
+        code, out, _ = bench.build(*options)
+        assert (code, f"{bench.name}: built in " in out) == (0, True)
+        program = "import neurosprobe, rclpy, os; print(neurosprobe.version, os.getuid())"
+        assert bench.run(PYTHON, "-c", program).split() == ["1.0", "1000"]
+        image = image_for(bench.name, bench.folder, bench.engine)
+        assert (image.start, image.notice) == ((PYTHON,), "")
+
+    def test_what_is_built_is_not_built_again(self, bench: Bench, options: tuple[str, ...]) -> None:
+        bench.require("neurosprobe==1.0")
+        bench.build(*options)
+        before = bench.engine.images.get(bench.tags[0]).id
+        _, out, _ = bench.build(*options)
+        assert f"{bench.name}: up to date" in out
+        assert bench.engine.images.get(bench.tags[0]).id == before
+
+    def test_after_a_change_the_old_one_serves_with_a_notice_until_the_new_one_replaces_it(
+        self, bench: Bench, options: tuple[str, ...]
+    ) -> None:
+        bench.require("neurosprobe==1.0")
+        bench.build(*options)
+        (old,) = bench.tags
+        bench.require("neurosprobe==2.0")
+        notice = image_for(bench.name, bench.folder, bench.engine).notice
+        assert "is older than its recipe: run ./install.py --containers " in notice
+        bench.build(*options)
+        assert bench.tags != [old]
+        assert len(bench.tags) == 1
+        program = "import neurosprobe; print(neurosprobe.version)"
+        assert bench.run(PYTHON, "-c", program).split() == ["2.0"]
+
+    def test_what_cannot_be_had_is_named_and_the_image_that_was_there_stays(
+        self, bench: Bench, options: tuple[str, ...]
+    ) -> None:
+        bench.require("neurosprobe==1.0")
+        bench.build(*options)
+        before = bench.tags
+        bench.require("neurosprobe==3.0")
+        code, _, error = bench.build(*options)
+        assert code == 4
+        assert (
+            f"image '{bench.name}' cannot be built: there is no package neurosprobe==3.0" in error
+        )
+        assert bench.tags == before
+
+    def test_what_excludes_each_other_is_said(self, bench: Bench, options: tuple[str, ...]) -> None:
+        bench.require("neurosprobe==1.0", "neurosprobe>1")
+        code, _, error = bench.build(*options)
+        assert (code, bench.tags) == (4, [])
+        assert "its requirements.txt cannot be satisfied" in error
+
+
+class TestDockerfiles:
+    def test_certificates_serve_the_build_and_are_gone_afterwards(self, bench: Bench) -> None:
+        (bench.folder / "ca.pem").write_text("certificates\n")
+        bench.write('FROM neuros_python\nRUN cat "$PIP_CERT" > /tmp/seen\n')
+        code, _, _ = bench.build("--ca-bundle", str(bench.folder / "ca.pem"))
+        assert code == 0
+        assert bench.run("sh", "-c", "ls /tmp; cat /tmp/seen").split() == ["seen", "certificates"]
+        assert bench.run("id", "-u").strip() == "1000"
+
+    def test_an_argument_reaches_the_dockerfile_and_is_remembered(self, bench: Bench) -> None:
+        bench.write("FROM neuros_python\nARG VARIANT=cpu\nENV VARIANT=$VARIANT\n")
+        bench.build("--build-arg", "VARIANT=cuda")
+        assert bench.run("sh", "-c", "echo $VARIANT").strip() == "cuda"
+        _, out, _ = bench.build()
+        assert f"{bench.name}: up to date" in out
+
+    @pytest.mark.parametrize(
+        ("step", "cause"),
+        [
+            ("RUN echo first && false", "returned a non-zero code: 1"),
+            ("COPY nothing /", "a file that its Dockerfile copies is not beside it"),
+            ("RUN touch /x", "put USER 0 above it"),
+        ],
+    )
+    def test_a_step_that_fails_is_shown_with_the_log_and_leaves_no_image(
+        self, step: str, cause: str, bench: Bench
+    ) -> None:
+        bench.write(f"FROM neuros_python\n{step}\n")
+        code, out, error = bench.build()
+        assert (code, bench.tags) == (4, [])
+        assert f"neuros: image '{bench.name}' cannot be built: " in error
+        assert cause in error
+        log = bench.folder / "cache" / "neuros" / "builds" / f"{bench.name}.log"
+        assert f"(log: {log})" in error
+        assert f" : {step}" in log.read_text()
+        assert f" : {step}" in out
+
+    def test_an_image_that_can_never_run_nodes_gets_no_name(self, bench: Bench) -> None:
+        bench.write("FROM scratch\nCOPY Dockerfile /\n")
+        code, _, error = bench.build()
+        assert (code, bench.tags) == (4, [])
+        assert f"image '{bench.name}' has no Python: take one with Python 3.10 to 3.14" in error
+
+
+class TestImagesOfUsers:
+    """Any image that the engine has can be a container."""
+
+    @pytest.fixture
+    def mine(self, engine: Any, bench: Bench) -> Iterator[str]:
+        """An image that its user built on NeuROS's, as Docker's documentation says."""
+        tag = f"mine_{bench.name}:1.0"
+        engine.images.get("neuros_python").tag(tag)
+        yield tag
+        engine.images.remove(tag)
+
+    def test_one_that_can_run_nodes_is_used_as_it_is(
+        self, mine: str, engine: Any, bench: Bench
+    ) -> None:
+        assert image_for(mine, bench.folder, engine).id == engine.images.get(mine).id
+
+    def test_it_is_none_of_those_that_neuros_lists_and_removes(
+        self, mine: str, engine: Any, bench: Bench
+    ) -> None:
+        bench.write("FROM neuros_python\n")
+        bench.build()
+        listed = bench.containers("list")
+        assert bench.tags[0] in listed
+        assert mine not in listed
+        assert bench.containers("remove", bench.name).startswith("removed ")
+        assert bench.tags == []
+        assert engine.images.get(mine)
+
+    def test_one_that_is_not_there_is_told_apart_from_one_that_is_not_built(
+        self, bench: Bench, engine: Any
+    ) -> None:
+        with pytest.raises(EnvironmentFault, match="the engine has no image of that name"):
+            image_for("nowhere/image:1", bench.folder, engine)
+        bench.write("FROM neuros_python\n")
+        with pytest.raises(EnvironmentFault) as caught:
+            image_for(bench.name, bench.folder, engine)
+        assert str(caught.value) == (
+            f"the image of container '{bench.name}' is not built: run ./install.py --containers"
+            f" {bench.folder}"
+        )
+
+    @pytest.fixture
+    def bare(self, engine: Any) -> str:
+        """An image with Python and without rclpy."""
+        for name in ("debian-python:bookworm", "debian-python:trixie"):
+            try:
+                return str(engine.images.get(name).tags[0])
+            except APIError:
+                continue
+        reason = "no image with Python alone: .ci/docker-engine start makes one"
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+        raise AssertionError
+
+    def test_one_without_rclpy_is_refused_with_what_adds_it(
+        self, bare: str, engine: Any, bench: Bench
+    ) -> None:
+        with pytest.raises(EnvironmentFault, match=f"run ./install.py --containers {bare}"):
+            image_for(bare, bench.folder, engine)
