@@ -12,6 +12,7 @@ first_hook  when a node has started its first hook                    node
 shutdown    when a plugin calls ``node.shutdown``                     node, reason, drain_s
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines
+heard       from a node of another launcher; null: it is gone         node, text
 =========== ========================================================= =====================
 
 ======= ================================================ ======
@@ -21,6 +22,8 @@ probe   report between two events, all at one moment     number
 explain say why nothing moves
 drain   stop the hooks that send unasked
 stop    start no further hook, finalise and end
+say     let nodes elsewhere hear this (see launch.sides) text
+leave   all is said and heard: a node at its end may go
 ======= ================================================ ======
 """
 

@@ -108,6 +108,16 @@ class EventLoop(Protocol):
         """End :meth:`run` after the current event. Any thread."""
 
 
+class Voice(Protocol):
+    """What nodes say to those that another launcher has started."""
+
+    def say(self, text: str) -> None:
+        """Let it be heard elsewhere, also by who comes later. Any thread."""
+
+    def close(self) -> None:
+        """Let the last word arrive, then be silent."""
+
+
 class Middleware(Protocol):
     """What joins the nodes of this process to each other and to the rest of the world."""
 
@@ -129,6 +139,17 @@ class Middleware(Protocol):
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has subscriptions, timers, services or clients on its ROS node."""
+
+    def join_sides(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        heard: Callable[[str, str | None], None],
+    ) -> Voice:
+        """Speak for the nodes ``names`` of this process, and listen to nodes elsewhere.
+
+        ``heard`` is called from any thread, with a node and its word, or ``None`` when it is gone.
+        """
 
     def copy(self, packet: Packet) -> Packet:
         """A packet that shares nothing with this one."""

@@ -41,11 +41,14 @@ def is_within(module: str, package: str) -> bool:
 SUPERVISOR = (
     "supervisor",
     "channels",
+    "ending",
     "outcome",
     "probing",
     "processes",
     "quiescence",
+    "sides",
     "watch",
+    "word",
 )
 
 # The first room that holds a module is its room.

@@ -28,9 +28,11 @@ from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.outcome import Outcome
 from neuros.launch.sessions import Session, guardian_environment, this_process
+from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
 from neuros.observe.report import run_record, run_table
 from neuros.project.model import NodeFile
+from neuros.runtime.side import ELSEWHERE_VARIABLE
 
 EXIT_ENVIRONMENT = 4
 _ENDED_BY_SIGNAL = (130, 143)
@@ -161,17 +163,22 @@ class _Run:
             self._console,
             self._signals,
             duration_s=self._plan.duration.wall_s,
-            is_partial=self._plan.is_partial,
+            sides=Sides(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
             waker=self._waker,
         )
 
+    def _where_to_start(self) -> str:
+        """How nodes elsewhere join this run."""
+        reach = " and --network" if self._plan.network.is_wide else ""
+        return f" (started by -n, with the same nodes and connections, -d {self._domain.id}{reach})"
+
     def _environment(self) -> dict[str, str]:
         """What every node gets, whatever the shell that NeuROS was started from has sourced."""
-        discovery = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         return {
+            **self._plan.network.environment(os.environ),
+            ELSEWHERE_VARIABLE: ",".join(self._plan.elsewhere),
             "NEUROS_RUN_ID": self._run_id,
             "ROS_DOMAIN_ID": str(self._domain.id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
             "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # the only one that the wheels bring
             "ROS_LOG_DIR": str(self._run_folder),
         }

@@ -26,6 +26,7 @@ from neuros import __version__
 from neuros.cli.benchmark import add_benchmark
 from neuros.cli.containers import add_containers
 from neuros.cli.doctor import add_doctor
+from neuros.cli.network import add_network
 from neuros.cli.observation import add_observation
 from neuros.cli.sessions import add_sessions
 from neuros.cli.verify import add_verify
@@ -126,8 +127,9 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         type=int,
         metavar="ID",
         help="ROS domain (default: ROS_DOMAIN_ID; else 0 where the project has external topics"
-        " or -n is used; else the first free one of 1 to 101)",
+        ", or -n or --network is used; else the first free one of 1 to 101)",
     )
+    add_network(launch)
     launch.add_argument(
         "--backend",
         choices=("auto", "docker", "process", "in-process"),

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 
 from neuros.cli.back_end import BackEnd, choose_back_end
+from neuros.cli.network import THIS_MACHINE, Network, chosen_network
 from neuros.cli.projects import load
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
@@ -45,6 +46,12 @@ class Plan:
     is_placed: bool = True
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
     has_digests: bool = False
+    network: Network = THIS_MACHINE
+
+    @property
+    def elsewhere(self) -> tuple[str, ...]:
+        """The nodes that are left out: they may be running elsewhere."""
+        return tuple(node.name for node in self.project.nodes if node.name not in self.names)
 
     @property
     def backend(self) -> str:
@@ -53,15 +60,16 @@ class Plan:
 
     @property
     def is_partial(self) -> bool:
-        """Whether some nodes are left out: they may be running elsewhere."""
-        return len(self.names) < len(self.project.nodes)
+        """Whether there are such nodes."""
+        return bool(self.elsewhere)
 
     @property
     def needs_known_domain(self) -> bool:
         """Whether others have to find this run, so that it cannot hide in a domain of its own."""
         nodes = self.project.nodes
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
-        return self.is_partial or any(port.external_topic is not None for port in ports)
+        has_external_topics = any(port.external_topic is not None for port in ports)
+        return self.is_partial or self.network.is_wide or has_external_topics
 
     def node_files(self, folders: Folders) -> list[NodeFile]:
         """One ``node.json`` per node that is to be started."""
@@ -105,6 +113,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
     """
     duration = parse_duration(options.duration)
     project = load(options)
+    network = chosen_network(options.network, options.peers)
     names = _chosen_names(project, options.node, options.backend)
     back_end = choose_back_end(options.backend, project, names)
     is_placed = not options.no_placement
@@ -120,7 +129,13 @@ def make_plan(options: argparse.Namespace) -> Plan:
         is_placed,
         pythons,
         has_digests=options.digests,
+        network=network,
     )
+    if back_end.name == "in-process" and network.is_wide and plan.is_partial:
+        raise UsageError(
+            "--network with -n: the nodes of the in-process back end reach none elsewhere; use"
+            " --backend process"
+        )
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
@@ -161,12 +176,11 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     if plan.backend == "in-process":
         nodes = [plan.project.node(name) for name in plan.names]
         require_one_python(nodes, plan.project.folder, environ)
-    is_local = environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
+    is_local = plan.network.environment(environ)[RANGE_VARIABLE] == "LOCALHOST"
     if plan.backend != "in-process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(
             f"{len(plan.names)} processes are more than find each other with discovery on this"
-            f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or set"
-            f" {RANGE_VARIABLE}=SUBNET"
+            f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or --network"
         )
 
 

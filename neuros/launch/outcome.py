@@ -6,7 +6,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}
 SIGNAL_NAMES = {
@@ -14,6 +14,16 @@ SIGNAL_NAMES = {
     signal.SIGTERM: "SIGTERM",
     signal.SIGHUP: "SIGHUP (the terminal was closed)",
 }
+
+
+class Output(Protocol):
+    """Where the supervisor writes for people; neither call may wait for a reader.
+
+    ``poll`` shows what nodes have logged since; it returns whether that was anything.
+    """
+
+    def log(self, severity: str, text: str) -> None: ...
+    def poll(self) -> object: ...
 
 
 class Phase(Enum):
@@ -36,6 +46,7 @@ class Outcome:
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.
         timelines: by node, points of simulated against wall time; each report brings further ones.
+        elsewhere: what nodes that other launchers started counted on connections to here.
         started_s: when the first hook started, ``None`` if none did.
         ending_s: when the end was asked for first: what comes after is draining and finalising.
         ended_s: when all processes had ended.
@@ -49,6 +60,7 @@ class Outcome:
     reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     report_times_s: dict[str, float] = field(default_factory=dict)
     timelines: dict[str, list[Sequence[float]]] = field(default_factory=dict)
+    elsewhere: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     started_s: float | None = None
     ending_s: float | None = None
     ended_s: float = 0.0

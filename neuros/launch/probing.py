@@ -7,6 +7,7 @@ from enum import Enum
 from typing import Any
 
 from neuros.launch import quiescence
+from neuros.launch.sides import Sides
 from neuros.project.model import Connection, NodeFile
 
 DEADLOCK_AFTER_S = 1.0
@@ -35,6 +36,7 @@ class Probing:
         names: the nodes, all of which have to answer.
         connections: those among them.
         send: sends to all processes, ``send("probe", number=3)``.
+        sides: who has to agree that the project is drained, where not all nodes are here.
     """
 
     def __init__(
@@ -42,10 +44,12 @@ class Probing:
         names: Iterable[str],
         connections: Sequence[Connection],
         send: Callable[..., object],
+        sides: Sides | None = None,
     ) -> None:
         self._names = set(names)
         self._connections = connections
         self._send = send
+        self._sides = sides
         self._is_draining = False
         self._number = 0
         self._asked_s = 0.0
@@ -125,8 +129,13 @@ class Probing:
             this_round = quiescence.counters(probes)
             is_over, verdict = quiescence.is_dead(probes, connections), Verdict.DEAD
         is_stable, self._last_round = this_round == self._last_round, this_round
-        if is_over and is_stable:
+        if is_over and is_stable and self._others_agree():
             self.verdict = verdict
+        elif self._sides is not None and not (is_over and is_stable):
+            self._sides.unsettle()
+
+    def _others_agree(self) -> bool:
+        return self._sides is None or self._sides.settle(self._probes)
 
 
 def connections_among(files: Sequence[NodeFile]) -> list[Connection]:

@@ -7,38 +7,26 @@ for a node or for a reader of its output.
 
 from __future__ import annotations
 
-import signal
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from neuros.control import Lines
 from neuros.launch.channels import Channels
-from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Phase
+from neuros.launch.ending import STOP_S, Ending
+from neuros.launch.outcome import Outcome, Output, Phase
 from neuros.launch.probing import Probing, Verdict, connections_among
-from neuros.launch.processes import Processes, names_of
+from neuros.launch.processes import Processes
+from neuros.launch.sides import Sides
 from neuros.launch.watch import Watch
 from neuros.ports import Launcher
 from neuros.project.model import NodeFile
 
-STOP_S = 5.0
-"""What nodes have for their finalise hooks and for flushing, in all."""
-
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
-
-
-class Output(Protocol):
-    """Where the supervisor writes for people; neither call may wait for a reader.
-
-    ``poll`` shows what nodes have logged since; it returns whether that was anything.
-    """
-
-    def log(self, severity: str, text: str) -> None: ...
-    def poll(self) -> object: ...
 
 
 class Supervisor:
@@ -52,7 +40,7 @@ class Supervisor:
         output: for log records; its ``poll`` shows what nodes have logged.
         signals: numbers of the signals that have arrived, appended to by a signal handler.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
-        is_partial: whether nodes that are not started here may be running elsewhere.
+        sides: who starts the other nodes of the project, where not all are started here.
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
             hosts that end before they have connected, are seen a fifth of a second late.
 
@@ -70,26 +58,38 @@ class Supervisor:
         signals: list[int],
         *,
         duration_s: float | None = None,
-        is_partial: bool = False,
+        sides: Sides | None = None,
         waker: socket.socket | None = None,
     ) -> None:
         self._files = files
         self._launcher = launcher
         self._environment = environment
         self._output = output
-        self._signals = signals
         self._duration_s = duration_s
-        self._is_partial = is_partial
+        self._sides = sides or Sides("", (), files)
         names = [file.node.name for file in files]
-        self._phase = Phase.RUNNING
-        self._deadline_s = 0.0
         self._channels = Channels(run_folder)
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
         self._watch = Watch(names, time.monotonic())
         self._processes = Processes(self._watch, self.outcome)
-        self._probing = Probing(names, connections_among(files), self._channels.send)
+        self._sides.speak_through(lambda text: self._channels.send("say", text=text))
+        self._probing = Probing(
+            names,
+            connections_among(files),
+            self._channels.send,
+            self._sides if self._sides.exist else None,
+        )
+        self._ending = Ending(
+            self._channels,
+            self._processes,
+            self._probing,
+            self._sides,
+            self.outcome,
+            output,
+            signals,
+        )
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
             "report": self._on_report,
@@ -97,18 +97,19 @@ class Supervisor:
             "shutdown": self._on_shutdown,
             "failed": self._on_failed,
             "explanation": self._on_explanation,
+            "heard": self._on_heard,
         }
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
         try:
-            self._heed_signals()  # one may have come before anything was started
-            if self._phase is Phase.RUNNING:
+            self._ending.heed_signals()  # one may have come before anything was started
+            if self._ending.phase is Phase.RUNNING:
                 self._processes.add(self._launcher.start(self._files, self._environment))
             has_shown = True
-            while self._processes and not self._is_hopeless():
+            while self._processes and not self._ending.is_hopeless:
                 self._channels.wait(self._pause_s(has_shown))
-                self._heed_signals()
+                self._ending.heed_signals()
                 self._hear()
                 self._look_at_processes()
                 self._look_at_time()
@@ -119,6 +120,7 @@ class Supervisor:
                 process.kill()
             self._hear()
             self._channels.close()
+            self.outcome.elsewhere = self._sides.books()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
 
@@ -133,7 +135,9 @@ class Supervisor:
 
     def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
         self._watch.greet(message["nodes"])
-        if self._phase is not Phase.RUNNING:
+        if self._sides.exist:
+            self._channels.send_to(lines, "say", text=self._sides.word)
+        if self._ending.phase is not Phase.RUNNING:
             self._channels.send_to(lines, "stop")
 
     def _on_report(self, _: Lines, message: Mapping[str, Any]) -> None:
@@ -148,71 +152,21 @@ class Supervisor:
 
     def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
         reason = f": {message['reason']}" if message["reason"] else ""
-        self._drain(f"{message['node']} ended the project{reason}", float(message["drain_s"]))
+        self._ending.drain(
+            f"{message['node']} ended the project{reason}", float(message["drain_s"])
+        )
 
     def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
         self._processes.note_failure(message["node"])
         first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
-        self._fail(f"node '{message['node']}' failed: {first_line}")
+        self._ending.fail(f"node '{message['node']}' failed: {first_line}")
+
+    def _on_heard(self, _: Lines, message: Mapping[str, Any]) -> None:
+        self._sides.hear(message["node"], message["text"], time.monotonic())
 
     def _on_explanation(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self._phase is Phase.RUNNING:
+        if self._ending.phase is Phase.RUNNING:
             self._output.log("WARN", f"{message['node']} {'; '.join(message['lines'])}")
-
-    # ------------------------------------------------------------------ ending
-
-    def _drain(self, reason: str, drain_s: float) -> None:
-        if self._phase is not Phase.RUNNING:
-            return
-        self._phase = Phase.DRAINING
-        now_s = time.monotonic()
-        self.outcome.begin_to_end(now_s)
-        self.outcome.reason = reason
-        self._deadline_s = now_s + drain_s
-        self._output.log("INFO", f"{reason}; letting packets under way arrive")
-        # A node that is still loading has sent nothing, and nobody could send to it yet.
-        for process in self._processes.not_loaded():
-            self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
-            self._processes.kill(process)
-        self._channels.send("drain")
-        self._probing.drain(self._processes.killed, now_s)
-
-    def _fail(self, reason: str) -> None:
-        self.outcome.fail(reason)
-        if self._phase in (Phase.RUNNING, Phase.DRAINING):
-            self._stop()
-
-    def _stop(self) -> None:
-        self._phase = Phase.STOPPING
-        now_s = time.monotonic()
-        self.outcome.begin_to_end(now_s)
-        self._deadline_s = now_s + STOP_S
-        self._channels.send("stop")
-        for process in self._processes.not_loaded():
-            self._processes.kill(process)  # it has not come as far as anything worth finalising
-
-    def _kill_all(self) -> None:
-        self._phase = Phase.KILLED
-        self._deadline_s = time.monotonic() + STOP_S
-        for process in self._processes:
-            self._processes.kill(process)
-
-    def _heed_signals(self) -> None:
-        while self._signals:
-            number = signal.Signals(self._signals.pop(0))
-            name = SIGNAL_NAMES[number]
-            if self._phase in (Phase.RUNNING, Phase.DRAINING):
-                self.outcome.exit_code = EXIT_CODES[number]
-                self.outcome.reason = f"ended by {name}"
-                self._output.log("INFO", f"{name}: stopping (once more kills at once)")
-                self._stop()
-                self.outcome.is_signalled = True
-            elif self._phase is Phase.STOPPING and self.outcome.is_signalled:
-                self._output.log("WARN", f"{name} again: killing what is left")
-                self._kill_all()
-            elif self._phase is Phase.STOPPING:
-                self.outcome.is_signalled = True
-                self._output.log("INFO", f"{name}: already ending (once more kills at once)")
 
     # ------------------------------------------------------------------ processes
 
@@ -221,19 +175,17 @@ class Supervisor:
         if ended:
             self._hear()  # what they said last has arrived by now
         for process, how in ended:
-            is_stopping = self._phase is Phase.STOPPING
+            is_stopping = self._ending.phase is Phase.STOPPING
             if not self._processes.may_end(process, is_stopping=is_stopping):
-                self._fail(self._processes.how_it_failed(process, how, is_stopping=is_stopping))
-
-    def _is_hopeless(self) -> bool:
-        """Whether something outlasts even SIGKILL; the guardian will try on for a while."""
-        return self._phase is Phase.KILLED and time.monotonic() >= self._deadline_s
+                self._ending.fail(
+                    self._processes.how_it_failed(process, how, is_stopping=is_stopping)
+                )
 
     # ------------------------------------------------------------------ time
 
     def _pause_s(self, has_shown: bool) -> float:
         """How long nothing needs to be looked at; ``has_shown``: nodes are logging now."""
-        if has_shown or self._phase is not Phase.RUNNING:
+        if has_shown or self._ending.phase is not Phase.RUNNING:
             return _TICK_S
         limit_s, started_s = self._duration_s, self.outcome.started_s
         if limit_s is None or started_s is None:
@@ -242,32 +194,21 @@ class Supervisor:
 
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
-        if self._phase is Phase.STOPPING and now_s >= self._deadline_s:
-            for process in self._processes:
-                self._output.log(
-                    "WARN", f"{names_of(process)}: not ended after {STOP_S:g} s, killed"
-                )
-            self._kill_all()
-        elif self._phase is Phase.DRAINING:
-            if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
-                self._stop()
-            elif now_s >= self._deadline_s:
-                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
-                self._output.log("WARN", f"not drained in time, so packets may be lost: {why}")
-                self._stop()
-        elif self._phase is Phase.RUNNING:
+        self._ending.heed_sides()
+        self._ending.look(now_s)
+        if self._ending.phase is Phase.RUNNING:
             self._look_at_run(now_s)
 
     def _look_at_run(self, now_s: float) -> None:
         started_s, limit_s = self.outcome.started_s, self._duration_s
         if limit_s is not None and started_s is not None and now_s - started_s >= limit_s:
-            self._drain(f"{limit_s:g} s are over", STOP_S)
+            self._ending.drain(f"{limit_s:g} s are over", STOP_S)
             return
-        for severity, text in self._watch.remarks(now_s):
+        for severity, text in (*self._watch.remarks(now_s), *self._sides.remarks(now_s)):
             self._output.log(severity, text)
         if self._watch.has_just_stalled(now_s):
             self._channels.send("explain")
-        if self._is_partial or not self._watch.is_complete:  # then not all can be asked
+        if self._sides.exist or not self._watch.is_complete:  # then not all can be asked
             return
         if self._probing.look(now_s, self._watch.rested_s(now_s)) is Verdict.DEAD:
-            self._fail(self._probing.why_dead())
+            self._ending.fail(self._probing.why_dead())

@@ -25,6 +25,7 @@ class Ended(Protocol):
     report_times_s: dict[str, float]
     timelines: dict[str, list[Sequence[float]]]
     started_s: float | None
+    elsewhere: Mapping[str, Mapping[str, Any]]
     ending_s: float | None
     ended_s: float
 
@@ -40,6 +41,7 @@ def run_record(
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
     sim_s = max(sim_times, default=None)
     running_s = _running_s(ended)
+    ledgers = {**ended.elsewhere, **{n: r["ledger"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
         "project": project.name,
@@ -54,7 +56,7 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, ended.reports, running_s, run_folder) for c in _connections(files)
+            _connection(c, ledgers, running_s, run_folder) for c in _connections(files)
         ],
         "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
         "expanded_project": project_to_json(project),
@@ -121,15 +123,15 @@ def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[floa
 
 def _connection(
     connection: Connection,
-    reports: Mapping[str, Any],
+    ledgers: Mapping[str, Mapping[str, Any]],
     running_s: float | None,
     run_folder: Path,
 ) -> dict[str, Any]:
     from neuros.observe.packets import packet_figures, read_packets
 
     key = str(connection)
-    outgoing = _ledger(reports, connection.source_node, "outgoing").get(key, {})
-    incoming = _ledger(reports, connection.destination_node, "incoming").get(key, {})
+    outgoing = ledgers.get(connection.source_node, {}).get("outgoing", {}).get(key, {})
+    incoming = ledgers.get(connection.destination_node, {}).get("incoming", {}).get(key, {})
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
     return {
@@ -146,14 +148,6 @@ def _connection(
             may_lose=not connection.is_reliable and sent != received,
         ),
     }
-
-
-def _ledger(reports: Mapping[str, Any], node: str, part: str) -> Mapping[str, Any]:
-    report = reports.get(node)
-    if report is None or report["ledger"] is None:
-        return {}
-    found: Mapping[str, Any] = report["ledger"][part]
-    return found
 
 
 def _node(name: str, ended: Ended) -> dict[str, Any]:

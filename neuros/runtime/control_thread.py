@@ -25,6 +25,8 @@ class Controlled(Protocol):
     def probe(self, number: int) -> None: ...
     def report(self) -> None: ...
     def explain(self) -> None: ...
+    def say(self, text: str) -> None: ...
+    def leave(self) -> None: ...
 
 
 class ControlThread(threading.Thread):
@@ -72,6 +74,7 @@ class ControlThread(threading.Thread):
         messages = self._lines.receive()
         if messages is None:
             self._process.ask_to_stop()
+            self._process.leave()
             return False
         for message in messages:
             self._obey(message)
@@ -88,6 +91,10 @@ class ControlThread(threading.Thread):
             process.post(lambda: process.probe(number))
         elif kind == "explain":
             self._try(process.explain)
+        elif kind == "say":
+            self._try(lambda: process.say(str(message["text"])))
+        elif kind == "leave":
+            process.leave()
 
     def _try(self, action: Callable[[], None]) -> None:
         try:

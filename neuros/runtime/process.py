@@ -19,6 +19,7 @@ from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.plugin import describe, plugin_traceback
 from neuros.runtime.scope import Stage
+from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
@@ -56,6 +57,9 @@ class NodeProcess:
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._lines: Lines | None = None
+        self._side = SideLink(
+            [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
+        )
 
     def run(self) -> int:
         """Run to the end; returns 0 if it was asked to end, 1 if a node failed."""
@@ -70,6 +74,7 @@ class NodeProcess:
             for node in self._nodes:
                 self._guard(node.finalise)
             self._guard(lambda: self.report(is_final=True))
+            self._guard(self._side.close)
             if self._middleware is not None:
                 self._guard(self._middleware.close)
             thread.end()
@@ -121,11 +126,20 @@ class NodeProcess:
             if node.engine is None or node.engine.executing is None:
                 self._tell("explanation", node=node.name, lines=node.explain())
 
+    def say(self, text: str) -> None:
+        """Pass on to nodes elsewhere what the launcher says. Any thread."""
+        self._side.say(text)
+
+    def leave(self) -> None:
+        """Nothing more will be said to nodes elsewhere. Any thread."""
+        self._side.leave()
+
     # ------------------------------------------------------------------ inside
 
     def _live(self) -> None:
         self._open_middleware()
         assert self._middleware is not None
+        self._side.open(self._middleware)
         for file in self._files:
             self._add(file)
         for node in self._nodes:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox, Transport
+from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.testing.step_loop import StepLoop
 from neuros.transport.copying import copy_packet
@@ -150,6 +150,15 @@ class Workbench:
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """A plugin cannot create any here."""
         return False
+
+    def join_sides(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        heard: Callable[[str, str | None], None],
+    ) -> Voice:
+        """There is no other side. Raises ``NotImplementedError``."""
+        raise NotImplementedError("a plugin under test runs in one part")
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""

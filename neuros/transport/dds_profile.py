@@ -21,16 +21,16 @@ PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 """Where Fast DDS 2 looks for its settings when the first ROS node of a process is created."""
 
 PROFILES = Path(__file__).with_name("fast_dds.xml")
-"""NeuROS's settings of Fast DDS, whatever the range."""
+"""NeuROS's settings of Fast DDS for a network: what is lost there is sent again soon."""
 
 LOCAL_PROFILES = Path(__file__).with_name("fast_dds_local.xml")
-"""The same, with transports that stay on this machine."""
+"""Those with transports that stay on this machine."""
 
 MOST_LOCAL_PARTICIPANTS = 120
 """Processes with ROS nodes that one domain has ports for (DDSI-RTPS 2.5, 9.6.2)."""
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-_PEERS_VARIABLE = "ROS_STATIC_PEERS"
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
 
 
 def dds_environment(environ: Mapping[str, str]) -> dict[str, str]:
@@ -41,6 +41,6 @@ def dds_environment(environ: Mapping[str, str]) -> dict[str, str]:
     """
     if environ.get(PROFILES_VARIABLE) not in (None, "", str(PROFILES), str(LOCAL_PROFILES)):
         return {}
-    if environ.get(RANGE_VARIABLE) != "LOCALHOST" or environ.get(_PEERS_VARIABLE):
+    if environ.get(RANGE_VARIABLE) != "LOCALHOST" or environ.get(PEERS_VARIABLE):
         return {PROFILES_VARIABLE: str(PROFILES)}
     return {PROFILES_VARIABLE: str(LOCAL_PROFILES), RANGE_VARIABLE: "SYSTEM_DEFAULT"}

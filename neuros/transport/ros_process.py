@@ -23,6 +23,7 @@ from neuros.transport.outside import RosOutside
 from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.sides import SideVoice
 
 _LINGER_S = 0.05
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
@@ -109,6 +110,15 @@ class RosProcess:
         """Whether a plugin has created something on its ROS node that may call back."""
         own = self._own_entities.get(file.node.name, set())
         return not _entities(self.ros_node(file)) <= own
+
+    def join_sides(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        heard: Callable[[str, str | None], None],
+    ) -> SideVoice:
+        """Speak for nodes of this process, and listen to nodes that another launcher starts."""
+        return SideVoice(names, elsewhere, self._context, heard)
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""

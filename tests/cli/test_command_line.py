@@ -107,6 +107,9 @@ def test_what_does_not_work_yet_is_not_offered(capsys: pytest.CaptureFixture[str
         ([".", "--duration", "0"], "--duration 0: give seconds"),
         ([".", "-d", "300"], "-d/--domain-id: '300' is no ROS domain id"),
         ([".", "--backend", "in-process", "-n", "a"], "-n leaves out one end of a.o -> b.x"),
+        ([".", "--peers", "10.0.0.7,2.3"], "--peers 10.0.0.7,2.3: '2.3' is neither an IPv4"),
+        ([".", "--peers", "a b,"], "--peers a b,: 'a b', '' is neither an IPv4"),
+        ([".", "--peers", "224.0.0.1"], "--peers 224.0.0.1: '224.0.0.1' is neither an IPv4"),
         ([".", "-o", "plugin.py"], "-o plugin.py: is not an empty folder"),
         ([".", "-o", "."], "-o .: is not an empty folder"),
     ],
@@ -307,7 +310,7 @@ def plan_of(count: int, backend: str) -> Plan:
 
 def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_named() -> None:
     too_many = MOST_LOCAL_PARTICIPANTS + 1
-    with pytest.raises(EnvironmentFault, match="--backend in-process, or set ROS_AUTOMATIC"):
+    with pytest.raises(EnvironmentFault, match="--backend in-process, or --network"):
         check_machine(plan_of(too_many, "process"), {})
     check_machine(plan_of(MOST_LOCAL_PARTICIPANTS, "process"), {})
     check_machine(plan_of(too_many, "in-process"), {})

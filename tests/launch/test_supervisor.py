@@ -21,6 +21,7 @@ from neuros.launch.host import HostProcess
 from neuros.launch.in_process import InProcessLauncher
 from neuros.launch.outcome import Outcome
 from neuros.launch.process import ProcessLauncher
+from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
@@ -74,7 +75,7 @@ class Run:
         connections: tuple[Connection, ...] = (),
         in_process: bool = False,
         duration_s: float | None = None,
-        is_partial: bool = False,
+        elsewhere: tuple[str, ...] = (),
         **acts: str,
     ) -> Outcome:
         """Run nodes that do as the text under their names says, to the end."""
@@ -87,7 +88,7 @@ class Run:
             self.output,
             self.signals,
             duration_s=duration_s,
-            is_partial=is_partial,
+            sides=Sides("this run", elsewhere, files),
         )
         start_s = time.monotonic()
         outcome = supervisor.run()
@@ -360,7 +361,7 @@ def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
 
 
 def test_nor_where_other_nodes_run_elsewhere(run: Run) -> None:
-    assert run(a=WELL_BEHAVED, duration_s=2.5, is_partial=True).exit_code == 0
+    assert run(a=WELL_BEHAVED, duration_s=2.5, elsewhere=("b",)).exit_code == 0
 
 
 # ------------------------------------------------------------------ signals

@@ -57,12 +57,26 @@ def test_a_file_of_neuros_that_was_inherited_is_no_file_of_the_users_own() -> No
 
 
 def test_only_what_stays_on_this_machine_is_repaired_late() -> None:
-    """A reader asks 5 ms after it has missed something, if nothing is said, and the writer hears
-    it that long after a publication."""
-    assert duration_ms(PROFILES, "nackSupressionDuration") < 5
-    assert duration_ms(PROFILES, "heartbeatResponseDelay") is None
+    """In a network, a writer asks after 20 ms whether all has come, and hears the answer soon."""
+    assert duration_ms(PROFILES, "heartbeatPeriod") == 20
+    assert duration_ms(PROFILES, "heartbeatResponseDelay") == 1
+    assert duration_ms(PROFILES, "nackResponseDelay") == 1
+    assert duration_ms(LOCAL_PROFILES, "heartbeatPeriod") is None
     assert duration_ms(LOCAL_PROFILES, "nackSupressionDuration") == 20
     assert duration_ms(LOCAL_PROFILES, "heartbeatResponseDelay") == 20
+
+
+def test_no_request_to_send_again_comes_while_requests_are_ignored() -> None:
+    ignored_ms = duration_ms(PROFILES, "nackSupressionDuration")
+    asked_ms = duration_ms(PROFILES, "heartbeatPeriod")
+    assert ignored_ms is not None
+    assert asked_ms is not None
+    assert 0 < ignored_ms < asked_ms
+
+
+def test_on_a_network_there_is_no_shared_memory_that_might_lose_packets_in_silence() -> None:
+    kinds = [kind.text for kind in ElementTree.parse(PROFILES).iter(f"{NAMESPACE}type")]
+    assert kinds == ["UDPv4"]
 
 
 def duration_ms(file: Path, name: str) -> float | None:

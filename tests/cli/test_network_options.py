@@ -1,0 +1,43 @@
+"""How far the nodes of a run look for others: ``--network`` and ``--peers``."""
+
+from __future__ import annotations
+
+import pytest
+
+from neuros.cli.network import chosen_network
+from neuros.errors import EnvironmentFault, UsageError
+
+RANGE, PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
+
+
+def test_nodes_stay_on_this_machine_unless_the_environment_says_otherwise() -> None:
+    network = chosen_network(False, None)
+    assert network.environment({}) == network.environment({RANGE: ""}) == {RANGE: "LOCALHOST"}
+    assert network.environment({RANGE: "SUBNET"}) == {RANGE: "SUBNET"}
+
+
+def test_network_goes_before_the_environment() -> None:
+    assert chosen_network(True, None).environment({RANGE: "LOCALHOST"}) == {RANGE: "SUBNET"}
+
+
+def test_peers_imply_it_and_are_given_as_ros_wants_them() -> None:
+    network = chosen_network(False, " 10.0.0.7, 10.0.0.8,10.0.0.7")
+    assert network.is_wide
+    assert network.environment({}) == {RANGE: "SUBNET", PEERS: "10.0.0.7;10.0.0.8"}
+
+
+def test_a_host_name_becomes_an_address_here_since_a_container_may_not_know_it() -> None:
+    assert chosen_network(False, "localhost").peers == ("127.0.0.1",)
+
+
+@pytest.mark.parametrize(
+    "nonsense", ["", "10.0.0", "10.0.0.256", "1", "0.0.0.0", "239.255.0.1", "a b", "-x", "fe80::1"]
+)
+def test_what_can_be_no_host_is_wrong_usage(nonsense: str) -> None:
+    with pytest.raises(UsageError, match="is neither an IPv4 address nor the name of a host"):
+        chosen_network(False, f"10.0.0.7,{nonsense}")
+
+
+def test_a_name_that_nobody_knows_is_a_fault_of_the_machine() -> None:
+    with pytest.raises(EnvironmentFault, match=r"the host 'robot\.invalid' cannot be found"):
+        chosen_network(False, "robot.invalid")

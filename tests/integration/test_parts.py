@@ -1,0 +1,91 @@
+"""One project, started in parts by several launchers on this machine: it begins and ends as one."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from launching import Running, start
+
+from neuros.launch.domain import choose_domain
+
+STREAM = Path(__file__).parent / "network" / "stream"
+CONNECTION = "source.image -> sink.image"
+FOUND_S = 60.0  # on a machine that does many other things
+ENDLESS = ("--set", "nodes.source.environment.COUNT=0")
+
+
+class Parts:
+    """Starts nodes of the project, each by a launcher of its own, in a domain of their own."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self._folder = folder
+        self._domain = str(domain)
+
+    def start(self, node: str, *arguments: str) -> Running:
+        folder = self._folder / node
+        folder.mkdir()
+        return start(STREAM, "-n", node, "-d", self._domain, *arguments, cwd=folder)
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    with choose_domain(None, {}, False) as domain:
+        yield Parts(tmp_path, domain.id)
+
+
+def test_parts_end_drained_together_and_each_knows_both_ends(parts: Parts) -> None:
+    with parts.start("sink") as sink, parts.start("source") as source:
+        finished = [source.finish(FOUND_S), sink.finish(FOUND_S)]
+    for part in finished:
+        assert part.exit_code == 0, part.output
+        books = part.connection(CONNECTION)
+        assert (books["sent"], books["received"], books["lost"]) == (100, 100, 0)
+        assert books["consumed"] == 100
+    assert finished[1].said("neuros")[-1].endswith("): source ended the project: all sent")
+
+
+def test_the_duration_of_one_part_ends_all(parts: Parts) -> None:
+    with (
+        parts.start("sink", "--duration", "0.5") as sink,
+        parts.start("source", *ENDLESS) as source,
+    ):
+        assert sink.finish(FOUND_S).exit_code == 0
+        finished = source.finish(FOUND_S)
+    assert finished.exit_code == 0
+    assert finished.said("neuros")[-1].endswith("): 0.5 s are over")
+    books = finished.connection(CONNECTION)
+    assert books["sent"] == books["received"] == books["consumed"] > 0
+
+
+def test_a_node_that_is_killed_ends_all_and_its_own_launcher_says_how(parts: Parts) -> None:
+    with parts.start("sink", *ENDLESS) as sink, parts.start("source", *ENDLESS) as source:
+        sink.wait_for("the first image is here", FOUND_S)
+        (pid,) = children(source.process.pid, "source/node.json")
+        subprocess.run(["kill", "-KILL", pid], check=True)
+        assert source.finish().exit_code == sink.finish().exit_code == 1
+    assert "killed by SIGKILL" in source.output
+    assert "node 'source' on " in sink.output
+
+
+def test_a_part_that_is_alone_is_ended_by_ctrl_c_as_ever(parts: Parts) -> None:
+    with parts.start("source") as source:
+        source.wait_for("nodes elsewhere are still waited for: sink (", FOUND_S)
+        source.signal(signal.SIGINT)
+        finished = source.finish()
+    assert finished.exit_code == 130
+    assert finished.connection(CONNECTION)["received"] is None
+
+
+def children(parent: int, argument: str) -> list[str]:
+    """The child processes of a launcher that were given this argument."""
+    listed = subprocess.run(
+        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(parent)],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    return [line.split()[0] for line in listed.splitlines() if argument in line]
