@@ -9,6 +9,7 @@ themselves see to it that nothing is lost.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from benchmarks import dora
@@ -22,7 +23,11 @@ _TIMEOUT_S = 60.0
 
 
 def neuros(
-    packet: Packet, backend: str, seconds: float, connection: dict[str, Any]
+    packet: Packet,
+    backend: str,
+    seconds: float,
+    connection: dict[str, Any],
+    options: Sequence[str] = (),
 ) -> dict[str, float]:
     """From hook to hook, :data:`QUEUE_SIZE` packets in the mailbox."""
     port = {"name": "ball", "type": packet.type}
@@ -42,7 +47,7 @@ def neuros(
         "connections": [{**ends, "queue_size": QUEUE_SIZE, **connection}],
     }
     with project_of_plugins(project) as folder:
-        launch(folder, folder / "run", backend)
+        launch(folder, folder / "run", backend, options=options)
         result = json.loads((folder / "run" / "count" / "result.json").read_text())
     return _figures(packet, result)
 

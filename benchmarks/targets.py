@@ -166,6 +166,26 @@ TARGETS = (
         (Bound("idle", 0.01),),
     ),
     Target(
+        "real-time factor of WhiskEye with a recording of everything",
+        "WhiskEye, recorded",
+        "the same without recording",
+        "recording",
+        (
+            Bound("recorded-hybrid", 0.95, is_maximum=False, label="hybrid"),
+            Bound("recorded-strict", 0.95, is_maximum=False, label="strict"),
+        ),
+    ),
+    Target(
+        "recorder: from the spool into the bag",
+        "recorder",
+        "",
+        "recording",
+        (
+            Bound("recorder-packets", 20_000, is_maximum=False, unit="1/s", label="IMU packets"),
+            Bound("recorder-volume", 120, is_maximum=False, unit="MB/s", label="VGA images"),
+        ),
+    ),
+    Target(
         "ring of 16 nodes: how much slower than its ring of 2, packets/s",
         "ring of 16 against 2",
         "bare rclpy ring of 16 and of 2",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -56,8 +57,11 @@ class Transport(Protocol):
         whether the plugin has kept a reference.
         """
 
-    def send(self, connections: Sequence[Connection], packet: Packet) -> None:
-        """Send one packet on all these connections of one output."""
+    def send(self, connections: Sequence[Connection], packet: Packet) -> bytes | None:
+        """Send one packet on all these connections of one output.
+
+        Returns the serialised packet if that had to be made, so that nobody makes it again.
+        """
 
     def send_external(self, port: Port, packet: Packet) -> None:
         """Publish on the external topic of an output."""
@@ -80,6 +84,34 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Give up all endpoints; further calls have no effect."""
+
+
+class Way(Enum):
+    """How a packet passes a node that keeps it for the recording."""
+
+    SENT = "sent"  # by an output, to other nodes or on its external topic
+    TO_ITSELF = "to itself"  # on a connection of the node to itself
+    HEARD = "heard"  # on the external topic of an input
+    RECEIVED = "received"  # on a connection whose sender is not part of this run
+
+
+class Tap(Protocol):
+    """Where a node puts the packets that are recorded.
+
+    ``name`` is that of the output or input, or the connection where ``way`` is about one.
+    """
+
+    def wants(self, way: Way, name: str) -> bool:
+        """Whether such packets are recorded."""
+
+    def keep(self, way: Way, name: str, data: bytes, sim_time_s: float | None) -> None:
+        """Keep a serialised packet, with the simulated time of the node if it owns one.
+
+        Raises ``OSError`` if it cannot be kept, and nothing after it either.
+        """
+
+    def close(self) -> None:
+        """Keep nothing any more."""
 
 
 class EventLoop(Protocol):
@@ -153,6 +185,9 @@ class Middleware(Protocol):
 
     def copy(self, packet: Packet) -> Packet:
         """A packet that shares nothing with this one."""
+
+    def encode(self, packet: Packet) -> bytes:
+        """A packet as ROS serialises it."""
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""

@@ -65,6 +65,7 @@ ROOMS = (
     Room(4, ("observe",)),
     Room(5, ("runtime",)),
     Room(6, ("cli", "doctor")),
+    Room(6, ("bag",)),
     Room(6, ("testing",)),
     Room(1, ("installation",)),
 )
@@ -84,6 +85,8 @@ THIRD_PARTY: dict[str, set[str]] = {
     "launch.environments.requirements": {"packaging"},
     "cli.sessions": {"tabulate"},
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
+    "observe.bag": {"rosbags", "numpy", "pandas"},
+    "cli.bag": {"tabulate"},
     "testing": {"pytest", "hypothesis"},
 }
 # The core is pure: no threads, no wall clock, no files.

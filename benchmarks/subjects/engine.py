@@ -56,7 +56,7 @@ class Surroundings:
     def send_external(self, port: Port, packet: Any) -> None: ...
     def acknowledge(self, connection: Connection, position: int) -> None: ...
 
-    def copy(self, packet: Any) -> Any:
+    def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet
 
 

@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,9 @@ def floor(simulated_s: float) -> dict[str, float]:
     return {name: figures[name] for name in (RATE, "overlap_bound", "overlapped")}
 
 
-def orchestrated(name: str, backend: str, simulated_s: float) -> dict[str, float]:
+def orchestrated(
+    name: str, backend: str, simulated_s: float, options: Sequence[str] = ()
+) -> dict[str, float]:
     """A project file of the example, without initialisation and ending."""
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = launch(
@@ -139,6 +142,7 @@ def orchestrated(name: str, backend: str, simulated_s: float) -> dict[str, float
             Path(folder) / "run",
             backend,
             settings={"nodes.robot.environment.DURATION": simulated_s},
+            options=options,
         )
     return {
         RATE: float(run[RATE]),

@@ -15,6 +15,7 @@ from neuros.cli.console import Console
 from neuros.cli.environments import make_environments
 from neuros.cli.observation import Observation, check_observation
 from neuros.cli.plan import Plan, make_plan
+from neuros.cli.recording import Recording, log_of, plan_of, summary
 from neuros.cli.run_folder import (
     folders_of,
     make_run_folder,
@@ -30,6 +31,7 @@ from neuros.launch.outcome import Outcome
 from neuros.launch.sessions import Session, guardian_environment, this_process
 from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
+from neuros.observe.recording.plan import RecordingPlan
 from neuros.observe.report import run_record, run_table
 from neuros.project.model import NodeFile
 from neuros.runtime.side import ELSEWHERE_VARIABLE
@@ -43,15 +45,18 @@ def launch(options: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with _signals_noted() as (signals, waker):
         plan = make_plan(options)
+        recording = plan_of(options, plan, os.environ)
+        is_known = plan.needs_known_domain or bool(recording and recording.wanted)
         if not options.dry_run and (ended := make_environments(plan.pythons, signals)):
             return ended
-        with choose_domain(options.domain_id, os.environ, plan.needs_known_domain) as domain:
+        with choose_domain(options.domain_id, os.environ, is_known) as domain:
             if options.dry_run:
-                return _dry_run(plan, domain, options.output)
+                return _dry_run(plan, domain, options.output, recording)
             check_observation(options)
             run_folder = make_run_folder(options.output, plan.project.name)
             files = write_node_files(plan, run_folder)
-            return _Run(plan, files, domain, run_folder, signals, waker).execute(options)
+            run = _Run(plan, files, domain, run_folder, signals, waker, recording)
+            return run.execute(options)
 
 
 class _Run:
@@ -65,6 +70,7 @@ class _Run:
         run_folder: Path,
         signals: list[int],
         waker: socket.socket,
+        recording: RecordingPlan | None,
     ) -> None:
         self._plan = plan
         self._files = files
@@ -76,6 +82,9 @@ class _Run:
         logs = {file.node.name: run_folder / file.node.name / "node.log" for file in files}
         if plan.backend == "in-process":
             logs["host"] = run_folder / "host.log"
+        if recording is not None:
+            logs["recorder"] = log_of(run_folder)
+        self._recording_plan = recording
         self._console = Console(logs, lambda: bool(signals), self._as_here)
 
     def execute(self, options: argparse.Namespace) -> int:
@@ -87,10 +96,12 @@ class _Run:
         guardian.remove_later(self._run_folder / SOCKET_NAME)
         observation = self._observation(options)
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
+        recording = None
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self._run_folder}")
             for severity, notice in self._plan.back_end.notices:
                 self._console.log(severity, notice)
+            recording = self._recording(guardian)
             supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
             supervisor.run()
@@ -99,6 +110,7 @@ class _Run:
             outcome.reason = f"not started: {error}"
             raise
         finally:
+            recorded = None if recording is None else recording.finish(self._signals)
             observed, faults = observation.finish()
             for fault in (*outcome.faults, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
@@ -114,6 +126,10 @@ class _Run:
                 "started": started,
                 **observed,
             }
+            if recording is not None and recorded is not None:
+                for problem in recording.report(recorded, record):
+                    outcome.fail(problem, EXIT_ENVIRONMENT)
+                record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             try:
                 write_record(record, self._run_folder)
             except OSError as error:
@@ -122,9 +138,18 @@ class _Run:
         for reason in outcome.failures:
             if reason != outcome.reason:
                 self._console.log("ERROR", reason)
+        if "recording" in record:
+            self._console.log("INFO", summary(record["recording"]))
         is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return outcome.exit_code
+
+    def _recording(self, guardian: Guardian) -> Recording | None:
+        if self._recording_plan is None:
+            return None
+        return Recording(
+            self._recording_plan, self._run_id, self._run_folder, self._environment(), guardian
+        )
 
     def _observation(self, options: argparse.Namespace) -> Observation:
         names = [file.node.name for file in self._files]
@@ -184,7 +209,9 @@ class _Run:
         }
 
 
-def _dry_run(plan: Plan, domain: DomainLock, output: str | None) -> int:
+def _dry_run(
+    plan: Plan, domain: DomainLock, output: str | None, recording: RecordingPlan | None
+) -> int:
     folder = run_folder_path(output, plan.project.name, "<utc time>")
     print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
     for line in (*plan.pythons.notices, *plan.pythons.describe()):
@@ -193,6 +220,9 @@ def _dry_run(plan: Plan, domain: DomainLock, output: str | None) -> int:
         print(notice)
     for line in plan.launcher(domain.id).describe(plan.node_files(folders_of(plan, folder))):
         print(line)
+    if recording is not None:
+        names = ", ".join([*(topic.name for topic in recording.topics), *recording.listen])
+        print(f"recorder: {names or 'nothing'} ({recording.storage})")
     return 0
 
 

@@ -23,11 +23,14 @@ import sys
 from collections.abc import Sequence
 
 from neuros import __version__
+from neuros.cli.bag import add_bag
 from neuros.cli.benchmark import add_benchmark
 from neuros.cli.containers import add_containers
 from neuros.cli.doctor import add_doctor
 from neuros.cli.network import add_network
 from neuros.cli.observation import add_observation
+from neuros.cli.recording_options import add_recorder, add_recording_options
+from neuros.cli.replay import add_replay
 from neuros.cli.sessions import add_sessions
 from neuros.cli.verify import add_verify
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
@@ -98,9 +101,12 @@ def parser() -> argparse.ArgumentParser:
     add_doctor(commands)
     add_containers(commands)
     add_sessions(commands)
+    add_bag(commands)
+    add_replay(commands)
     add_benchmark(commands)
     add_verify(commands)
     _add_node(commands)
+    add_recorder(commands)
     return result
 
 
@@ -155,6 +161,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         help="leave it to the kernel which node runs on which core; affinity has no effect",
     )
     add_observation(launch)
+    add_recording_options(launch)
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
     launch.set_defaults(command=_launch)
@@ -194,6 +201,7 @@ def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     node.add_argument("--duration-sim", type=float)
     node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
+    node.add_argument("--record", action="store_true")
     node.set_defaults(command=_node)
 
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from neuros.ports import Middleware
+from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.project.split import node_file_from_json
 from neuros.runtime.process import NodeProcess
@@ -45,10 +45,20 @@ def run_node(options: argparse.Namespace) -> int:
     leave.exit_code = NodeProcess(
         files,
         make_middleware,
+        open_tap=_taps(files[0].folders.run) if options.record else None,
         duration_sim_s=options.duration_sim,
         own_logs=options.in_memory,
     ).run()
     return leave.exit_code
+
+
+def _taps(run: Path) -> Callable[[NodeFile], Tap]:
+    """What makes the taps of nodes, as the run's recording has it."""
+    from neuros.observe.recording.plan import load_plan
+    from neuros.observe.recording.spool import open_tap
+
+    plan = load_plan(run)
+    return lambda file: open_tap(plan, run, file.node.name)
 
 
 class _Leave:

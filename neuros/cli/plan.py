@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from neuros.cli.back_end import BackEnd, choose_back_end
 from neuros.cli.network import THIS_MACHINE, Network, chosen_network
 from neuros.cli.projects import load
+from neuros.cli.recording_options import is_recorded
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
@@ -46,6 +47,7 @@ class Plan:
     is_placed: bool = True
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
     has_digests: bool = False
+    is_recorded: bool = False
     network: Network = THIS_MACHINE
 
     @property
@@ -100,6 +102,8 @@ class Plan:
             options.append("--debug")
         if self.has_digests and self.backend == "in-process":  # elsewhere they are always kept
             options.append("--digests")
+        if self.is_recorded:
+            options.append("--record")
         return self.back_end.launcher(
             options, self.placement(domain_id), self.pythons.paths, guardian
         )
@@ -129,6 +133,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
         is_placed,
         pythons,
         has_digests=options.digests,
+        is_recorded=is_recorded(options),
         network=network,
     )
     if back_end.name == "in-process" and network.is_wide and plan.is_partial:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from functools import cache
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -60,8 +59,9 @@ def _recorded(run_folder: Path, connection: str, number: int) -> Any:
 @cache
 def _bag(run_folder: Path) -> Any:
     from neuros.errors import NeurosError
+    from neuros.observe.bag.opened import open_bag
 
     try:
-        return import_module("neuros.bag").open(run_folder)
-    except (ImportError, NeurosError):  # it was not recorded
+        return open_bag(run_folder)
+    except NeurosError:  # it was not recorded
         return None

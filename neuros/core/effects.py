@@ -30,5 +30,5 @@ class Effects(Protocol):
     def post_loop_back(self, event: Callable[[], None]) -> None:
         """Have the loop-back handled after all events that already wait, outside ones too."""
 
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
+    def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
+        """What the node gets on a connection to itself: it shares nothing with this packet."""

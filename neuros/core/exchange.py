@@ -71,7 +71,7 @@ class Exchange:
             self._effects.send(output.elsewhere, packet)
 
     def _send_to_itself(self, connection: Connection, packet: Any) -> None:
-        own = self._effects.copy(packet)
+        own = self._effects.copy_to_itself(connection, packet)
         self._effects.post(lambda: self._deliver(connection, own))
 
     def _acknowledge(self, inlet: Inlet) -> None:

@@ -15,7 +15,7 @@ from neuros.core.hook import Hook
 from neuros.core.ledger import snapshot
 from neuros.errors import HookError, NeurosError, NodeError, PluginError
 from neuros.hooks import HookKind, HookSpec
-from neuros.ports import Logger, Middleware
+from neuros.ports import Logger, Middleware, Tap, Way
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.packet_books import PacketBooks
@@ -33,6 +33,7 @@ class NodeRuntime:
     Args:
         tell: reports to the supervisor, ``tell(kind, **fields)``.
         fail: called with an error that ends the project.
+        tap: where packets go that are recorded, ``None``: none are.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
@@ -49,6 +50,7 @@ class NodeRuntime:
         *,
         tell: Callable[..., object],
         fail: Callable[[str, NeurosError], None],
+        tap: Tap | None = None,
         log_file: Path | None,
         duration_sim_s: float | None,
         on_initialised: Callable[[], None] = lambda: None,
@@ -62,6 +64,7 @@ class NodeRuntime:
         self._stage = stage
         self._tell = tell
         self._fail = fail
+        self._tap = tap
         self._duration_sim_s = duration_sim_s if file.node.owns_time else None
         self._on_initialised = on_initialised
         self._clock = clock
@@ -141,6 +144,9 @@ class NodeRuntime:
             for spec in self._specs:
                 if spec.kind is HookKind.FINALISE:
                     self._guard(lambda spec=spec: self._run_spec(spec, ()))  # type: ignore[misc]
+        if self._tap is not None:
+            self._tap.close()
+            self._tap = None
         for close in reversed(self._closers):
             try:
                 close()
@@ -151,6 +157,8 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
+        if self._tap is not None:
+            self._keep(Way.RECEIVED, str(connection), packet)
         try:
             self._loaded.on_packet(connection, packet)
         except NeurosError as error:
@@ -158,6 +166,8 @@ class NodeRuntime:
 
     def on_external_packet(self, port: Port, packet: Any) -> None:
         """A packet has arrived on an external topic."""
+        if self._tap is not None:
+            self._keep(Way.HEARD, port.name, packet)
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
@@ -195,13 +205,17 @@ class NodeRuntime:
         """Send on connections to other nodes."""
         if self._clock_ports and connections[0].source_output in self._clock_ports:
             self._note_clock(packet)
-        self._transport.send(connections, packet)
+        data = self._transport.send(connections, packet)
+        if self._tap is not None:
+            self._keep(Way.SENT, connections[0].source_output, packet, data)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on an external topic."""
         if port.name in self._clock_ports:
             self._note_clock(packet)
         self._transport.send_external(port, packet)
+        if self._tap is not None:
+            self._keep(Way.SENT, port.name, packet)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell a sender how far every taker has come."""
@@ -215,8 +229,10 @@ class NodeRuntime:
         """Queue the loop-back."""
         self._middleware.loop.post_loop_back(partial(self._guard, event))
 
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
+    def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
+        """What the node gets on a connection to itself: it shares nothing with this packet."""
+        if self._tap is not None:
+            self._keep(Way.TO_ITSELF, str(connection), packet)
         return self._middleware.copy(packet)
 
     # ------------------------------------------------------------------ behind `node`
@@ -328,6 +344,20 @@ class NodeRuntime:
     def _loaded(self) -> Engine:
         assert self.engine is not None
         return self.engine
+
+    def _keep(self, way: Way, name: str, packet: Any, data: bytes | None = None) -> None:
+        """Record a packet, where that is wanted; ``data`` is the packet, if serialised already."""
+        tap = self._tap
+        if tap is None or not tap.wants(way, name):
+            return
+        try:
+            tap.keep(way, name, data or self._middleware.encode(packet), self.sim_time)
+        except OSError as error:
+            self._tap = None
+            tap.close()
+            self.logger.error(
+                f"its packets are not recorded from now on: {error.strerror}; the run goes on"
+            )
 
     def _guard(self, event: Callable[[], None]) -> None:
         try:

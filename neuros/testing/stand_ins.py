@@ -164,6 +164,10 @@ class Workbench:
         """A packet that shares nothing with this one."""
         return decode(encode(packet))
 
+    def encode(self, packet: Any) -> bytes:
+        """A packet as ROS serialises it."""
+        return encode(packet)[1]
+
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)

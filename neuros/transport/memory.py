@@ -108,7 +108,10 @@ class MemoryTransport:
         self._given_up = unheld(box)
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Give each receiver a copy, but the last one the packet itself if it is unshared."""
+        """Give each receiver a copy, but the last one the packet itself if it is unshared.
+
+        It returns nothing, since nothing is serialised.
+        """
         if not self._is_open:
             return
         if self._digest is not None:

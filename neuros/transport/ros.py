@@ -24,6 +24,7 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import Decoder, Encoder, message_carrier
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_carriers import LargeCarriers
+from neuros.transport.large_packets import is_parcel
 from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
@@ -81,10 +82,14 @@ class RosTransport:
     def note_result(self, box: Sequence[Any]) -> None:
         """Nothing to do: what is sent leaves as bytes."""
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Publish a packet on the data topics of these connections, serialised once."""
+    def send(self, connections: Sequence[Connection], packet: Any) -> bytes | None:
+        """Publish a packet on the data topics of these connections, serialised once.
+
+        Returns it where it was serialised as a whole message.
+        """
         if not self._is_open:
-            return
+            return None
+        whole = None
         encoded: dict[Encoder, tuple[bytes, int]] = {}
         for connection in connections:
             way = self._ways[connection]
@@ -92,8 +97,11 @@ class RosTransport:
             if found is None:
                 data = way.carrier.encode(packet)
                 found = encoded[way.carrier] = (data, way.digest(packet, data))
+                if not is_parcel(data):
+                    whole = data
             way.publish(found[0])
             self.digests[connection].append(found[1])
+        return whole
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""

@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
+from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import digest_of
@@ -123,6 +124,11 @@ class RosProcess:
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""
         return copy_packet(packet)
+
+    def encode(self, packet: Any) -> bytes:
+        """A packet as ROS serialises it."""
+        kind: type = type(packet)
+        return message_carrier(kind).encode(packet)
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""

@@ -224,7 +224,7 @@ class Bench:
     def post_loop_back(self, event: Callable[[], None]) -> None:
         self.posted.append(("loop-back", event))
 
-    def copy(self, packet: Any) -> Any:
+    def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return ("copy of", packet)
 
 

@@ -70,7 +70,7 @@ class NetworkNode:
 
     post_loop_back = post
 
-    def copy(self, packet: Any) -> Any:
+    def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet
 
     @property

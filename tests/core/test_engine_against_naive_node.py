@@ -48,7 +48,7 @@ class Written:
     def post_loop_back(self, each: Callable[[], None]) -> None:
         self.events.append(("loop-back", each))
 
-    def copy(self, packet: Any) -> Any:
+    def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet
 
 

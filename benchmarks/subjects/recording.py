@@ -1,0 +1,116 @@
+"""What a recording costs a run, and how much one recorder keeps up with."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks import flooding
+from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
+from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
+from benchmarks.subjects.whiskeye import RATE, orchestrated
+from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
+from neuros.observe.recording.recorder import Recorder
+from neuros.observe.recording.spool import SpoolWriter
+from neuros.ports import Way
+
+RECORD = ("-r",)
+SIMULATED_S = 20.0
+PROJECTS = {"hybrid": "project", "strict": "strict"}
+IMU_BYTES, IMAGE_BYTES = 360, 921_600
+
+
+def subject(is_quick: bool) -> Subject:
+    """Simulated seconds per run, packets per spool."""
+    share = 0.1 if is_quick else 1.0
+    return Subject(
+        "recording: what it costs a run, and what the recorder keeps up with",
+        (*(_whiskeye(name, share) for name in PROJECTS), _recorder(share), *_floods(is_quick)),
+    )
+
+
+def _whiskeye(name: str, share: float) -> Group:
+    simulated_s = share * SIMULATED_S
+    candidates: dict[str, Measurement] = {}
+    cases = []
+    for backend, label in (("process", "process"), ("in-process", "in process")):
+        plain, recorded = f"{name}, {label}", f"{name}, {label}, recorded"
+        run = functools.partial(orchestrated, PROJECTS[name], backend, simulated_s)
+        candidates |= {plain: run, recorded: functools.partial(run, options=RECORD)}
+        cases.append(
+            Case(
+                f"whiskeye {recorded}, real-time factor",
+                "",
+                Figure(recorded, RATE),
+                Figure(plain, RATE),
+                plain,
+                f"recorded-{name}" if backend == "process" else None,
+            )
+        )
+    return Group(candidates, tuple(cases), MINIMUM_PAIRS)
+
+
+def _recorder(share: float) -> Group:
+    candidates: dict[str, Measurement] = {
+        "IMU": functools.partial(recorded, IMU_BYTES, round(100_000 * share)),
+        "image": functools.partial(recorded, IMAGE_BYTES, round(500 * share)),
+    }
+    cases = (
+        Case("recorder, IMU packets", "1/s", Figure("IMU", "rate"), bound="recorder-packets"),
+        Case("recorder, VGA images", "MB/s", Figure("image", "volume"), bound="recorder-volume"),
+        Case("node, keep an IMU packet", "us", Figure("IMU", "keep_us")),
+        Case("node, keep a VGA image", "us", Figure("image", "keep_us")),
+    )
+    return Group(candidates, cases, MINIMUM_PAIRS)
+
+
+def _floods(is_quick: bool) -> tuple[Group, ...]:
+    """As many packets as a connection carries, recorded and not."""
+    return tuple(_flood(packet, 0.3 if is_quick else 2.0) for packet in (IMU_PACKET, LARGE))
+
+
+def _flood(packet: Packet, seconds: float) -> Group:
+    run = functools.partial(flooding.neuros, packet, "process", seconds, {"discard_limit": 0})
+    is_image = packet is LARGE
+    figure, unit = ("volume", "MB/s") if is_image else ("rate", "1/s")
+    case = Case(
+        f"throughput, {packet.name}, process, discard limit 0, recorded",
+        unit,
+        Figure("recorded", figure),
+        Figure("not recorded", figure),
+        "not recorded",
+    )
+    candidates: dict[str, Measurement] = {
+        "not recorded": run,
+        "recorded": functools.partial(run, options=RECORD),
+    }
+    return Group(candidates, (case,), rounds=6)
+
+
+def recorded(size: int, count: int) -> dict[str, float]:
+    """Keep packets of a size, and move them into a bag: a node's side, and the recorder's."""
+    topic = Topic("/neuros/a/out/b/in/data", "std_msgs/msg/String")
+    plan = RecordingPlan("mcap", (topic,), {"a": (Stream("sent", "out", (0,)),)})
+    data = bytes(size)
+    with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
+        run = Path(folder)
+        spool = SpoolWriter(run / "a", plan.streams["a"])
+        start_s = time.perf_counter()
+        for _ in range(count):
+            spool.keep(Way.SENT, "out", data, None)
+        kept_s = time.perf_counter()
+        spool.close()
+        recorder = Recorder(plan, run, complain=print)
+        moved_s = time.perf_counter()
+        while recorder.poll():
+            pass
+        recorder.complete()
+        end_s = time.perf_counter()
+        recorder.clean_up()
+    return {
+        "keep_us": (kept_s - start_s) / count * 1e6,
+        "rate": count / (end_s - moved_s),
+        "volume": count * size / (end_s - moved_s) / 1e6,
+    }

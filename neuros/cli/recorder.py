@@ -1,0 +1,130 @@
+"""The program of the recorder process; ``launch`` starts it, not people."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from neuros.errors import NeurosError
+from neuros.launch.recording import END
+from neuros.observe.recording.listened import ListenedSpool
+from neuros.observe.recording.plan import BAG_NAME, RecordingPlan, Topic, load_plan
+from neuros.observe.recording.recorder import Recorder
+from neuros.observe.recording.repair import counts_of, repair, the_only_recorder
+
+_POLL_S = 0.1
+# The launcher was killed: its guardian kills what is left of the run after 4.5 s.
+_ORPHANED_S = 4.0
+
+
+def run_recorder(options: argparse.Namespace) -> int:
+    """Record a run until its launcher says, or is, at its end; or complete its bag."""
+    run = Path(options.run)
+    problems = _Problems()
+    counts: dict[str, int] = {}
+    try:
+        if (run / BAG_NAME).exists():
+            counts = repair(run, problems.add) or counts_of(run)
+        else:
+            counts = _record(run, load_plan(run), problems.add)
+    except (NeurosError, OSError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        problems.add(
+            f"the recording has stopped: {reason}; what is in the bag can be read, and"
+            f" neuros bag repair {run} adds what is not"
+        )
+    print(json.dumps({"counts": counts, "problems": problems.texts}), flush=True)
+    return 0
+
+
+class _Problems:
+    """What went wrong: for the launcher at the end, and for the log at once."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def add(self, text: str) -> None:
+        """Note a problem, a sentence. Any thread."""
+        self.texts.append(text)
+        print(f"[ERROR] [{time.time():.9f}] [recorder]: {text}", file=sys.stderr, flush=True)
+
+
+def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -> dict[str, int]:
+    with the_only_recorder(run), _listening(run, plan, complain) as unheard:
+        recorder = Recorder(plan, run, complain)
+        try:
+            while not _is_told_to_end(0.0 if recorder.poll() else _POLL_S, recorder):
+                pass
+            for topic in unheard():
+                complain(f"{topic} is not recorded: nobody published it")
+            recorder.complete()
+        except BaseException:
+            recorder.abandon()
+            raise
+        recorder.clean_up()
+        return recorder.counts()
+
+
+def _is_told_to_end(wait_s: float, recorder: Recorder) -> bool:
+    """Whether nothing more will come, after ``wait_s`` seconds at most."""
+    readable, _, _ = select.select([0], [], [], wait_s)
+    if not readable:
+        return False
+    if os.read(0, len(END)) == END:
+        return True
+    give_up_s = time.monotonic() + _ORPHANED_S
+    while recorder.is_fed and time.monotonic() < give_up_s:
+        recorder.poll()
+        time.sleep(_POLL_S)
+    return True
+
+
+@contextlib.contextmanager
+def _listening(
+    run: Path, plan: RecordingPlan, complain: Callable[[str], object]
+) -> Iterator[Callable[[], list[str]]]:
+    """Listen in a thread; yields what stops it, and tells which wanted topics nobody published."""
+    if not plan.listen:
+        yield list
+        return
+    from neuros.transport.listening import FoundTopic, Listener
+
+    spool = ListenedSpool(run)
+    unheard = list(plan.wanted)
+
+    def found(topic: FoundTopic) -> Callable[[int, bytes], None]:
+        if topic.name in unheard:
+            unheard.remove(topic.name)
+        number = spool.add(Topic(topic.name, topic.type, topic.is_reliable, topic.depth))
+        return lambda wall_ns, data: spool.keep(number, wall_ns, data)
+
+    def refused(name: str, reason: str) -> None:
+        if name in unheard:
+            unheard.remove(name)
+        complain(f"{name} is not recorded: {reason}")
+
+    def failed(reason: str) -> None:
+        complain(f"topics that no node has are not recorded from now on: {reason}")
+
+    listener = Listener(plan.listen, found, refused, failed)
+    thread = threading.Thread(target=listener.run, name="listener")
+    thread.start()
+
+    def stop() -> list[str]:
+        listener.stop()
+        thread.join()
+        spool.close()
+        return unheard
+
+    try:
+        yield stop
+    finally:
+        stop()

@@ -1,0 +1,177 @@
+"""The recording of a run, as its launcher sees it: planned before, reported after."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import platform
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from neuros import __version__
+from neuros.cli.plan import Plan
+from neuros.errors import UsageError
+from neuros.launch.guardian import Guardian
+from neuros.launch.recording import Recorded, RecorderProcess
+from neuros.observe.recording.plan import BAG_NAME, RecordingPlan
+from neuros.observe.recording.selection import Request, plan_recording
+from neuros.project.model import Project
+from neuros.project.split import project_to_json
+
+_PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")
+
+
+class Recording:
+    """What is recorded of one run, and the process that does it.
+
+    Raises:
+        UsageError: if something is to be recorded that does not exist.
+        EnvironmentFault: if the recorder cannot be started.
+    """
+
+    def __init__(
+        self,
+        plan: RecordingPlan,
+        run_id: str,
+        run: Path,
+        environment: Mapping[str, str],
+        guardian: Guardian,
+    ) -> None:
+        self._plan = replace(plan, custom={**plan.custom, "run_id": run_id})
+        self._run = run
+        try:
+            self._plan.save(run)
+        except OSError as error:
+            raise UsageError(
+                f"{run} cannot be written to ({error.strerror}): name another folder with -o"
+            ) from error
+        command = [sys.executable, "-m", "neuros.cli", "recorder", str(run)]
+        self._process = RecorderProcess(command, run, log_of(run), environment)
+        guardian.watch(self._process.pid)
+
+    def finish(self, signals: Sequence[int]) -> Recorded:
+        """Have the bag completed; who has no patience for that sends another signal."""
+        before = len(signals)
+        return self._process.finish(lambda: len(signals) > before)
+
+    def report(self, recorded: Recorded, record: dict[str, Any]) -> list[str]:
+        """Put into the record what was recorded; returns what is missing, a sentence each."""
+        topics = self._topics(recorded, record)
+        problems = recorded.problems or _missing(topics)
+        record["recording"] = {
+            "bag": str(self._run / BAG_NAME),
+            "storage": self._plan.storage,
+            "topics": topics,
+            "problems": problems,
+        }
+        return problems
+
+    def _topics(self, recorded: Recorded, record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Per topic the packets in the bag, and those that passed this run."""
+        passed = {c["connection"]: _passed(c) for c in record["connections"]}
+        planned = {topic.name: topic for topic in self._plan.topics}
+        topics = {}
+        for name in dict.fromkeys([*planned, *recorded.counts]):
+            topic = planned.get(name)
+            connection = None if topic is None else topic.connection
+            topics[name] = {
+                "connection": connection,
+                "recorded": recorded.counts.get(name, 0),
+                "passed": None if connection is None else passed.get(connection),
+                "is_lossy": bool(connection and topic and not topic.is_reliable),
+            }
+        return topics
+
+
+def plan_of(
+    options: argparse.Namespace, plan: Plan, environ: Mapping[str, str]
+) -> RecordingPlan | None:
+    """What the command line has recorded of a run, ``None``: nothing. Raises ``UsageError``."""
+    if not plan.is_recorded:
+        if options.exclude or options.storage != "mcap":
+            name = "--exclude" if options.exclude else "--storage"
+            raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+        return None
+    is_open = plan.needs_known_domain or options.domain_id is not None
+    return plan_recording(
+        plan.project,
+        plan.names,
+        Request(
+            everything=options.record,
+            topics=tuple(options.record_topics),
+            exclude=tuple(options.exclude),
+            storage=options.storage,
+        ),
+        is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
+        custom=_custom_data(plan.project),
+    )
+
+
+def log_of(run: Path) -> Path:
+    """Where the recorder writes what it has to say."""
+    return run / "recorder.log"
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """One or two lines for the end of a run."""
+    topics = report["topics"].values()
+    count = sum(topic["recorded"] for topic in topics)
+    lines = [f"recorded {count} packets on {len(topics)} topics: {report['bag']}"]
+    lossy = [topic for topic in topics if topic["is_lossy"]]
+    if lossy:
+        seen = sum(topic["recorded"] for topic in lossy)
+        passed = [topic["passed"] for topic in lossy]
+        of = "?" if None in passed else sum(passed)
+        lines.append(f"{seen} of {of} packets on connections without discard limit")
+    return "\n".join(lines)
+
+
+def _missing(topics: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What has passed this run and is not in the bag, a sentence each."""
+    return [
+        f"{topic['passed'] - topic['recorded']} of {topic['passed']} packets of {name} are not in"
+        " the bag"
+        for name, topic in topics.items()
+        if topic["passed"] is not None and topic["recorded"] < topic["passed"]
+    ]
+
+
+def _passed(connection: Mapping[str, Any]) -> int | None:
+    """The packets that passed this run on a connection: sent, or received from elsewhere."""
+    sent = connection["sent"]
+    found: int | None = connection["received"] if sent is None else sent
+    return found
+
+
+def _custom_data(project: Project) -> dict[str, str]:
+    """What the metadata of the bag says about the run; each value is text."""
+    content = json.dumps(project_to_json(project), sort_keys=True)
+    versions = {"neuros": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "project": project.name,
+        "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": json.dumps(versions),
+        "seeds": json.dumps(_seeds(project)),
+    }
+
+
+def _seeds(project: Project) -> dict[str, str]:
+    """Every seed that a node gets, by ``node.VARIABLE``."""
+    return {
+        f"{node.name}.{name}": value
+        for node in project.nodes
+        for name, value in node.environment.items()
+        if "seed" in name.lower()
+    }

@@ -1,0 +1,58 @@
+"""The options of a recording, and the hidden command of its recorder."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_recording_options(launch: argparse.ArgumentParser) -> None:
+    """Add what ``launch`` has to be told about a recording."""
+    group = launch.add_argument_group(
+        "recording", "NAME is a topic, an output (node.output), or a connection; * stands for any"
+    )
+    group.add_argument(
+        "-r",
+        "--record",
+        action="store_true",
+        help="record every connection, the external topics, and /clock: RUN/bag",
+    )
+    group.add_argument(
+        "-t",
+        "--topic",
+        action="append",
+        default=[],
+        dest="record_topics",
+        metavar="NAME",
+        help="record this (repeatable), be it a ROS topic that no node has; without -r, this only",
+    )
+    group.add_argument(
+        "--exclude",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="do not record this (repeatable)",
+    )
+    group.add_argument(
+        "--storage",
+        choices=("mcap", "sqlite3"),
+        default="mcap",
+        help="the format of the bag's file (default: mcap)",
+    )
+
+
+def is_recorded(options: argparse.Namespace) -> bool:
+    """Whether a run is to be recorded."""
+    return bool(options.record or options.record_topics)
+
+
+def add_recorder(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """What ``launch`` starts; people do not."""
+    recorder = commands.add_parser("recorder", add_help=False)
+    recorder.add_argument("run")
+    recorder.set_defaults(command=_run_recorder)
+
+
+def _run_recorder(options: argparse.Namespace) -> int:
+    from neuros.cli.recorder import run_recorder
+
+    return run_recorder(options)

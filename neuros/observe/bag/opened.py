@@ -1,0 +1,225 @@
+"""A bag that is open for reading."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.interfaces import Connection, QosReliability
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from neuros.errors import EnvironmentFault
+from neuros.observe.bag.columns import Column, columns_of
+from neuros.observe.recording.plan import BAG_NAME, PLAN_NAME, load_plan
+from neuros.observe.recording.repair import needs_repair, repair
+from neuros.observe.recording.stored import stored_messages
+
+LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
+_MOST_COLUMNS = 100
+
+
+class RawPacket(NamedTuple):
+    """A packet as it was recorded: wall time and simulated time in nanoseconds, and CDR."""
+
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class RecordedTopic:
+    """The packets of one topic, in the order in which they were sent.
+
+    Attributes:
+        name: the topic.
+        type: its message type in ROS notation.
+        connection: ``a.out -> b.in``, or ``None`` for a topic that belongs to none.
+        is_reliable, depth: of the quality of service that was offered.
+    """
+
+    def __init__(self, bag: Bag, recorded: Connection, connection: str | None) -> None:
+        self._bag = bag
+        self.name = recorded.topic
+        self.type = recorded.msgtype
+        self.connection = connection
+        profiles = getattr(recorded.ext, "offered_qos_profiles", None) or []
+        self.is_reliable = all(p.reliability is QosReliability.RELIABLE for p in profiles)
+        self.depth = max((p.depth for p in profiles), default=0) or 10
+
+    @property
+    def count(self) -> int:
+        """How many packets there are."""
+        return len(self.raw())
+
+    def raw(self) -> list[RawPacket]:
+        """All packets as they were recorded."""
+        return self._bag.packets_of(self.name)
+
+    def messages(self) -> Iterator[tuple[RawPacket, Any]]:
+        """Packets and messages, made by ``rosbags`` one by one."""
+        for packet in self.raw():
+            yield packet, self._bag.store.deserialize_cdr(packet.data, self.type)
+
+    def columns(self) -> dict[str, Column]:
+        """A column for each field, and the two times; see :meth:`array`."""
+        packets = self.raw()
+        return {
+            LOG_TIME: np.fromiter((p.log_time_ns for p in packets), np.int64, len(packets)),
+            PUBLISH_TIME: np.fromiter((p.publish_time_ns for p in packets), np.int64, len(packets)),
+            **columns_of([p.data for p in packets], self.type, self._bag.store),
+        }
+
+    def array(self) -> npt.NDArray[Any]:
+        """A structured array, one row per packet.
+
+        Its fields are ``log_time_ns`` (wall time), ``publish_time_ns`` (simulated time, where there
+        is one) and those of the message, with dots: ``header.stamp.sec``. Arrays keep their shape;
+        sequences of different length are objects.
+        """
+        columns = self.columns()
+        rows = len(columns[LOG_TIME])
+        made = np.empty(rows, [(name, c.dtype, c.shape[1:]) for name, c in columns.items()])
+        for name, column in columns.items():
+            made[name] = column
+        return made
+
+    def frame(self) -> Any:
+        """A ``pandas.DataFrame``, one row per packet; arrays get a column for each element.
+
+        Raises:
+            EnvironmentFault: if pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise EnvironmentFault(
+                f"pandas is not installed for {sys.executable}: pip install pandas, or use array()"
+            ) from error
+        spread: dict[str, Any] = {}
+        for name, column in self.columns().items():
+            elements = column.reshape(len(column), -1).shape[1] if len(column) else 1
+            if column.ndim == 1:
+                spread[name] = column
+            elif elements <= _MOST_COLUMNS:
+                for place, single in enumerate(column.reshape(len(column), -1).T):
+                    spread[f"{name}[{place}]"] = single
+            else:
+                spread[name] = list(column)
+        return pd.DataFrame(spread)
+
+
+class Bag:
+    """What a run has recorded.
+
+    Attributes:
+        folder: the rosbag2 folder.
+        topics: by name, in the order of the project.
+        custom: what its metadata says of the run: ``run_id``, ``project``, ``project_sha256``,
+            ``versions``, ``seeds``.
+        duration_s: from the first packet to the last.
+    """
+
+    def __init__(self, folder: Path, connections: Mapping[str, str | None]) -> None:
+        self.folder = folder
+        try:
+            with Reader(folder) as reader:
+                self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
+                self.duration_s = reader.duration / 1e9
+                found = {c.topic: c for c in reader.connections}
+        except ReaderError as error:
+            raise EnvironmentFault(
+                f"{folder} cannot be read: {error} (neuros bag repair RUN completes the bag of a"
+                " run that was killed)"
+            ) from error
+        self.store = _store_of(found.values())
+        self.topics = {
+            name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
+        }
+        self._packets: dict[str, list[RawPacket]] | None = None
+
+    @property
+    def project(self) -> str | None:
+        """The name of the project."""
+        return self.custom.get("project")
+
+    def __getitem__(self, name: str) -> RecordedTopic:
+        """The topic of that name, of that connection, or of an output with one connection.
+
+        Raises:
+            KeyError: if there is none, or several; its text names those that there are.
+        """
+        if name in self.topics:
+            return self.topics[name]
+        labels = {topic: topic.connection or "" for topic in self.topics.values()}
+        fitting = [t for t, label in labels.items() if name in (label, label.partition(" -> ")[0])]
+        if len(fitting) == 1:
+            return fitting[0]
+        there = [t.connection or t.name for t in fitting or self.topics.values()]
+        raise KeyError(f"{name}: {'which of' if fitting else 'there are'} {', '.join(there)}")
+
+    def packets_of(self, name: str) -> list[RawPacket]:
+        """All packets of a topic, by their wall time."""
+        if self._packets is None:
+            self._packets = {topic: [] for topic in self.topics}
+            for topic, log_ns, publish_ns, data in stored_messages(self.folder):
+                self._packets[topic].append(RawPacket(log_ns, publish_ns, data))
+            for packets in self._packets.values():
+                packets.sort(key=lambda packet: packet.log_time_ns)
+        return self._packets[name]
+
+    def close(self) -> None:
+        """Let go of what has been read."""
+        self._packets = None
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_bag(run: str | os.PathLike[str]) -> Bag:
+    """Open what a run has recorded; one that was cut off is completed first.
+
+    Args:
+        run: the run folder, or a rosbag2 folder.
+
+    Raises:
+        UsageError: if there is none, or this version of NeuROS cannot read it.
+        EnvironmentFault: if it is damaged.
+    """
+    folder = Path(run)
+    if (folder / "metadata.yaml").is_file() and not (folder / PLAN_NAME).is_file():
+        if not (folder.parent / PLAN_NAME).is_file():
+            return Bag(folder, {})
+        folder = folder.parent
+    plan = load_plan(folder)
+    if needs_repair(folder, plan):
+        _repair_if_possible(folder)
+    return Bag(folder / BAG_NAME, {topic.name: topic.connection for topic in plan.topics})
+
+
+def _repair_if_possible(run: Path) -> None:
+    """A run that still goes on has a bag that can be read as it is."""
+    try:
+        repair(run, lambda _: None)
+    except EnvironmentFault:
+        if not (run / BAG_NAME / "metadata.yaml").is_file():
+            raise
+
+
+def _store_of(connections: Any) -> Typestore:
+    """The types as the bag defines them."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    connection: Connection
+    for connection in connections:
+        types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+    store.register(types)
+    return store

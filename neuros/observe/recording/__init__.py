@@ -1,0 +1,5 @@
+"""Recording: what a run's packets pass on their way into a bag.
+
+Each node keeps what it sends, as bytes, in a *spool* of its own; one recorder process moves it from
+there into the bag. ``docs/recording.md`` says why.
+"""

@@ -1,0 +1,174 @@
+"""Which packets of a project a recording holds, and which node keeps them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from neuros.errors import UsageError
+from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
+from neuros.ports import Way
+from neuros.project.model import Connection, Node, Project
+
+CLOCK = "/clock"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for.
+
+    Attributes:
+        everything: all that the project's nodes send and hear, and ``/clock``.
+        topics: names and patterns of topics, connections or outputs; besides everything, or alone.
+        exclude: the same, left out in any case.
+        storage: ``mcap`` or ``sqlite3``.
+    """
+
+    everything: bool
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    storage: str = "mcap"
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where packets of a topic can be kept."""
+
+    node: str
+    way: Way
+    name: str
+    topic: Topic
+
+
+def plan_recording(
+    project: Project,
+    names: Collection[str],
+    request: Request,
+    *,
+    is_alone: bool,
+    custom: Mapping[str, str],
+) -> RecordingPlan:
+    """What is recorded of a run of the nodes ``names``.
+
+    Args:
+        is_alone: nobody outside the run can publish in its domain, so there is no clock to hear.
+
+    Raises:
+        UsageError: if something is asked for that does not exist.
+    """
+    places = [place for place in _places(project, names) if _is_chosen(place.topic, request)]
+    known = {place.topic.name for place in _places(project, names)}
+    wanted = _asked_of_ros(request, known, project)
+    listen = list(wanted)
+    if request.everything and not is_alone and CLOCK not in known:
+        listen.append(CLOCK)
+    topics = list(dict.fromkeys(place.topic for place in places))
+    owners = [n.name for n in project.nodes if n.name in names and n.owns_time]
+    return RecordingPlan(
+        storage=request.storage,
+        topics=tuple(topics),
+        streams=_streams(places, topics),
+        listen=tuple(
+            name for name in dict.fromkeys(listen) if not is_named(name, None, request.exclude)
+        ),
+        wanted=wanted,
+        time_owner=owners[0] if len(owners) == 1 else None,
+        custom=custom,
+    )
+
+
+def _places(project: Project, names: Collection[str]) -> Iterator[_Place]:
+    """One place for each topic and sender, in the order of the project."""
+    for connection in project.connections:
+        yield from _connection_place(project, connection, names)
+    nodes = [node for node in project.nodes if node.name in names]
+    sent: set[str] = set()
+    for node in nodes:
+        for place in _external(node, is_output=True):
+            sent.add(place.topic.name)
+            yield place
+    heard: set[str] = set()
+    for node in nodes:
+        for place in _external(node, is_output=False):
+            if place.topic.name not in sent | heard:
+                heard.add(place.topic.name)
+                yield place
+
+
+def _connection_place(
+    project: Project, connection: Connection, names: Collection[str]
+) -> Iterator[_Place]:
+    source, destination = connection.source_node, connection.destination_node
+    topic = Topic(
+        f"{connection.topic}/data",
+        project.node(source).output(connection.source_output).type,
+        connection.is_reliable,
+        connection.window,
+        str(connection),
+    )
+    if source in names:
+        if source == destination:
+            yield _Place(source, Way.TO_ITSELF, str(connection), topic)
+        else:
+            yield _Place(source, Way.SENT, connection.source_output, topic)
+    elif destination in names:
+        yield _Place(destination, Way.RECEIVED, str(connection), topic)
+
+
+def _external(node: Node, *, is_output: bool) -> Iterator[_Place]:
+    for port in node.outputs if is_output else node.inputs:
+        if port.external_topic is not None:
+            name = "/" + port.external_topic.lstrip("/")
+            way = Way.SENT if is_output else Way.HEARD
+            yield _Place(node.name, way, port.name, Topic(name, port.type, is_reliable=is_output))
+
+
+def _streams(places: Sequence[_Place], topics: Sequence[Topic]) -> dict[str, tuple[Stream, ...]]:
+    """Packets that pass a node in one and the same way are kept once, for all their topics."""
+    groups: dict[tuple[str, Way, str], list[int]] = {}
+    for place in places:
+        key = (place.node, place.way, place.name)
+        groups.setdefault(key, []).append(topics.index(place.topic))
+    streams: dict[str, list[Stream]] = {}
+    for (node, way, name), members in groups.items():
+        streams.setdefault(node, []).append(Stream(way.value, name, tuple(members)))
+    return {node: tuple(found) for node, found in streams.items()}
+
+
+def _is_chosen(topic: Topic, request: Request) -> bool:
+    if is_named(topic.name, topic.connection, request.exclude):
+        return False
+    return request.everything or is_named(topic.name, topic.connection, request.topics)
+
+
+def is_named(name: str, connection: str | None, patterns: Sequence[str]) -> bool:
+    """Whether one of the patterns fits a topic, its connection, or the output that feeds it."""
+    words = [name, name.removesuffix("/data")] if connection else [name]
+    if connection:
+        words += [connection, connection.partition(" -> ")[0]]
+    return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
+
+
+def _asked_of_ros(request: Request, known: Collection[str], project: Project) -> tuple[str, ...]:
+    """Topics that only the ROS graph can know.
+
+    Raises:
+        UsageError: for what can be neither on the graph nor in the project.
+    """
+    found = []
+    labels = {str(connection): f"{connection.topic}/data" for connection in project.connections}
+    for text in request.topics:
+        in_project = any(
+            is_named(name, label, [text]) for label, name in labels.items() if name in known
+        ) or any(fnmatchcase(name, text) for name in known)
+        if in_project:
+            continue
+        if not text.startswith("/") or text.startswith("/neuros/") or set(text) & set("*?["):
+            outputs = dict.fromkeys(label.partition(" -> ")[0] for label in labels)
+            raise UsageError(
+                f"--topic {text}: the project has no such topic, connection or output; outputs:"
+                f" {', '.join(outputs) or 'none'}"
+            )
+        found.append(text)
+    return tuple(dict.fromkeys(found))
