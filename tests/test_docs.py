@@ -111,15 +111,25 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def options_of(command: str) -> set[str]:
-    """The options of ``neuros <command>``."""
-    actions = parser()._actions
+    """The options of ``neuros <command>``, with those of its actions."""
     if not command:
-        return {option for action in actions for option in action.option_strings}
-    for action in actions:
-        if isinstance(action, argparse._SubParsersAction) and command in action.choices:
-            own = action.choices[command]._actions
-            return {option for each in own for option in each.option_strings}
-    return set()
+        return {option for action in parser()._actions for option in action.option_strings}
+    return {
+        option
+        for each in subparsers(parser())
+        if each.prog.split()[1:2] == [command]
+        for action in each._actions
+        for option in action.option_strings
+    }
+
+
+def subparsers(of: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """All commands below a parser, and their actions."""
+    for action in of._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                yield each
+                yield from subparsers(each)
 
 
 @pages
