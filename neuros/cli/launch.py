@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from neuros.cli.console import Console
 from neuros.cli.environments import make_environments
@@ -31,12 +32,13 @@ from neuros.launch.outcome import Outcome
 from neuros.launch.sessions import Session, guardian_environment, this_process
 from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
+from neuros.observe.budgets import broken_budgets
 from neuros.observe.recording.plan import RecordingPlan
 from neuros.observe.report import run_record, run_table
 from neuros.project.model import NodeFile
 from neuros.runtime.side import ELSEWHERE_VARIABLE
 
-EXIT_ENVIRONMENT = 4
+EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
 _PATIENCE_S = 1.0
 
@@ -129,7 +131,7 @@ class _Run:
             if recording is not None and recorded is not None:
                 for problem in recording.report(recorded, record):
                     outcome.fail(problem, EXIT_ENVIRONMENT)
-                record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
+            self._judge(record, outcome)
             try:
                 write_record(record, self._run_folder)
             except OSError as error:
@@ -150,6 +152,16 @@ class _Run:
         return Recording(
             self._recording_plan, self._run_id, self._run_folder, self._environment(), guardian
         )
+
+    def _judge(self, record: dict[str, Any], outcome: Outcome) -> None:
+        """Hold the run to its budgets."""
+        broken = broken_budgets(
+            record, self._plan.project.budgets, is_partial=self._plan.is_partial
+        )
+        for text in broken:
+            outcome.fail(f"budget broken: {text}", EXIT_BUDGET)
+        record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
+        record["broken_budgets"] = broken
 
     def _observation(self, options: argparse.Namespace) -> Observation:
         names = [file.node.name for file in self._files]

@@ -7,6 +7,7 @@
 3   invalid project
 4   something is missing on this machine (package, engine, image), or what was to be recorded
     could not be written
+5   a budget of the project was broken
 130 ended by Ctrl+C
 143 ended by SIGTERM, or because the terminal was closed
 === ===========================================================
@@ -44,6 +45,7 @@ exit codes:
   2    wrong usage
   3    invalid project: every problem is listed with its file and line
   4    something is missing on this machine, or a record could not be written
+  5    the run broke a budget of its project
   130  ended by Ctrl+C (a second one kills at once)
   143  ended by SIGTERM, or because the terminal was closed
 """

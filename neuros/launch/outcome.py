@@ -41,7 +41,7 @@ class Outcome:
 
     Attributes:
         exit_code: 0 ended normally, 1 a node failed or deadlock, 4 what should have been recorded
-            could not be, 130 and 143 by signal.
+            could not be, 5 a budget was broken, 130 and 143 by signal.
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from neuros.errors import Problem
+from neuros.project.budgets import budget_mistakes
 from neuros.project.draft import Draft
 from neuros.project.message_types import normalised
 from neuros.project.source import Element
@@ -35,6 +36,7 @@ def mistakes(draft: Draft) -> list[Problem]:
         *_duplicate_ports(draft),
         *_duplicate_connections(draft),
         *_connection_ends(draft),
+        *budget_mistakes(draft),
     ]
 
 

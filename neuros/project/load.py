@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neuros.errors import Problem, ProjectError
+from neuros.project.budgets import budgets_of
 from neuros.project.build import Builder, connection
 from neuros.project.checks import mistakes, remarks
 from neuros.project.draft import Draft, read_draft
@@ -65,6 +66,7 @@ def load_project(
         connections=tuple(connection(c, index) for index, c in enumerate(draft.connections)),
         file=roots.project / file.name,
         description=draft.root.string("description") or "",
+        budgets=budgets_of(draft),
     )
     return Loaded(project, tuple(remarks(draft)))
 

@@ -151,6 +151,21 @@ class NodeFile:
 
 
 @dataclass(frozen=True)
+class Budgets:
+    """What must hold of every run; a run that breaks one ends with exit code 5.
+
+    Attributes:
+        lost_packets: by connection (``a.out -> b.in``), how many may be lost or discarded in all.
+        real_time_factor: at least this much.
+        tick_error_ms: how far an interval of a timed hook may be off its period.
+    """
+
+    lost_packets: Mapping[str, int] = field(default_factory=lambda: _NOTHING, hash=False)
+    real_time_factor: float | None = None
+    tick_error_ms: float | None = None
+
+
+@dataclass(frozen=True)
 class Project:
     """A whole project, valid in itself."""
 
@@ -159,6 +174,7 @@ class Project:
     connections: tuple[Connection, ...]
     file: Path
     description: str = ""
+    budgets: Budgets = Budgets()
 
     @property
     def folder(self) -> Path:

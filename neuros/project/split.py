@@ -1,7 +1,7 @@
 """One project file for the user, one ``node.json`` per node; and both back again.
 
-``merge(split(project)) == project``, where ``merge`` is told what no node knows: the name, the file
-and the description of the project.
+``merge(split(project)) == project``, where ``merge`` is told what no node knows: name, file,
+description and budgets of the project.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
+from neuros.project.budgets import budgets_to_json
+from neuros.project.model import Budgets, Connection, Folders, Node, NodeFile, Port, Project
 from neuros.project.resources import access_of, keys_of, resources_of
 
+_NO_BUDGETS = Budgets()
 _ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 
 
@@ -49,7 +51,12 @@ def split(
 
 
 def merge(
-    node_files: Iterable[NodeFile], *, name: str, file: Path, description: str = ""
+    node_files: Iterable[NodeFile],
+    *,
+    name: str,
+    file: Path,
+    description: str = "",
+    budgets: Budgets = _NO_BUDGETS,
 ) -> Project:
     """Put a project together again; the order of the parts does not matter."""
     parts = sorted(node_files, key=lambda part: part.index)
@@ -60,6 +67,7 @@ def merge(
         connections=tuple(connections[index] for index in sorted(connections)),
         file=file,
         description=description,
+        budgets=budgets,
     )
 
 
@@ -120,6 +128,8 @@ def project_to_json(project: Project) -> dict[str, Any]:
         {**_node_keys(node), "environment": _environment(node)} for node in project.nodes
     ]
     content["connections"] = [_connection_keys(c) for c in project.connections]
+    if budgets := budgets_to_json(project.budgets):
+        content["budgets"] = budgets
     return content
 
 

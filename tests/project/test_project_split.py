@@ -110,7 +110,13 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
 def test_merge_undoes_split(project: Project, random: Any) -> None:
     parts = list(split(project, folders_for))
     random.shuffle(parts)
-    merged = merge(parts, name=project.name, file=project.file, description=project.description)
+    merged = merge(
+        parts,
+        name=project.name,
+        file=project.file,
+        description=project.description,
+        budgets=project.budgets,
+    )
     assert merged == project
 
 
