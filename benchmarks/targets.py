@@ -152,6 +152,20 @@ TARGETS = (
         ),
     ),
     Target(
+        "WhiskEye strict, a container per node",
+        "WhiskEye strict in containers",
+        "a process per node",
+        "containers",
+        (Bound("containers-speed", 0.9, is_maximum=False),),
+    ),
+    Target(
+        "WhiskEye in containers from the command to the first hook of every node",
+        "first hook of WhiskEye in containers",
+        "",
+        "containers",
+        (Bound("containers-first-hook", 4.0, unit="s"),),
+    ),
+    Target(
         "memory per node (process), beyond bare rclpy node",
         "memory per node",
         "bare rclpy node",

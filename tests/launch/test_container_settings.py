@@ -49,7 +49,12 @@ def test_by_default_it_may_nothing_and_sees_only_its_run() -> None:
     assert seen["/neuros/run/snn/node.json"] == ("/home/me/runs/1/snn/node.json", True)
     assert seen["/neuros/lib/neuros"] == (str(Path(__file__).resolve().parents[2] / "neuros"), True)
     assert "/neuros/workspace" not in seen, "there is none here"
-    assert [path for path, (_, read_only) in seen.items() if not read_only] == ["/neuros/run"]
+    assert seen["/dev/shm"] == ("/dev/shm/neuros_0123456789abcdef", False)
+    assert {path for path, (_, read_only) in seen.items() if not read_only} == {
+        "/neuros/run",
+        "/dev/shm",
+    }
+    assert found["ipc_mode"] == "private"
 
 
 def test_it_is_labelled_and_named() -> None:

@@ -17,7 +17,7 @@ from neuros.errors import EnvironmentFault
 from neuros.launch.docker.container import RunningContainer
 from neuros.launch.docker.engine import connect, engine_faults
 from neuros.launch.docker.images import Image, images_for
-from neuros.launch.docker.settings import User, container_settings
+from neuros.launch.docker.settings import User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
 from neuros.launch.host_command import log_file
 from neuros.launch.placement import Cores, on_cores
@@ -55,7 +55,8 @@ class DockerLauncher:
 
     Args:
         options: of the command ``node``, as ``--debug``.
-        on_started: is told the socket of the engine before the first container is made there.
+        on_started: is told the socket of the engine, and a folder that is to be removed in the end,
+            before the first container is made.
         placement: the cores of each node, by name; the kernel places those that are not in it.
     """
 
@@ -63,7 +64,7 @@ class DockerLauncher:
         self,
         containers: Containers,
         options: Sequence[str] = (),
-        on_started: Callable[[str], None] | None = None,
+        on_started: Callable[[str, Path], None] | None = None,
         placement: Mapping[str, Cores] = MappingProxyType({}),
         environ: Mapping[str, str] = os.environ,
     ) -> None:
@@ -78,8 +79,13 @@ class DockerLauncher:
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningContainer]:
         """Start a container per node, side by side, all or none. Raises ``EnvironmentFault``."""
+        folder = shared_memory(environment.get(RUN_ID, ""))
         if self._on_started:
-            self._on_started(engine_socket(self._engine))
+            self._on_started(engine_socket(self._engine), folder)
+        try:
+            folder.mkdir(mode=0o700)
+        except OSError as error:
+            raise EnvironmentFault(f"no shared memory for containers: {error}") from error
         with engine_faults("the engine's events cannot be listened to"):
             watch = ContainerWatch(self._engine, environment.get(RUN_ID, ""))
         watch.start()

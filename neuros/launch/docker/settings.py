@@ -28,9 +28,11 @@ from neuros.launch.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.launch.run_processes import RUN_ID
 from neuros.project.model import NodeFile
 
-# Shared memory carries packets only between processes of one user that share both (docs/docker.md).
+# Discovery stays on this machine, so that nodes have to share its network. Large packets go through
+# shared memory where both ends see the same: the containers of one run do, and see nobody else's.
 NETWORK_MODE = "host"
-IPC_MODE = "host"
+IPC_MODE = "private"
+SHARED_MEMORY = Path("/dev/shm")
 
 MOST_PIDS = 4096
 """Processes and threads of a node that sets no limit: what keeps a fork bomb to its container."""
@@ -98,7 +100,7 @@ def container_settings(
         "environment": _environment(file, user, environment, cores),
         "working_dir": str(FOLDERS.run),
         "labels": _labels(file, run_id, launcher_pid),
-        "mounts": _mounts(file, user),
+        "mounts": _mounts(file, user, run_id),
         "user": f"{user.uid}:{user.gid}",
         "group_add": [str(group) for group in user.groups],
         "cap_drop": ["ALL"],
@@ -128,6 +130,11 @@ def container_settings(
 def container_name(file: NodeFile, run_id: str) -> str:
     """What a container is called: unique, and to be recognised in ``docker ps``."""
     return f"neuros-{file.node.name}-{run_id[:8]}"
+
+
+def shared_memory(run_id: str) -> Path:
+    """The folder of this machine that the containers of a run have as their ``/dev/shm``."""
+    return SHARED_MEMORY / f"neuros_{run_id}"
 
 
 def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
@@ -173,7 +180,7 @@ def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
     }
 
 
-def _mounts(file: NodeFile, user: User) -> list[dict[str, Any]]:
+def _mounts(file: NodeFile, user: User, run_id: str) -> list[dict[str, Any]]:
     package = Path(neuros.__file__).resolve().parent
     own = node_folder(file) / "node.json"
     mounts = [
@@ -182,6 +189,7 @@ def _mounts(file: NodeFile, user: User) -> list[dict[str, Any]]:
         _mount(file.folders.run, FOLDERS.run, read_only=False),
         # In a folder that it may write to; but what it was told stays as it was.
         _mount(own, node_folder(inside(file)) / own.name),
+        _mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
     ]
     if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
         mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))

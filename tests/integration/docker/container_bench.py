@@ -14,6 +14,7 @@ from docker import DockerClient
 from launching import Finished, Running, start
 
 from containers import nothing_left, wait_until
+from neuros.launch.docker.settings import shared_memory
 from neuros.launch.run_processes import RUN_ID, RunProcesses
 from neuros.launch.sessions import Session, sessions
 from neuros.launch.shared_memory import _dead_groups
@@ -107,6 +108,7 @@ class ContainerBench:
             *(f"{RUN_ID}={run}" for run in self.runs if RunProcesses(run).alive()),
             *(name for each in containers if self._is_mine(each) for name in each["Names"]),
             *map(str, self.folder.rglob("control.sock")),
+            *(str(folder) for run in self.runs if (folder := shared_memory(run)).exists()),
             *(name for group in groups for name, _ in group.files),
         ]
 

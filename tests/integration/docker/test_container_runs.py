@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import signal
 import subprocess
 import sys
@@ -20,11 +21,19 @@ from container_bench import (
     container_bench,
 )
 from engine_proxy import EngineProxy
-from launching import Finished, Running, launch
+from launching import EXAMPLES, Finished, Running, launch
 
 from containers import require_containers, wait_until
+from neuros.errors import EnvironmentFault
 from neuros.launch.docker.engine import connect
-from neuros.launch.docker.launcher import engine_socket
+from neuros.launch.docker.launcher import DockerLauncher, engine_socket, find_containers
+from neuros.launch.docker.settings import container_name
+from neuros.launch.run_processes import RUN_ID
+from neuros.project.load import load_project
+from neuros.project.model import Folders
+from neuros.project.split import split
+
+LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
 LOOKS = """
 @neuros_initialise()
@@ -286,6 +295,62 @@ def test_with_an_engine_and_the_images_auto_is_docker(bench: ContainerBench) -> 
     )
     assert finished.exit_code == 0, finished.output
     assert finished.record["backend"] == "docker"
+
+
+def test_a_name_that_is_taken_is_said_and_nothing_is_left(
+    bench: ContainerBench, tmp_path: Path
+) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    project = load_project(tmp_path, workspace=tmp_path).project
+    run_id, (a, b) = secrets.token_hex(8), split(project, lambda _: Folders(*[tmp_path] * 3))
+    for node in (a, b):
+        (tmp_path / node.node.name).mkdir()
+        (tmp_path / node.node.name / "node.json").touch()
+    containers = find_containers(["neuros_python"], None)
+    folders: list[Path] = []
+    launcher = DockerLauncher(containers, on_started=lambda _, folder: folders.append(folder))
+    taken = containers.engine.containers.create(
+        containers.images["neuros_python"].id, ["true"], name=container_name(b, run_id)
+    )
+    try:
+        with pytest.raises(EnvironmentFault, match="already in use"):
+            launcher.start([a, b], {RUN_ID: run_id})
+        wait_until(lambda: not bench.left())
+    finally:
+        taken.remove()
+        containers.engine.close()
+        for folder in folders:
+            folder.rmdir()
+
+
+# ------------------------------------------------------------------ packets
+
+
+def test_images_go_from_container_to_container_without_loss(bench: ContainerBench) -> None:
+    finished = launch(LARGE_PACKETS, "--backend", "docker", cwd=bench.folder, timeout_s=60.0)
+    assert finished.exit_code == 0, finished.output
+    for counters in finished.record["connections"]:
+        if counters["discard_limit"] == 0:
+            assert counters["sent"] == counters["received"] > 0
+            assert counters["lost"] == 0
+    assert "go through DDS" not in finished.output, "they share memory"
+
+
+def test_whiskeye_runs_in_three_different_containers(bench: ContainerBench) -> None:
+    require_containers("neuros_python", "neuros_mujoco", "neuros_nest")
+    finished = launch(
+        EXAMPLES / "4_neurorobotics/whiskeye/strict.json",
+        *("--backend", "docker", "--duration", "1sim"),
+        cwd=bench.folder,
+        timeout_s=60.0,
+    )
+    assert finished.exit_code == 0, finished.output
+    for counters in finished.record["connections"]:
+        assert counters["sent"] == counters["consumed"] == 50
+    assert finished.run_folder is not None
+    picture = finished.run_folder / "visualiser/head_direction.png"
+    assert picture.exists()
+    assert f"picture: {picture}" in finished.output, "as it is called here"
 
 
 # ------------------------------------------------------------------ sessions
