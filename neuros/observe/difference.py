@@ -79,7 +79,8 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
     first = min(found, key=lambda difference: difference.at_ns, default=None)
     others = len(found) - 1
     if others > 0:
-        remarks.append(f"{others} more connection{'s' if others > 1 else ''} differ, later on")
+        differ = "connections differ" if others > 1 else "connection differs"
+        remarks.append(f"{others} more {differ}, later on")
     return Verdict(None if first is None else first.text, tuple(remarks), compared)
 
 

@@ -36,7 +36,7 @@ def digest_for(kind: type) -> Digest:
     """What digests messages of a class."""
     buffers = message_buffers(kind)
     if buffers is None:
-        return lambda packet, data: int(xxh3_64_intdigest(data))
+        return lambda packet, data: _whole(data)
     return _LargeDigest(kind, buffers)
 
 
@@ -46,7 +46,7 @@ def digest_of(packet: Any) -> int:
     buffers = message_buffers(kind)
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
         return _digest(message_carrier(kind).encode(buffers.leave_out(packet)), buffers, packet)
-    return int(xxh3_64_intdigest(message_carrier(kind).encode(packet)))
+    return _whole(message_carrier(kind).encode(packet))
 
 
 class _LargeDigest:
@@ -60,9 +60,15 @@ class _LargeDigest:
         if is_parcel(data):
             return _digest(message_of(data), self._buffers, packet)
         if len(data) < LARGE_BYTES or _size(self._buffers.views(packet)) < LARGE_BYTES:
-            return int(xxh3_64_intdigest(data))
+            return _whole(data)
         rest = self._plain.encode(self._buffers.leave_out(packet))
         return _digest(rest, self._buffers, packet)
+
+
+def _whole(data: bytes) -> int:
+    """Of a whole message, padded to four bytes: so it arrives, whatever was sent (RTPS, 9.4.1)."""
+    missing = -len(data) % 4
+    return int(xxh3_64_intdigest(data + bytes(missing) if missing else data))
 
 
 def _digest(rest: bytes, buffers: MessageBuffers, packet: Any) -> int:

@@ -45,6 +45,17 @@ def test_it_has_the_intervals_of_the_timed_hook(run: Finished) -> None:
     assert ticks["min_ms"] <= ticks["mean_ms"] <= ticks["max_ms"]
 
 
+def test_what_was_consumed_has_the_digest_of_what_was_sent(run: Finished) -> None:
+    (connection,) = run.record["connections"]
+    if run.record["backend"] == "in-process":
+        assert connection["digests"] is None
+        return
+    digests = connection["digests"]
+    assert digests["sent_packets"] == connection["sent"] > 1
+    assert digests["consumed_packets"] == connection["consumed"] == connection["sent"]
+    assert digests["consumed"] == digests["sent"]
+
+
 def test_wall_time_of_every_node_is_divided_without_rest(run: Finished) -> None:
     for node in run.record["nodes"].values():
         spent = node["accounting"]

@@ -95,7 +95,7 @@ def test_of_several_connections_the_one_that_parted_first_is_named(
     found = verdict(a, b)
     assert found.difference is not None
     assert found.difference.startswith(f"{SECOND}: packet 2 differs")
-    assert found.remarks == ("1 more connection differ, later on",)
+    assert found.remarks == ("1 more connection differs, later on",)
 
 
 def test_a_run_that_ends_earlier_is_not_identical(folders: tuple[Path, Path]) -> None:

@@ -48,6 +48,14 @@ def test_packets_that_differ_have_different_digests(one: Any, other: Any) -> Non
     assert digest(one) != digest(other)
 
 
+@pytest.mark.parametrize("text", ["", "a", "ab", "abc", "abcd"])
+def test_the_padding_with_which_a_message_arrives_does_not_count(text: str) -> None:
+    packet = String(data=text)
+    sent = message_carrier(String).encode(packet)
+    arrived = sent + bytes(-len(sent) % 4)
+    assert digest_for(String)(packet, arrived) == digest_for(String)(packet, sent)
+
+
 @pytest.mark.parametrize("is_reliable", [True, False])
 def test_a_parcel_has_the_digest_of_the_whole_message_at_both_ends(
     tmp_path: Path, is_reliable: bool
