@@ -65,6 +65,9 @@ class NodeRuntime:
         self._tell = tell
         self._fail = fail
         self._tap = tap
+        self._kept_on_arrival = frozenset(
+            c for c in file.connections if tap is not None and tap.wants(Way.RECEIVED, str(c))
+        )
         self._duration_sim_s = duration_sim_s if file.node.owns_time else None
         self._on_initialised = on_initialised
         self._clock = clock
@@ -157,7 +160,7 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
-        if self._tap is not None:
+        if connection in self._kept_on_arrival:
             self._keep(Way.RECEIVED, str(connection), packet)
         try:
             self._loaded.on_packet(connection, packet)

@@ -17,6 +17,8 @@ from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
 
 _LAST_S = 1.0
+# A connection's own depth goes with acknowledgements, which nobody sends here.
+_DEPTH = 1000
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def play(
 
 
 def _qos(topic: PlayedTopic) -> QoSProfile:
-    profile = QoSProfile(depth=max(topic.depth, 1))
+    profile = QoSProfile(depth=max(topic.depth, _DEPTH))
     if not topic.is_reliable:
         profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
     return profile

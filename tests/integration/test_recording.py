@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from ros_program import RosProgram
 from rosbags.rosbag2 import Reader
-from std_msgs.msg import String
+from std_msgs.msg import Float64, String
 from test_back_ends import talk_to_the_gate
 
 import neuros.bag
@@ -182,7 +182,10 @@ def test_replay_publishes_what_was_recorded(
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     command = [sys.executable, "-m", "neuros.cli", "replay", str(pipeline.run_folder)]
     with choose_domain(None, {}, False) as domain, RosProgram(domain_id=domain.id) as program:
-        totals = program.listen("/neuros/relay/total/sink/total/data", "std_msgs/msg/Float64")
+        totals: list[Float64] = []
+        program.node.create_subscription(
+            Float64, "/neuros/relay/total/sink/total/data", totals.append, 1000
+        )
         numbers = program.listen(NUMBER, "std_msgs/msg/Int32")
         options = ["-t", "relay.total", "--rate", "2", "--delay", "3", "-d", str(domain.id)]
         with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as replay:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +42,7 @@ class RecordedTopic:
         type: its message type in ROS notation.
         connection: ``a.out -> b.in``, or ``None`` for a topic that belongs to none.
         is_reliable, depth: of the quality of service that was offered.
+        count: how many packets there are.
     """
 
     def __init__(self, bag: Bag, recorded: Connection, connection: str | None) -> None:
@@ -48,14 +50,10 @@ class RecordedTopic:
         self.name = recorded.topic
         self.type = recorded.msgtype
         self.connection = connection
+        self.count = recorded.msgcount
         profiles = getattr(recorded.ext, "offered_qos_profiles", None) or []
         self.is_reliable = all(p.reliability is QosReliability.RELIABLE for p in profiles)
         self.depth = max((p.depth for p in profiles), default=0) or 10
-
-    @property
-    def count(self) -> int:
-        """How many packets there are."""
-        return len(self.raw())
 
     def raw(self) -> list[RawPacket]:
         """All packets as they were recorded."""
@@ -141,7 +139,7 @@ class Bag:
         self.topics = {
             name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
         }
-        self._packets: dict[str, list[RawPacket]] | None = None
+        self._packets: dict[str, list[RawPacket]] = {}
 
     @property
     def project(self) -> str | None:
@@ -165,17 +163,18 @@ class Bag:
 
     def packets_of(self, name: str) -> list[RawPacket]:
         """All packets of a topic, by their wall time."""
-        if self._packets is None:
-            self._packets = {topic: [] for topic in self.topics}
-            for topic, log_ns, publish_ns, data in stored_messages(self.folder):
-                self._packets[topic].append(RawPacket(log_ns, publish_ns, data))
-            for packets in self._packets.values():
-                packets.sort(key=lambda packet: packet.log_time_ns)
+        if name not in self._packets:
+            packets = [
+                RawPacket(log_ns, publish_ns, data)
+                for _, log_ns, publish_ns, data in stored_messages(self.folder, name)
+            ]
+            packets.sort(key=itemgetter(0))
+            self._packets[name] = packets
         return self._packets[name]
 
     def close(self) -> None:
         """Let go of what has been read."""
-        self._packets = None
+        self._packets.clear()
 
     def __enter__(self) -> Bag:
         return self

@@ -30,17 +30,17 @@ class Stored(NamedTuple):
     data: bytes
 
 
-def stored_messages(folder: Path) -> Iterator[Stored]:
-    """All messages in the files of a bag's folder, as far as they can be read.
+def stored_messages(folder: Path, only: str | None = None) -> Iterator[Stored]:
+    """All messages in the files of a bag's folder, or those of one topic, as far as they go.
 
     Raises:
         EnvironmentFault: if they are compressed, which is not how NeuROS records.
     """
     for path in sorted(folder.glob("*.mcap")):
         with open(path, "rb") as file:
-            yield from _of_mcap(file)
+            yield from _of_mcap(file, only)
     for path in sorted(folder.glob("*.db3")):
-        yield from _of_sqlite(path)
+        yield from (each for each in _of_sqlite(path) if only in (None, each.topic))
 
 
 def is_whole(folder: Path) -> bool:
@@ -58,7 +58,7 @@ def _has_end(path: Path) -> bool:
         return size > 2 * len(_MAGIC) and file.read() == _MAGIC
 
 
-def _of_mcap(file: BinaryIO) -> Iterator[Stored]:
+def _of_mcap(file: BinaryIO, only: str | None) -> Iterator[Stored]:
     if file.read(len(_MAGIC)) != _MAGIC:
         return
     topics: dict[int, str] = {}
@@ -71,12 +71,12 @@ def _of_mcap(file: BinaryIO) -> Iterator[Stored]:
         if kind == _DATA_END:
             return
         if kind == _CHUNK_OP:
-            yield from _of_chunk(content, topics)
+            yield from _of_chunk(content, topics, only)
         if len(content) < size:
             return
 
 
-def _of_chunk(content: bytes, topics: dict[int, str]) -> Iterator[Stored]:
+def _of_chunk(content: bytes, topics: dict[int, str], only: str | None) -> Iterator[Stored]:
     """The messages of a chunk without compression; ``topics`` grows by its channels."""
     at = _CHUNK.size
     if len(content) < at + 4:
@@ -93,7 +93,9 @@ def _of_chunk(content: bytes, topics: dict[int, str]) -> Iterator[Stored]:
         if kind == _CHANNEL:
             length = int.from_bytes(content[at + 4 : at + 8], "little")
             number = int.from_bytes(content[at : at + 2], "little")
-            topics[number] = content[at + 8 : at + 8 + length].decode()
+            name = content[at + 8 : at + 8 + length].decode()
+            if only in (None, name):
+                topics[number] = name
         elif kind == _MESSAGE_OP:
             number, _, log_ns, publish_ns = _MESSAGE.unpack_from(content, at)
             if number in topics:

@@ -1,0 +1,189 @@
+"""What was recorded, as arrays and frames: the same numbers as rosbags reads one by one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from observe.recordings import NUMBER, answer, number, plan, record, spool
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+import neuros.bag
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.observe.bag.columns import columns_of
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+
+floats = st.floats(width=32, allow_nan=False)
+texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=6)
+stamps = st.builds(TYPES["builtin_interfaces/msg/Time"], st.integers(0, 9), st.integers(0, 9))
+headers = st.builds(TYPES["std_msgs/msg/Header"], stamps, texts)
+
+
+def doubles(sizes: st.SearchStrategy[int]) -> st.SearchStrategy[Any]:
+    return sizes.flatmap(lambda n: st.lists(floats, min_size=n, max_size=n)).map(
+        lambda values: np.array(values, np.float64)
+    )
+
+
+MESSAGES = {
+    "std_msgs/msg/Int32": st.builds(TYPES["std_msgs/msg/Int32"], st.integers(-(2**31), 2**31 - 1)),
+    "std_msgs/msg/Bool": st.builds(TYPES["std_msgs/msg/Bool"], st.booleans()),
+    "std_msgs/msg/Empty": st.builds(TYPES["std_msgs/msg/Empty"]),
+    "std_msgs/msg/String": st.builds(TYPES["std_msgs/msg/String"], texts),
+    "geometry_msgs/msg/Vector3Stamped": st.builds(
+        TYPES["geometry_msgs/msg/Vector3Stamped"],
+        headers,
+        st.builds(TYPES["geometry_msgs/msg/Vector3"], floats, floats, floats),
+    ),
+    "sensor_msgs/msg/JointState": st.builds(
+        TYPES["sensor_msgs/msg/JointState"],
+        headers,
+        st.lists(texts, max_size=2),
+        doubles(st.integers(0, 3)),
+        doubles(st.just(2)),
+        doubles(st.just(0)),
+    ),
+    "sensor_msgs/msg/MagneticField": st.builds(
+        TYPES["sensor_msgs/msg/MagneticField"],
+        headers,
+        st.builds(TYPES["geometry_msgs/msg/Vector3"], floats, floats, floats),
+        doubles(st.just(9)),
+    ),
+}
+Sent = tuple[str, list[Any]]
+sent = st.sampled_from(sorted(MESSAGES)).flatmap(
+    lambda name: st.tuples(st.just(name), st.lists(MESSAGES[name], min_size=1, max_size=8))
+)
+
+
+def field(message: Any, name: str) -> Any:
+    for part in name.split("."):
+        message = getattr(message, part)
+    return message
+
+
+@settings(deadline=None)
+@given(sent)
+def test_columns_hold_what_rosbags_reads(messages: Sent) -> None:
+    name, expected = messages
+    packets = [bytes(STORE.serialize_cdr(message, name)) for message in expected]
+    columns = columns_of(packets, name, STORE)
+    assert columns or name == "std_msgs/msg/Empty"
+    for column_name, column in columns.items():
+        assert len(column) == len(expected)
+        for message, found in zip(expected, column, strict=True):
+            wanted = field(message, column_name)
+            assert np.array_equal(np.asarray(wanted), np.asarray(found)), column_name
+
+
+def test_arrays_of_one_length_have_a_dimension_and_others_are_objects() -> None:
+    name = "std_msgs/msg/Float32MultiArray"
+    layout = TYPES["std_msgs/msg/MultiArrayLayout"]([], 0)
+
+    def packed(*lengths: int) -> list[bytes]:
+        made = (TYPES[name](layout, np.arange(n, dtype=np.float32)) for n in lengths)
+        return [bytes(STORE.serialize_cdr(message, name)) for message in made]
+
+    assert columns_of(packed(3, 3), name, STORE)["data"].shape == (2, 3)
+    ragged = columns_of(packed(1, 3), name, STORE)["data"]
+    assert ragged.dtype == object
+    assert [value.tolist() for value in ragged] == [[0.0], [0.0, 1.0, 2.0]]
+
+
+def test_more_layouts_than_one_can_keep_are_read_all_the_same() -> None:
+    name = "std_msgs/msg/String"
+    texts = ["x" * k for k in range(200)]
+    packets = [bytes(STORE.serialize_cdr(TYPES[name](text), name)) for text in texts]
+    assert columns_of(packets, name, STORE)["data"].tolist() == texts
+
+
+def test_a_run_is_opened_by_its_folder_or_its_bag(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, 5, number(1)), (30, 6, number(3))])
+    record(tmp_path, plan(time_owner="a"))
+    for folder in (tmp_path, tmp_path / "bag"):
+        with neuros.bag.open(folder) as bag:
+            array = bag["a.number -> b.n"].array()
+            assert array.dtype.names == ("log_time_ns", "publish_time_ns", "data")
+            assert array.tolist() == [(10, 5, 1), (30, 6, 3)]
+            assert bag.custom == {"run_id": "0123"}
+
+
+def test_a_bag_by_itself_is_opened(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1))])
+    record(tmp_path, plan())
+    (tmp_path / "bag").rename(tmp_path / "elsewhere")
+    (tmp_path / "recording.json").unlink()
+    with neuros.bag.open(tmp_path / "elsewhere") as bag:
+        assert bag[NUMBER.name].array()["data"].tolist() == [1]
+
+
+def test_a_frame_has_a_column_for_each_element(tmp_path: Path) -> None:
+    spool(tmp_path, "b", [(10, None, answer()), (30, None, answer())])
+    record(tmp_path, plan())
+    with neuros.bag.open(tmp_path) as bag:
+        frame = bag["/answer"].frame()
+    assert list(frame) == ["log_time_ns", "publish_time_ns", "data"]
+    assert frame["data"].tolist() == [0.0, 0.0]
+
+
+def test_without_pandas_a_frame_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path, plan())
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with (
+        neuros.bag.open(tmp_path) as bag,
+        pytest.raises(EnvironmentFault, match="pip install pandas"),
+    ):
+        bag["/answer"].frame()
+
+
+def test_a_topic_without_packets_is_an_empty_array(tmp_path: Path) -> None:
+    record(tmp_path, plan())
+    with neuros.bag.open(tmp_path) as bag:
+        assert len(bag["/answer"].array()) == 0
+        assert bag["/answer"].count == 0
+
+
+def test_a_name_that_means_several_topics_or_none_is_said(tmp_path: Path) -> None:
+    record(tmp_path, plan())
+    with neuros.bag.open(tmp_path) as bag:
+        with pytest.raises(KeyError, match=r"which of a\.number -> b\.n, a\.number -> c\.n"):
+            bag["a.number"]
+        with pytest.raises(KeyError, match="there are"):
+            bag["nothing"]
+
+
+def test_what_was_cut_off_is_completed_when_it_is_opened(tmp_path: Path) -> None:
+    plan().save(tmp_path)
+    spool(tmp_path, "a", [(10, None, number(1))])
+    with neuros.bag.open(tmp_path) as bag:
+        assert bag["a.number -> b.n"].array()["data"].tolist() == [1]
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.message_count == 2
+
+
+def test_a_run_that_was_not_recorded_and_one_of_another_version_are_said(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="was not recorded"):
+        neuros.bag.open(tmp_path)
+    (tmp_path / "recording.json").write_text('{"version": 99}')
+    with pytest.raises(UsageError, match="version 99, and this NeuROS reads version 1"):
+        neuros.bag.open(tmp_path)
+    (tmp_path / "recording.json").write_text('{"version": 1')
+    with pytest.raises(UsageError, match="is damaged"):
+        neuros.bag.open(tmp_path)
+
+
+def test_a_bag_that_is_not_one_is_said(tmp_path: Path) -> None:
+    record(tmp_path, plan())
+    (tmp_path / "bag" / "metadata.yaml").write_text("nonsense: 1")
+    with pytest.raises(EnvironmentFault, match="cannot be read"):
+        neuros.bag.open(tmp_path)
