@@ -54,7 +54,8 @@ class _Problems:
     def add(self, text: str) -> None:
         """Note a problem, a sentence. Any thread."""
         self.texts.append(text)
-        print(f"[ERROR] [{time.time():.9f}] [recorder]: {text}", file=sys.stderr, flush=True)
+        with contextlib.suppress(OSError):  # the disk of the log may be full, too
+            print(f"[ERROR] [{time.time():.9f}] [recorder]: {text}", file=sys.stderr, flush=True)
 
 
 def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -> dict[str, int]:
