@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 
 from tabulate import tabulate
 
 from benchmarks import comparing, running, subjects
+from benchmarks.interruption import interrupted_by_termination
 from benchmarks.machine import ROOT
 from benchmarks.measure import Subject
 from benchmarks.results import Results, combine, differences, utc_time
@@ -54,7 +52,7 @@ def _measure(options: argparse.Namespace) -> tuple[Results, int]:
     results, code = Results.here(options.quick), 0
     file = Path(options.output) if options.output else FOLDER / f"{utc_time()}.json"
     try:
-        with _interrupted_by_termination():
+        with interrupted_by_termination():
             running.measure(chosen, results, file, _say, options.rounds)
     except KeyboardInterrupt:
         _say("interrupted: what was measured is kept")
@@ -120,23 +118,6 @@ def _draw(results: Results, options: argparse.Namespace) -> None:
             _say(f"drawn: {file}")
     if options.write_docs:
         page.write(results, ROOT / "docs")
-
-
-@contextlib.contextmanager
-def _interrupted_by_termination() -> Iterator[None]:
-    """SIGTERM, and a terminal that is closed, end the measurements as Ctrl+C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {
-        number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _say(line: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 PLUGINS = Path(__file__).resolve().parent / "plugins"
 
-_RUN_S = 120.0
+RUN_S = 120.0
 
 
 @contextlib.contextmanager
@@ -35,6 +35,7 @@ def launch(
     *,
     settings: Mapping[str, Any] | None = None,
     options: Sequence[str] = (),
+    timeout_s: float = RUN_S,
 ) -> dict[str, Any]:
     """Run a project to its end; returns its ``run.json``.
 
@@ -42,9 +43,11 @@ def launch(
         run_folder: must not exist yet.
         settings: values for ``--set``.
         options: further ones of the command line.
+        timeout_s: how long it may take, from the command to its end.
 
     Raises:
         RuntimeError: if it does not end with 0, with what it printed.
+        subprocess.TimeoutExpired: if it takes longer; it is ended.
     """
     command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
     command += ["--backend", backend, "-o", str(run_folder), *options]
@@ -60,7 +63,7 @@ def launch(
         env=environment,
     )
     try:
-        output, _ = process.communicate(timeout=_RUN_S)
+        output, _ = process.communicate(timeout=timeout_s)
     finally:
         if process.poll() is None:
             process.terminate()  # it ends its nodes

@@ -56,12 +56,9 @@ class Results:
         return cls(utc_time(), is_quick, machine(), versions())
 
     def write(self, file: Path) -> None:
-        """Write them; a reader sees the old or the new file, never a part."""
+        """Write them to a file."""
         data = {"schema": SCHEMA, **asdict(self)}
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_name(f".{file.name}.part")
-        part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
-        os.replace(part, file)
+        write_whole(file, json.dumps(data, indent=1) + "\n")
 
     @classmethod
     def read(cls, file: Path) -> Results:
@@ -113,6 +110,14 @@ def differences(a: Results, b: Results) -> list[str]:
     if a.is_quick != b.is_quick:
         lines.append("one of them is a quick run")
     return lines
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write a file; a reader sees the old or the new one, never a part."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f".{file.name}.part")
+    part.write_text(text, "utf-8")
+    os.replace(part, file)
 
 
 def utc_time() -> str:

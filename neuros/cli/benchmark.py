@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import sys
-from pathlib import Path
-from typing import Any
 
-from neuros.errors import EnvironmentFault, UsageError
-
-_ROOT = Path(__file__).resolve().parents[2]
+from neuros.cli.checkout import checkout_command, positive_number
+from neuros.errors import UsageError
 
 _EPILOG = """\
 exit codes:
@@ -35,7 +30,12 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     add("subjects", nargs="*", metavar="SUBJECT", help="what to measure (default: everything)")
     add("--list", action="store_true", help="show the subjects, and measure nothing")
     add("-k", "--rows", metavar="TEXT", default="", help="only rows whose name contains TEXT")
-    add("--rounds", type=_positive, metavar="N", help="rounds (default: 10 where a target is held)")
+    add(
+        "--rounds",
+        type=positive_number,
+        metavar="N",
+        help="rounds (default: 10 where a target is held)",
+    )
     add("--quick", action="store_true", help="few and short rounds: no figures to quote")
     add("-o", "--output", metavar="FILE", help="default: build/benchmarks/<utc time>.json")
     add(
@@ -54,28 +54,4 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 def _benchmark(options: argparse.Namespace) -> int:
     if options.subjects and (options.files or options.compare or options.list):
         raise UsageError("--from, --compare and --list measure nothing: name no SUBJECT")
-    return int(_benchmarks(_ROOT).run(options))
-
-
-def _benchmarks(root: Path) -> Any:
-    """The module that does it; it belongs to the source checkout, and not to the package.
-
-    Raises:
-        EnvironmentFault: where neuros was installed without one.
-    """
-    if not (root / "benchmarks" / "command.py").is_file():
-        raise EnvironmentFault(
-            f"there are no benchmarks in {root}: they are part of the source checkout;"
-            " clone it, run ./install.py there, and use its .venv/bin/neuros"
-        )
-    if str(root) not in sys.path:
-        sys.path.insert(0, str(root))
-    name = "benchmarks.command"
-    return importlib.import_module(name)
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
+    return int(checkout_command("benchmarks.command").run(options))

@@ -32,6 +32,7 @@ from neuros.cli.network import add_network
 from neuros.cli.observation import add_observation
 from neuros.cli.recording_options import add_recorder, add_recording_options
 from neuros.cli.replay import add_replay
+from neuros.cli.reproduce import add_reproduce
 from neuros.cli.sessions import add_sessions
 from neuros.cli.verify import add_verify
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
@@ -106,6 +107,7 @@ def parser() -> argparse.ArgumentParser:
     add_bag(commands)
     add_replay(commands)
     add_benchmark(commands)
+    add_reproduce(commands)
     add_verify(commands)
     _add_node(commands)
     add_recorder(commands)

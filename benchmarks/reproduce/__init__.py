@@ -1,0 +1,1 @@
+"""``neuros reproduce``: the published experiments again, and the figures and tables of them."""
