@@ -76,8 +76,8 @@ TOPICS = (
     _Topic(
         "Delivery rate",
         "Packets that a hook has started on, of those that were sent. Where nothing holds the"
-        " physics back it is faster than the network here. There it was the slower one, and no IMU"
-        " packet was lost.",
+        " physics back it is faster than the network here, and does not wait for its start either."
+        " In the published runs, in which no IMU packet was lost, it must have been slower.",
         Layout(
             "delivery",
             [
