@@ -71,13 +71,11 @@ class Experiment:
         now = cls(folder, name, duration_s, utc_time(), machine(), versions())
         if (folder / FILE).exists():
             there = cls.open(folder, name)
-            for key in ("duration_s", "machine", "versions"):
-                then, today = getattr(there, key), getattr(now, key)
-                if then != today:
-                    raise UsageError(
-                        f"{folder} holds runs with {key} {then}, and these would have {today}:"
-                        " name another folder with -o"
-                    )
+            if different := _differences(there, now):
+                raise UsageError(
+                    f"{folder} holds runs that these must not be mixed with ({different}):"
+                    " name another folder with -o"
+                )
             return there
         try:
             if folder.is_dir() and os.listdir(folder):
@@ -127,3 +125,16 @@ class Experiment:
         while (self.folder / "runs" / f"{name}-{number}").exists():
             number += 1
         return number
+
+
+def _differences(there: Experiment, now: Experiment) -> str:
+    """In what two experiments differ, apart from their runs; empty if in nothing."""
+    then, today = (
+        {"duration": f"{each.duration_s:g} s", **each.machine, **each.versions}
+        for each in (there, now)
+    )
+    return "; ".join(
+        f"{key} there {then.get(key)}, now {today.get(key)}"
+        for key in {**then, **today}
+        if then.get(key) != today.get(key)
+    )

@@ -187,12 +187,12 @@ def test_runs_of_another_duration_machine_or_version_are_not_mixed(
     capsys.readouterr()
     command_line = ["reproduce", "tick", "-o", str(tmp_path), "--duration", "4"]
     assert main(command_line) == 2
-    assert "holds runs with duration_s 3.0, and these would have 4.0" in capsys.readouterr().err
+    assert "must not be mixed with (duration there 3 s, now 4 s)" in capsys.readouterr().err
 
     there = Experiment.open(tmp_path, "tick")
     replace(there, machine={**there.machine, "processor": "another"}).write()
     assert reproduce(tmp_path, "--only", "good") == 2
-    assert "holds runs with machine" in capsys.readouterr().err
+    assert "mixed with (processor there another, now " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
