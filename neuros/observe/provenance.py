@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,42 +81,43 @@ class GitState:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._commit = _git(folder, "rev-parse", "HEAD")
-        self._changes = _git(folder, "status", "--porcelain", "--", ".")
+        self._state: dict[str, Any] | None = None
+        self._asking = threading.Thread(
+            target=self._ask, args=(folder,), name="neuros-git", daemon=True
+        )
+        self._asking.start()
 
     def finish(self) -> dict[str, Any] | None:
         """``commit``, and ``is_dirty`` if the folder differs from it; ``None`` outside git."""
-        commit, changes = _answer(self._commit), _answer(self._changes)
+        self._asking.join()
+        return self._state
+
+    def _ask(self, folder: Path) -> None:
+        commit = _git(folder, "rev-parse", "HEAD")
         if commit is None:
-            return None
-        return {"commit": commit.strip(), "is_dirty": None if changes is None else bool(changes)}
+            return
+        changes = _git(folder, "status", "--porcelain", "--", ".")
+        self._state = {
+            "commit": commit.strip(),
+            "is_dirty": None if changes is None else bool(changes),
+        }
 
 
-def _git(folder: Path, *arguments: str) -> subprocess.Popen[bytes] | None:
+def _git(folder: Path, *arguments: str) -> str | None:
     # Variables of a surrounding git command (a hook, say) would lead it to another repository.
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
-        return subprocess.Popen(
+        asked = subprocess.run(
             ["git", "--no-optional-locks", "-C", str(folder), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
+            timeout=_GIT_PATIENCE_S,
         )
-    except OSError:  # there is no git
+    except (OSError, subprocess.TimeoutExpired):  # there is no git, or its disk does not answer
         return None
-
-
-def _answer(asked: subprocess.Popen[bytes] | None) -> str | None:
-    if asked is None:
-        return None
-    try:
-        output, _ = asked.communicate(timeout=_GIT_PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        asked.kill()
-        asked.communicate()
-        return None
-    return output.decode(errors="replace") if asked.returncode == 0 else None
+    return asked.stdout.decode(errors="replace") if asked.returncode == 0 else None
 
 
 def _first(file: str, key: str) -> str | None:

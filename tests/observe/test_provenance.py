@@ -6,8 +6,10 @@ import os
 import subprocess
 from pathlib import Path
 
+import psutil
 import pytest
 
+from containers import wait_until
 from neuros.observe.provenance import GitState, installed_packages, provenance, seeds
 from neuros.project.model import Node
 
@@ -80,3 +82,20 @@ def test_a_machine_without_git_has_no_commit(
 ) -> None:
     monkeypatch.setenv("PATH", os.devnull)
     assert GitState(repository).finish() is None
+
+
+def test_while_the_run_goes_on_git_is_not_left_as_a_zombie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = tmp_path / "bin/git"
+    fake.parent.mkdir()
+    fake.write_text(
+        f"#!/bin/sh\necho $$ > {tmp_path}/pid.new\nmv {tmp_path}/pid.new {tmp_path}/pid\n"
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{fake.parent}{os.pathsep}{os.environ['PATH']}")
+    state = GitState(tmp_path)
+    wait_until((tmp_path / "pid").exists, 10.0)
+    pid = int((tmp_path / "pid").read_text())
+    wait_until(lambda: not psutil.pid_exists(pid), 10.0)
+    assert state.finish() is not None
