@@ -101,14 +101,14 @@ def parser() -> argparse.ArgumentParser:
     _add_launch(commands)
     _add_validate(commands)
     _add_graph(commands)
-    add_doctor(commands)
-    add_containers(commands)
     add_sessions(commands)
+    add_verify(commands)
     add_bag(commands)
     add_replay(commands)
+    add_doctor(commands)
+    add_containers(commands)
     add_benchmark(commands)
     add_reproduce(commands)
-    add_verify(commands)
     _add_node(commands)
     add_recorder(commands)
     return result
@@ -221,9 +221,9 @@ def _add_project(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="PATH=VALUE",
-        help="change a key of the project: nodes.NAME.KEY...=VALUE or"
-        " connections.SRC.OUT.DST.IN.KEY=VALUE (JSON if it parses; always text in environment;"
-        " nothing removes the key)",
+        help="change a key of the project: nodes.NAME.KEY...=VALUE,"
+        " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE (JSON if it parses; always text"
+        " in environment; nothing removes the key)",
     )
 
 

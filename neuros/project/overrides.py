@@ -4,6 +4,7 @@
 
     nodes.NAME.KEY...=VALUE
     connections.SRC.OUT.DST.IN.KEY=VALUE
+    budgets.KEY=VALUE                     budgets.lost_packets.SRC.OUT -> DST.IN=VALUE
 
 ``VALUE`` is JSON if it parses and a text otherwise; in ``environment`` it is always a text. Without
 a value the key is removed. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
@@ -23,6 +24,7 @@ from neuros.project.suggest import did_you_mean
 _ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 _NODE_FORM = "nodes.NAME.KEY=VALUE"
 _CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
+_BUDGET_FORM = "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE"
 
 
 def apply_override(draft: Draft, text: str) -> list[Problem]:
@@ -30,10 +32,12 @@ def apply_override(draft: Draft, text: str) -> list[Problem]:
     override = _Override(Source(f"--set {text}", draft.roots.project, text))
     target, equals, _ = text.partition("=")
     kind, *steps = target.split(".")
+    if kind == "budgets":
+        return override.apply_to_budgets(draft.root, steps)
     form = {"nodes": _NODE_FORM, "connections": _CONNECTION_FORM}.get(kind)
     if form is None:
-        hint = did_you_mean(kind, ("nodes", "connections"))
-        return [override.problem("must begin with 'nodes.' or 'connections.'", hint)]
+        hint = did_you_mean(kind, ("nodes", "connections", "budgets"))
+        return [override.problem("must begin with 'nodes.', 'connections.' or 'budgets.'", hint)]
     names = len(_ENDS) if kind == "connections" else 1
     if not equals or len(steps) <= names or not all(steps[: names + 1]):
         return [override.problem("is not of the form", form)]
@@ -67,6 +71,13 @@ class _Override:
 
     def problem(self, text: str, hint: str = "") -> Problem:
         return self.source.problem(0, "", text, hint)
+
+    def apply_to_budgets(self, root: Element, steps: list[str]) -> list[Problem]:
+        if "=" not in self.source.text or not all(steps) or not steps:
+            return [self.problem("is not of the form", _BUDGET_FORM)]
+        if len(steps) > 1:
+            steps = [steps[0], ".".join(steps[1:])]  # names of connections contain dots
+        return self.apply(root, ["budgets", *steps])
 
     def apply(self, parent: Element, steps: list[str]) -> list[Problem]:
         is_text = steps[0] == "environment" and len(steps) > 1

@@ -9,7 +9,7 @@ import pytest
 
 from neuros.errors import ProjectError
 from neuros.project.load import load_project
-from neuros.project.model import Project
+from neuros.project.model import Budgets, Project
 
 PROJECT = {
     "nodes": [
@@ -92,6 +92,17 @@ def test_ports_go_by_their_names(file: Path) -> None:
     assert project.node("robot").output("imu").mujoco["rate"] == 100
 
 
+def test_budgets_are_set_and_removed(file: Path) -> None:
+    budgets = load(
+        file,
+        "budgets.real_time_factor=0.5",
+        "budgets.tick_error_ms=5",
+        "budgets.lost_packets.robot.imu -> snn.imu=3",
+        "budgets.tick_error_ms=",
+    ).budgets
+    assert budgets == Budgets({"robot.imu -> snn.imu": 3}, 0.5, None)
+
+
 def test_they_apply_in_their_order(file: Path) -> None:
     project = load(file, "nodes.snn.container=a", "nodes.snn.container=b")
     assert project.node("snn").container == "b"
@@ -104,13 +115,22 @@ def test_they_apply_in_their_order(file: Path) -> None:
         ("connections.robot.imu.snn.im.queue_size=1",
          "1:1: /: there is no connection 'robot.imu.snn.im' (did you mean 'robot.imu.snn.imu'?)"),
         ("node.robot.plugin=p.py",
-         "1:1: /: must begin with 'nodes.' or 'connections.' (did you mean 'nodes'?)"),
+         "1:1: /: must begin with 'nodes.', 'connections.' or 'budgets.' (did you mean 'nodes'?)"),
         ("nodes.robot=1", "1:1: /: is not of the form (nodes.NAME.KEY=VALUE)"),
         ("nodes.robot.plugin", "1:1: /: is not of the form (nodes.NAME.KEY=VALUE)"),
         ("connections.robot.imu.snn.imu=1",
          "1:1: /: is not of the form (connections.SRC.OUT.DST.IN.KEY=VALUE)"),
         ("nodes.robot.name.first=1", "1:1: /: 'first' leads nowhere: there is no object around it"),
         ("nodes.robot.outputs.odom.type=x", "1:1: /: there is no 'odom' in /outputs"),
+        ("budgets=1",
+         "1:1: /: is not of the form"
+         " (budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE)"),
+        ("budgets.real_time_factr=1",
+         "1:25: /budgets/real_time_factr: unknown key 'real_time_factr'"
+         " (did you mean 'real_time_factor'?)"),
+        ("budgets.lost_packets.robot.im -> snn.imu=1",
+         "1:42: /budgets/lost_packets/robot.im -> snn.imu: there is no connection"
+         " 'robot.im -> snn.imu' (did you mean 'robot.imu -> snn.imu'?)"),
         ("connections.robot.imu.snn.imu.discard_limit=-1",
          "1:45: /connections/0/discard_limit: must be at least 0, but is -1"),
         ("nodes.snn.colour=red", "1:18: /nodes/1/colour: unknown key 'colour'"),
