@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from functools import cache
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ def _verify(options: argparse.Namespace) -> int:
     from neuros.observe.past_run import open_run
 
     a, b = open_run(options.run_a), open_run(options.run_b)
-    verdict = compare(a, b, _recorded)
+    verdict = compare(a, b, _Recorded())
     for remark in verdict.remarks:
         print(f"note: {remark}")
     if verdict.difference is not None:
@@ -43,25 +41,33 @@ def _verify(options: argparse.Namespace) -> int:
     return 0
 
 
-def _recorded(run_folder: Path, connection: str, number: int) -> Any:
-    """A packet from what a run has recorded; ``None`` where it is not there."""
-    bag = _bag(run_folder)
-    if bag is None:
-        return None
-    try:
-        messages = bag[connection].messages()
-    except KeyError:
-        return None
-    found = next(islice(messages, number - 1, None), None)
-    return None if found is None else found[1]
+class _Recorded:
+    """Packets from what runs have recorded; ``None`` where one is not there."""
+
+    def __init__(self) -> None:
+        self._bags: dict[Path, Any] = {}
+
+    def __call__(self, run_folder: Path, connection: str, number: int) -> Any:
+        if run_folder not in self._bags:
+            self._bags[run_folder] = _bag(run_folder)
+        bag = self._bags[run_folder]
+        if bag is None:
+            return None
+        try:
+            return bag[connection].message(number - 1)
+        except (KeyError, IndexError):
+            return None
 
 
-@cache
 def _bag(run_folder: Path) -> Any:
     from neuros.errors import NeurosError
     from neuros.observe.bag.opened import open_bag
+    from neuros.observe.recording.plan import PLAN_NAME
 
+    if not (run_folder / PLAN_NAME).exists():
+        return None
     try:
         return open_bag(run_folder)
-    except NeurosError:  # it was not recorded
+    except NeurosError as error:
+        print(f"note: {error}")
         return None

@@ -33,10 +33,14 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Difference:
-    """One connection on which they part; ``at_ns`` (in run A) tells which was the first."""
+    """One connection on which they part; ``at_ns`` (in run A) tells which was the first.
+
+    ``packet``: the connection and the number of the first packet that differs, from 1.
+    """
 
     at_ns: float
     text: str
+    packet: tuple[str, int] | None = None
 
 
 def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
@@ -67,7 +71,7 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
                 " sends to itself)"
             )
             continue
-        difference = _sent(name, (a.folder, b.folder), in_a, in_b, message_of)
+        difference = _sent(name, in_a, in_b)
         compared += _first_difference(in_a.sent, in_b.sent)
         taken = _taken(name, in_a, in_b)
         if difference is not None:
@@ -81,12 +85,13 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
     if others > 0:
         differ = "connections differ" if others > 1 else "connection differs"
         remarks.append(f"{others} more {differ}, later on")
-    return Verdict(None if first is None else first.text, tuple(remarks), compared)
+    text = None if first is None else first.text
+    if first is not None and first.packet is not None:  # a bag is read for the first one only
+        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, message_of)}"
+    return Verdict(text, tuple(remarks), compared)
 
 
-def _sent(
-    name: str, folders: tuple[Path, Path], in_a: Packets, in_b: Packets, message_of: MessageOf
-) -> _Difference | None:
+def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     place = _first_difference(in_a.sent, in_b.sent)
     if place == len(in_a.sent) == len(in_b.sent):
         return None
@@ -95,13 +100,16 @@ def _sent(
         shorter, longer = ("A", "B") if len(in_a.sent) < len(in_b.sent) else ("B", "A")
         text = f"{name}: run {shorter} ends after packet {place}, run {longer} has more"
         return _Difference(at_ns, f"{text} ({abs(len(in_a.sent) - len(in_b.sent))})")
-    number = place + 1
+    return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
+
+
+def _field(folders: tuple[Path, Path], name: str, number: int, message_of: MessageOf) -> str:
+    """In which field a packet differs, as far as it was recorded."""
     messages = [message_of(folder, name, number) for folder in folders]
-    text = f"{name}: packet {number} differs"
     if None in messages:
-        return _Difference(at_ns, f"{text} (which field, only --record can tell)")
-    fields = [*differing_fields(*messages)]
-    return _Difference(at_ns, f"{text} in {fields[0] if fields else 'nothing that was recorded'}")
+        return "(which field, only --record can tell)"
+    field = next(differing_fields(*messages), None)
+    return f"in {field or 'nothing that was recorded'}"
 
 
 def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:

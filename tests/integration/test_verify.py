@@ -22,7 +22,7 @@ def run(folder: Path, *arguments: str) -> Finished:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    return run(tmp_path_factory.mktemp("runs") / "reference", "--backend", "process")
+    return run(tmp_path_factory.mktemp("runs") / "reference", "--backend", "process", "-r")
 
 
 def verify(a: Finished, b: Finished, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
@@ -48,13 +48,19 @@ def test_a_strict_run_is_repeated_packet_by_packet(
     assert digests[0] == digests[1]
 
 
-def test_another_project_is_told_by_its_first_packet(
+def test_another_project_is_told_by_its_first_packet_and_the_field(
     tmp_path: Path, reference: Finished, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    changed = run(tmp_path / "changed", "--set", "nodes.controller.environment.TOUR=3 0")
+    changed = run(tmp_path / "changed", "--set", "nodes.controller.environment.TOUR=3 0", "-r")
     code, text = verify(reference, changed, capsys)
     assert code == 1
-    assert "different: controller.target -> elevator.target: packet 1 differs" in text
+    first = "different: controller.target -> elevator.target: packet 1 differs"
+    assert f"{first} in data: " in text
+    assert changed.run_folder is not None
+    (changed.run_folder / "recording.json").write_text("{")
+    _code, text = verify(reference, changed, capsys)
+    assert "recording.json is damaged" in text
+    assert f"{first} (which field, only --record can tell)" in text
 
 
 def test_in_process_without_digests_there_is_nothing_to_compare(

@@ -64,6 +64,10 @@ class RecordedTopic:
         for packet in self.raw():
             yield packet, self._bag.store.deserialize_cdr(packet.data, self.type)
 
+    def message(self, place: int) -> Any:
+        """The message at a place, from 0. Raises ``IndexError``."""
+        return self._bag.store.deserialize_cdr(self.raw()[place].data, self.type)
+
     def columns(self) -> dict[str, Column]:
         """A column for each field, and the two times; see :meth:`array`."""
         packets = self.raw()
