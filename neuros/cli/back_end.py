@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.launch.docker.layout import as_here, inside
@@ -41,6 +41,15 @@ class BackEnd:
     def as_here(self, text: str, folders: Folders) -> str:
         """What a node has said, with the names that its paths have on this machine."""
         return as_here(text, folders) if self.containers else text
+
+    def record(self) -> dict[str, Any]:
+        """What belongs into the record of a run: engine and images, where there are any."""
+        if self.containers is None:
+            return {}
+        try:
+            return {"docker": self.containers.record()}
+        except EnvironmentFault:  # the engine has gone away, of which the run has ended
+            return {"docker": None}
 
     def launcher(
         self,

@@ -124,6 +124,7 @@ class _Run:
             record = run_record(self._plan.project, self._files, outcome, wall_s, self._run_folder)
             record |= {
                 "backend": self._plan.backend,
+                **self._plan.back_end.record(),
                 "domain_id": self._domain.id,
                 "started": started,
                 **observed,

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from neuros.observe.provenance import note_versions
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.project.split import node_file_from_json
@@ -26,6 +27,8 @@ def run_node(options: argparse.Namespace) -> int:
     files = [node_file_from_json(json.loads(Path(p).read_text())) for p in options.node_files]
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    if not options.in_memory:  # else it is the launcher's Python
+        note_versions(files[0].folders.run / files[0].node.name)
 
     def make_middleware(
         files: Sequence[NodeFile], on_failure: Callable[[BaseException], None]

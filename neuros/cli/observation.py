@@ -67,6 +67,7 @@ class Observation:
         is_one_process: bool,
     ) -> None:
         self._run_id = run_id
+        self._run_folder = run_folder
         self._project = project
         from neuros.observe.provenance import GitState
 
@@ -82,7 +83,7 @@ class Observation:
 
         record = {
             "run_id": self._run_id,
-            **provenance(sys.argv, self._project.nodes),
+            **provenance(sys.argv, self._project.nodes, self._run_folder),
             "git": self._git.finish(),
         }
         if self._monitor is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import platform
 import subprocess
@@ -16,26 +17,52 @@ from neuros import __version__
 from neuros.project.model import Node
 
 _GIT_PATIENCE_S = 5.0
+_VERSIONS = "versions.json"
 
 
-def provenance(command: Sequence[str], nodes: Iterable[Node]) -> dict[str, Any]:
+def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) -> dict[str, Any]:
     """All of it but git's part, ready for JSON.
 
     Args:
         command: the command line that was given.
         nodes: of the project: what is called a seed in their environment is listed.
+        run_folder: where nodes have noted their versions.
     """
+    nodes = list(nodes)
+    own = python_versions()
     return {
         "command": list(command),
         "versions": {
             "neuros": __version__,
-            "python": platform.python_version(),
             "kernel": f"{platform.system()} {platform.release()}",
-            "packages": installed_packages(sys.path),
+            **own,
+            "nodes": {
+                node.name: noted
+                for node in nodes
+                if (noted := _noted_versions(run_folder / node.name)) not in (None, own)
+            },
         },
         "machine": machine(),
         "seeds": seeds(nodes),
     }
+
+
+def python_versions() -> dict[str, Any]:
+    """Of this Python and of what it finds."""
+    return {"python": platform.python_version(), "packages": installed_packages(sys.path)}
+
+
+def note_versions(node_folder: Path) -> None:
+    """Leave in a node's folder what the node runs on: a container has a Python of its own."""
+    with contextlib.suppress(OSError):  # of a full disk others complain who lose more
+        (node_folder / _VERSIONS).write_text(json.dumps(python_versions(), indent=2), "utf-8")
+
+
+def _noted_versions(node_folder: Path) -> Any:
+    try:
+        return json.loads((node_folder / _VERSIONS).read_text("utf-8"))
+    except (OSError, ValueError):  # it never began, or the disk was full
+        return None
 
 
 def installed_packages(folders: Iterable[str]) -> dict[str, str]:

@@ -28,6 +28,7 @@ def test_it_has_what_the_run_was_made_of(run: Finished) -> None:
     assert record["seeds"] == {"clock": {"SEED": "7"}}
     assert any("clock" in part for part in record["command"])
     assert record["versions"]["packages"]["ros_jazzy_rclpy"]
+    assert record["versions"]["nodes"] == {}, "they run on the launcher's Python"
     assert record["machine"]["cores"] >= 1
     names = [node["name"] for node in record["expanded_project"]["nodes"]]
     assert names == ["clock", "display"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from pathlib import Path
@@ -10,7 +11,13 @@ import psutil
 import pytest
 
 from containers import wait_until
-from neuros.observe.provenance import GitState, installed_packages, provenance, seeds
+from neuros.observe.provenance import (
+    GitState,
+    installed_packages,
+    note_versions,
+    provenance,
+    seeds,
+)
 from neuros.project.model import Node
 
 
@@ -44,10 +51,21 @@ def test_seeds_are_found_in_the_environment_of_nodes() -> None:
     assert seeds(nodes) == {"robot": {"SEED": "7"}, "snn": {"NEST_SEED": "8"}}
 
 
-def test_versions_name_what_is_installed() -> None:
-    versions = provenance(["launch.py", "tennis"], [])["versions"]
+def test_versions_name_what_is_installed(tmp_path: Path) -> None:
+    versions = provenance(["launch.py", "tennis"], [], tmp_path)["versions"]
     assert versions["packages"]["pytest"] == pytest.__version__
     assert {"neuros", "python", "kernel"} < set(versions)
+
+
+def test_versions_of_nodes_are_named_where_they_differ(tmp_path: Path) -> None:
+    nodes = [node(name) for name in ("same", "other", "never", "torn")]
+    for each in nodes:
+        (tmp_path / each.name).mkdir()
+    note_versions(tmp_path / "same")
+    other = {"python": "3.13.1", "packages": {"numpy": "1.0"}}
+    (tmp_path / "other/versions.json").write_text(json.dumps(other))
+    (tmp_path / "torn/versions.json").write_text('{"python":')
+    assert provenance([], nodes, tmp_path)["versions"]["nodes"] == {"other": other}
 
 
 def test_the_first_of_two_versions_on_the_path_counts(tmp_path: Path) -> None:

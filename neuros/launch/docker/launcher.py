@@ -35,6 +35,16 @@ class Containers:
     engine: DockerClient
     images: Mapping[str, Image]
 
+    def record(self) -> dict[str, Any]:
+        """What there is to know of them later, ready for JSON. Raises ``EnvironmentFault``."""
+        with engine_faults("Docker"):
+            version = self.engine.version()["Version"]
+        images = {
+            container: {"name": image.name, "id": image.id}
+            for container, image in self.images.items()
+        }
+        return {"engine": version, "images": images}
+
 
 def find_containers(names: Iterable[str], project_folder: Path | None) -> Containers:
     """What containers of these names are started from.
