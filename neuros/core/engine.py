@@ -28,6 +28,7 @@ from neuros.core.inputs import Inlet
 from neuros.core.life import Life
 from neuros.core.node_ports import NodePorts, undeclared
 from neuros.core.schedule import Schedule
+from neuros.core.trace import Trace
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node
@@ -47,6 +48,7 @@ class Engine:
         all_hooks: in the order of declaration, those that will not run again, too.
         executing: the hook that runs now.
         since_ns: when that started, or else up to when the time is booked.
+        trace: the first executions.
 
     Raises:
         HookError: if a hook names a port that the node has not, or needs an input without source.
@@ -78,6 +80,7 @@ class Engine:
         self._is_passing = False
         self.executing: Hook | None = None
         self.accounts = Accounts()
+        self.trace = Trace()
         self._cause = REGISTERING
         self.created_ns = self.since_ns = clock()
 
@@ -99,6 +102,8 @@ class Engine:
         """All takers at the far end have started on the packets up to ``position``."""
         now_ns = self._wake()
         self.outlets[connection].credit(position, now_ns)
+        if not self.trace.is_full:
+            self.trace.note_credit(connection, position, now_ns)
         self._pass()
 
     def on_registered(self, connection: Connection) -> None:
@@ -272,6 +277,8 @@ class Engine:
             hook.executions += 1
             hook.busy_ns += end_ns - start_ns
             self.since_ns = end_ns
+            if not self.trace.is_full:
+                self.trace.note_execution(hook, start_ns, end_ns)
         for output, packet in hook.packets_of(result):
             self._exchange.send(output, packet, self.since_ns)
         if isinstance(hook, Source):

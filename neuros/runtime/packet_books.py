@@ -10,12 +10,17 @@ taken     at the receiver: the position (from 1) of a packet that a hook has sta
 taken_ns  when that was
 ========= ==========================================================================
 
+``<node>/packets/executions`` has the first executions of the node's hooks (the place of the hook in
+``hooks.json``, start and end), ``credits`` the acknowledgements that arrived meanwhile (index of
+the connection, position, time): three 8-byte numbers each.
+
 An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
 out once per second.
 """
 
 from __future__ import annotations
 
+import json
 import threading
 from array import array
 from collections.abc import Iterator, Mapping
@@ -49,6 +54,7 @@ class PacketBooks:
         self._digests = digests
         self._folder = folder / FOLDER
         self._written: dict[str, int] = {}
+        self._hooks_written = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
 
@@ -62,6 +68,10 @@ class PacketBooks:
                 del entries[:count]
                 if data and name and self.failure is None:
                     self._append(name, data)
+            hooks = self._engine.trace.hooks[:]
+            if len(hooks) > self._hooks_written and self.failure is None:
+                self._hooks_written = len(hooks)
+                self._write_hooks(hooks)
 
     def _all(self) -> Iterator[tuple[str, array[Any]]]:
         for connection, outlet in self._engine.outlets.items():
@@ -71,6 +81,8 @@ class PacketBooks:
             name = f"{key.index}." if isinstance(key, Connection) else ""
             yield name and f"{name}taken", inlet.taken
             yield name and f"{name}taken_ns", inlet.taken_ns
+        yield "executions", self._engine.trace.executions
+        yield "credits", self._engine.trace.credits
         for connection, digests in self._digests.items():
             yield f"{connection.index}.digests", digests
 
@@ -82,8 +94,19 @@ class PacketBooks:
             with open(self._folder / name, "ab") as file:
                 file.write(data)
         except OSError as error:
-            self.failure = (
-                f"{self._folder} could not be written to ({error.strerror}): latencies and digests"
-                " end there"
-            )
+            self._fail(error)
         self._written[name] = self._written.get(name, 0) + len(data)
+
+    def _write_hooks(self, hooks: list[tuple[str, str]]) -> None:
+        text = json.dumps([{"name": name, "kind": kind} for name, kind in hooks])
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / "hooks.json").write_text(text, "utf-8")
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failure = (
+            f"{self._folder} could not be written to ({error.strerror}): latencies and digests"
+            " end there"
+        )

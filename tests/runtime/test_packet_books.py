@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from array import array
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,10 @@ from typing import Any
 import pytest
 
 from neuros.core.flow import Outlet
+from neuros.core.hook import Hook
 from neuros.core.inputs import Inlet
+from neuros.core.trace import Trace
+from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection
 from neuros.runtime import packet_books
 from neuros.runtime.packet_books import PacketBooks
@@ -23,7 +27,7 @@ ARRIVING = Connection("other", "out", "node", "in", 0, index=4)
 def node() -> Any:
     """What an engine has of its connections: one each way, and an external topic."""
     inlets = {key: Inlet(key, str(key), "in", 1) for key in (ARRIVING, "topic")}
-    return SimpleNamespace(outlets={LEAVING: Outlet(LEAVING)}, inlets=inlets)
+    return SimpleNamespace(outlets={LEAVING: Outlet(LEAVING)}, inlets=inlets, trace=Trace())
 
 
 def numbers(folder: Path, name: str) -> list[int]:
@@ -69,6 +73,21 @@ def test_of_external_topics_nothing_is_kept(tmp_path: Path, node: Any) -> None:
     PacketBooks(node, {}, tmp_path).write()
     assert list(tmp_path.iterdir()) == []
     assert not node.inlets["topic"].taken
+
+
+def test_first_executions_are_written_with_the_names_of_their_hooks(
+    tmp_path: Path, node: Any
+) -> None:
+    hook = Hook(HookSpec(HookKind.FUNCTION, test_a_file_does_not_grow_for_ever, (), ()), (), {})
+    node.trace.note_execution(hook, 100, 250)
+    node.trace.note_credit(LEAVING, 1, 300)
+    PacketBooks(node, {}, tmp_path).write()
+    assert numbers(tmp_path, "executions") == [0, 100, 250]
+    assert numbers(tmp_path, "credits") == [3, 1, 300]
+    assert json.loads((tmp_path / "packets/hooks.json").read_text()) == [
+        {"name": "test_a_file_does_not_grow_for_ever", "kind": "function"}
+    ]
+    assert not node.trace.executions
 
 
 def test_a_file_does_not_grow_for_ever(
