@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from neuros.ports import Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
 
 if TYPE_CHECKING:
+    from neuros.launch.docker.images import Image
     from neuros.launch.docker.launcher import Containers
 
 BACK_ENDS = ("auto", "docker", "process", "in-process")
@@ -37,6 +39,10 @@ class BackEnd:
     def as_seen(self, file: NodeFile) -> NodeFile:
         """The node with all paths as it sees them itself."""
         return inside(file) if self.containers else file
+
+    def image_of(self, node: Node) -> Image | None:
+        """What the container of a node is made from, ``None`` where nodes are processes."""
+        return self.containers.images[node.container] if self.containers else None
 
     def as_here(self, text: str, folders: Folders) -> str:
         """What a node has said, with the names that its paths have on this machine."""
@@ -89,8 +95,8 @@ def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> Ba
             if wanted == "docker":
                 raise
             return BackEnd("process", (_why_not(fault), *_ignored(nodes)))
-        notices = tuple(("WARN", each.notice) for each in containers.images.values() if each.notice)
-        return BackEnd("docker", notices, containers)
+        notices = [("WARN", each.notice) for each in containers.images.values() if each.notice]
+        return BackEnd("docker", (*notices, *_without_display(nodes, os.environ)), containers)
     return BackEnd(wanted, tuple(_ignored(nodes)))
 
 
@@ -100,6 +106,16 @@ def _containers(project: Project, nodes: Sequence[Node]) -> Containers:
     from neuros.launch.docker.launcher import find_containers
 
     return find_containers(dict.fromkeys(node.container for node in nodes), project.folder)
+
+
+def _without_display(
+    nodes: Sequence[Node], environ: Mapping[str, str]
+) -> Sequence[tuple[str, str]]:
+    """One line on windows that nobody will see."""
+    asking = [node.name for node in nodes if node.access.display]
+    if not asking or environ.get("DISPLAY"):
+        return ()
+    return [("WARN", f"{', '.join(asking)} asks for a display, and DISPLAY is not set: no windows")]
 
 
 def _why_not(fault: EnvironmentFault) -> tuple[str, str]:

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from neuros.errors import EnvironmentFault
 from neuros.launch.docker.container import how_it_ended
 from neuros.launch.docker.images import Image
+from neuros.launch.docker.launcher import user_for
 from neuros.launch.docker.layout import as_here, inside
-from neuros.launch.docker.settings import User, container_settings
+from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings
 from neuros.project.model import Folders, Node, NodeFile
 from neuros.project.resources import Access, Resources
 
@@ -90,7 +92,10 @@ def test_gpus_and_devices_are_requested(gpus: tuple[str, ...], request_: dict[st
     assert found["group_add"] == ["20"], "the group that owns the device"
 
 
-def test_the_display_is_open_to_those_alone_that_ask_for_it() -> None:
+def test_the_display_is_open_to_those_alone_that_ask_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neuros.launch.docker.settings._X11", tmp_path)
     environ = {"DISPLAY": ":1", "NEUROS_GUI": "1"}
     user = User(1000, 1001, environ=environ, xauthority=Path("/home/me/.Xauthority"))
     closed = settings(node_file(), user)
@@ -100,7 +105,27 @@ def test_the_display_is_open_to_those_alone_that_ask_for_it() -> None:
     assert found["environment"]["NEUROS_GUI"] == "1"
     assert found["environment"]["XAUTHORITY"] == "/neuros/xauthority"
     assert mounts(found)["/neuros/xauthority"] == ("/home/me/.Xauthority", True)
-    assert mounts(found)["/tmp/.X11-unix"] == ("/tmp/.X11-unix", True)
+    assert mounts(found)[str(tmp_path)] == (str(tmp_path), True)
+
+
+def test_a_display_over_the_network_comes_without_a_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neuros.launch.docker.settings._X11", tmp_path / "none")
+    user = User(1000, 1001, environ={"DISPLAY": "localhost:10.0"})
+    found = settings(node_file(access=Access(display=True)), user)
+    assert found["environment"]["DISPLAY"] == "localhost:10.0"
+    assert str(tmp_path / "none") not in mounts(found)
+
+
+def test_settings_of_dds_of_the_users_own_are_passed_on(tmp_path: Path) -> None:
+    (tmp_path / "dds.xml").touch()
+    user = user_for(node_file(), {DDS_SETTINGS: str(tmp_path / "dds.xml")})
+    found = settings(node_file(), user)
+    assert found["environment"][DDS_SETTINGS] == "/neuros/fast_dds.xml"
+    assert mounts(found)["/neuros/fast_dds.xml"] == (str(tmp_path / "dds.xml"), True)
+    with pytest.raises(EnvironmentFault, match="there is no such file"):
+        user_for(node_file(), {DDS_SETTINGS: str(tmp_path / "none.xml")})
 
 
 def test_the_environment_is_that_of_the_node_and_little_of_the_users() -> None:

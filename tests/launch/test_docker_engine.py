@@ -136,6 +136,12 @@ class TestFaultsWhileWorking:
         with fault("the disk is full: make room"), engine_faults("image 'a'"):
             raise said
 
+    def test_a_gpu_that_it_cannot_give_comes_with_a_remedy(self) -> None:
+        text = 'could not select device driver "" with capabilities: [[gpu]]'
+        said = APIError("x", SimpleNamespace(status_code=500), text)
+        with fault("node 'a': .*NVIDIA Container Toolkit"), engine_faults("node 'a'"):
+            raise said
+
     def test_an_engine_that_goes_away_is_noticed(self) -> None:
         reset = ProtocolError("Connection aborted.", ConnectionResetError(104, "reset"))
         with fault("node 'a': the Docker engine has gone away"), engine_faults("node 'a'"):

@@ -18,6 +18,7 @@ from neuros.project.resources import memory_text
 
 _OUT_OF_MEMORY = 128 + signal.SIGKILL
 _NOT_EXECUTED = (125, 126, 127)
+_STOPPED = "the Docker engine stopped it, as it does for `docker stop` and when it ends itself"
 
 
 class RunningContainer:
@@ -43,6 +44,7 @@ class RunningContainer:
         self._watch = watch
         self._log = log
         self._mem_bytes = mem_bytes
+        self._is_told = False
         watch.add(container_id)
 
     @property
@@ -58,7 +60,9 @@ class RunningContainer:
         """``None`` while it runs, then how it ended, in words."""
         end = self._watch.end_of(self._id)
         if end is not None:
-            return how_it_ended(*end, self._log, self._mem_bytes)
+            words = how_it_ended(*end, self._log, self._mem_bytes)
+            is_stopped = self._watch.is_signalled(self._id) and not self._is_told
+            return f"{words}: {_STOPPED}" if is_stopped else words
         if self._watch.lost and not self._watch.has_processes(self._name):
             return f"the Docker engine went away ({self._watch.lost}): start it again"
         return None
@@ -70,6 +74,7 @@ class RunningContainer:
         self._signal(signal.SIGKILL)
 
     def _signal(self, number: signal.Signals) -> None:
+        self._is_told = True
         if self._watch.lost:
             self._watch.signal_all(number, self._name)
         else:

@@ -75,6 +75,8 @@ def explain(text: str) -> str:
     said = " ".join(text.split())
     if "no space left on device" in said.lower():
         return f"{said}: the disk is full: make room (docker system df; docker image prune)"
+    if "could not select device driver" in said and "gpu" in said:
+        return "the engine cannot give it a GPU: install the NVIDIA Container Toolkit"
     return said
 
 

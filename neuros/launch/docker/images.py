@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ PYTHON = "neuros.image.python"
 
 ADDED = "neuros_on"
 """The repository of images that users have, with what nodes need added; tags are their ids."""
+
+# What may stand in an address of the engine, where ".." would lead elsewhere.
+_REFERENCE = re.compile(r"[A-Za-z0-9][\w.-]*([:/@][A-Za-z0-9][\w.-]*)*")
 
 
 @dataclass(frozen=True)
@@ -128,14 +132,16 @@ def _labelled(image: Any, name: str, notice: str = "") -> Image:
 def _given(container: str, engine: DockerClient) -> Image:
     """An image that the user has; its own Python is used where that has rclpy."""
     try:
-        image = engine.images.get(container)
+        image = engine.images.get(container) if _REFERENCE.fullmatch(container) else None
     except (ImageNotFound, APIError) as error:
         if not isinstance(error, ImageNotFound) and error.status_code != 400:
             raise
+        image = None
+    if image is None:
         raise EnvironmentFault(
             f"container '{container}': there is no folder containers/{container}, and the engine"
             f" has no image of that name: docker pull {container}, or write its Dockerfile"
-        ) from error
+        )
     if START in image.labels:
         return _labelled(image, container)
     try:

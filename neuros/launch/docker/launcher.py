@@ -17,7 +17,7 @@ from neuros.errors import EnvironmentFault
 from neuros.launch.docker.container import RunningContainer
 from neuros.launch.docker.engine import connect, engine_faults
 from neuros.launch.docker.images import Image, images_for
-from neuros.launch.docker.settings import User, container_settings, shared_memory
+from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
 from neuros.launch.host_command import log_file
 from neuros.launch.placement import Cores, on_cores
@@ -172,7 +172,7 @@ def user_for(file: NodeFile, environ: Mapping[str, str]) -> User:
     """The caller, as far as a node is let in to what belongs to the caller.
 
     Raises:
-        EnvironmentFault: if a device of the node is not there.
+        EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
     """
     groups = {_group_of(file, device) for device in file.node.access.devices}
     key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
@@ -182,7 +182,19 @@ def user_for(file: NodeFile, environ: Mapping[str, str]) -> User:
         tuple(sorted(groups.intersection(os.getgroups()))),
         environ,
         key if file.node.access.display and key.is_file() else None,
+        _dds_settings(environ.get(DDS_SETTINGS)),
     )
+
+
+def _dds_settings(named: str | None) -> Path | None:
+    if not named:
+        return None
+    path = Path(named).absolute()
+    if not path.is_file():
+        raise EnvironmentFault(
+            f"{DDS_SETTINGS}={named}: there is no such file: unset it, or name one"
+        )
+    return path
 
 
 def _group_of(file: NodeFile, device: str) -> int:

@@ -19,6 +19,9 @@ LIBRARY = ROOT / "lib"
 XAUTHORITY = ROOT / "xauthority"
 """The key to the user's display, where a node has one."""
 
+DDS_FILE = ROOT / "fast_dds.xml"
+"""The user's own settings of Fast DDS, where there are any."""
+
 _INSIDE = re.compile(rf"(?<![\w/.]){ROOT}/({'|'.join(each.name for each in fields(Folders))})\b")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import neuros
 from neuros.launch.docker.images import Image
-from neuros.launch.docker.layout import FOLDERS, LIBRARY, XAUTHORITY, inside
+from neuros.launch.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
 from neuros.launch.host_command import (
     DEFAULTS,
     host_arguments,
@@ -43,7 +43,10 @@ PASSED_ON = (
 )
 """What a container gets of the launcher's environment; the rest of it stays outside."""
 
-_X11 = "/tmp/.X11-unix"
+# Fast DDS reads settings of the user's own from the file that this names.
+DDS_SETTINGS = "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+_X11 = Path("/tmp/.X11-unix")
 _TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
 # What the engine keeps (`docker logs`) says where the rest is: the node writes its log itself, so
 # that nothing passes through the engine, and nothing is lost when that or the launcher dies.
@@ -58,6 +61,7 @@ class User:
         groups: further groups, those that own the devices of nodes.
         environ: the environment of the launcher.
         xauthority: the file with the key to the display that it names.
+        dds_settings: the file that its ``FASTRTPS_DEFAULT_PROFILES_FILE`` names.
     """
 
     uid: int
@@ -65,6 +69,7 @@ class User:
     groups: tuple[int, ...] = ()
     environ: Mapping[str, str] = field(default_factory=dict)
     xauthority: Path | None = None
+    dds_settings: Path | None = None
 
     @property
     def display(self) -> str:
@@ -161,6 +166,8 @@ def _environment(
         "PYTHONPATH": str(LIBRARY),
         "ROS_LOG_DIR": str(FOLDERS.run),
     }
+    if user.dds_settings:
+        environment[DDS_SETTINGS] = str(DDS_FILE)
     if file.node.access.display and user.display:
         environment["DISPLAY"] = user.display
         if "NEUROS_GUI" in user.environ:
@@ -193,8 +200,11 @@ def _mounts(file: NodeFile, user: User, run_id: str) -> list[dict[str, Any]]:
     ]
     if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
         mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))
+    if user.dds_settings:
+        mounts.append(_mount(user.dds_settings, DDS_FILE))
     if file.node.access.display and user.display:
-        mounts.append(_mount(Path(_X11), Path(_X11)))
+        if _X11.is_dir():  # with a display over the network (ssh -X) there may be none
+            mounts.append(_mount(_X11, _X11))
         if user.xauthority:
             mounts.append(_mount(user.xauthority, XAUTHORITY))
     return mounts

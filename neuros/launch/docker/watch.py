@@ -33,6 +33,7 @@ class _Fate:
     exit_code: int | None = None
     died_s: float = 0.0
     is_out_of_memory: bool = False
+    is_signalled: bool = False
     is_gone: bool = False
 
 
@@ -93,6 +94,11 @@ class ContainerWatch(threading.Thread):
             self.close()
         return fate.exit_code, fate.is_out_of_memory
 
+    def is_signalled(self, container_id: str) -> bool:
+        """Whether the engine has sent it a signal, whoever asked for that."""
+        fate = self._fates.get(container_id)
+        return fate is not None and fate.is_signalled
+
     def has_processes(self, node: str) -> bool:
         """Whether processes of a node are there, as this machine sees it."""
         return node in RunProcesses(self._run_id).nodes().values()
@@ -109,6 +115,8 @@ class ContainerWatch(threading.Thread):
         fate = self._fates.setdefault(actor["ID"], _Fate())
         if event["Action"] == "oom":
             fate.is_out_of_memory = True
+        elif event["Action"] == "kill":
+            fate.is_signalled = True
         elif event["Action"] == "die":
             fate.died_s = time.monotonic()
             fate.exit_code = int(actor["Attributes"]["exitCode"])

@@ -21,7 +21,7 @@ from container_bench import (
     container_bench,
 )
 from engine_proxy import EngineProxy
-from launching import EXAMPLES, Finished, Running, launch
+from launching import EXAMPLES, Finished, Running, launch, start
 
 from containers import require_containers, wait_until
 from neuros.errors import EnvironmentFault
@@ -32,6 +32,7 @@ from neuros.launch.run_processes import RUN_ID
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split
+from neuros.transport.dds_profile import LOCAL_PROFILES
 
 LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
@@ -139,6 +140,22 @@ def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
     assert json.loads((finished.run_folder / "a/seen.json").read_text())["device"]
 
 
+def test_settings_of_dds_of_the_users_own_hold_inside(bench: ContainerBench) -> None:
+    bench.project({"a": LOOKS}, a={"environment": {"FILE": "/neuros/fast_dds.xml"}})
+    finished = bench.launch(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOCAL_PROFILES))
+    assert finished.run_folder is not None, finished.output
+    seen = json.loads((finished.run_folder / "a/seen.json").read_text())
+    assert seen["environment"]["FASTRTPS_DEFAULT_PROFILES_FILE"] == "/neuros/fast_dds.xml"
+    assert seen["file"] == LOCAL_PROFILES.read_text()
+
+
+def test_a_display_that_is_not_there_is_said(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS}, a={"display": True})
+    finished = bench.launch("--duration", "0.1", DISPLAY="")
+    assert finished.exit_code == 0, finished.output
+    assert "a asks for a display, and DISPLAY is not set: no windows" in finished.said("neuros")
+
+
 def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     script = bench.folder / "before"
     script.write_text("#!/usr/bin/env python3\nprint('a script in Python')\n")
@@ -147,6 +164,28 @@ def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     finished = bench.launch()
     assert finished.exit_code == 0, finished.output
     assert "a script in Python" in finished.output
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_an_ordinary_user_of_the_engine_leaves_files_of_nobody_else(bench: ContainerBench) -> None:
+    uid, group = 1000, os.stat(engine_socket(bench.engine)).st_gid
+    # May read what root has installed, and use the engine; nothing else that is not its own.
+    ordinary = (
+        *("setpriv", f"--reuid={uid}", f"--regid={uid}", f"--groups={group}"),
+        *("--inh-caps=-all,+dac_read_search", "--ambient-caps=+dac_read_search"),
+    )
+    bench.project({"a": RUNS, "b": RUNS})
+    os.chown(bench.folder, uid, uid)
+    arguments = ("--backend", "docker", "--duration", "0.2")
+    with start(
+        bench.folder, *arguments, cwd=bench.folder, through=ordinary, HOME=str(bench.folder)
+    ) as running:
+        finished = running.finish(30.0)
+    assert finished.exit_code == 0, finished.output
+    assert bench.has_saved("a", "b")
+    assert finished.run_folder is not None
+    owners = {path.stat().st_uid for path in finished.run_folder.rglob("*")}
+    assert owners == {uid}
 
 
 # ------------------------------------------------------------------ how it ends
@@ -240,6 +279,22 @@ def test_when_the_engine_goes_away_the_run_ends_and_says_so(
     assert bench.has_saved("a", "b")
 
 
+def test_a_container_that_somebody_else_stops_is_named_and_why(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    run = bench.session(running).run
+    (container,) = bench.engine.containers.list(
+        filters={"label": [f"neuros.run={run}", "neuros.node=a"]}
+    )
+    container.stop()
+    finished = running.finish(10.0)
+    assert finished.exit_code == 1
+    assert "node 'a' ended unexpectedly: exit code 0: the Docker engine stopped it" in last_line(
+        finished
+    )
+    assert bench.has_saved("a", "b")
+
+
 def test_two_runs_at_once_do_not_meet(bench: ContainerBench) -> None:
     bench.project({"a": RUNS, "b": RUNS})
     pair = [bench.start("--duration", "1"), bench.start("--duration", "1")]
@@ -256,10 +311,11 @@ def test_two_runs_at_once_do_not_meet(bench: ContainerBench) -> None:
     ("keys", "sentence"),
     [
         ({"container": "no_such_image"}, "no_such_image"),
+        ({"container": "../images"}, "the engine has no image of that name"),
         ({"resources": {"cpus": 4096}}, "node 'a' cannot be started: .*CPUs"),
         ({"devices": ["/dev/no_such_thing"]}, "node 'a' asks for the device /dev/no_such_thing"),
     ],
-    ids=["image", "cpus", "device"],
+    ids=["image", "no name of an image", "cpus", "device"],
 )
 def test_what_is_not_there_is_said_in_one_sentence(
     bench: ContainerBench, keys: dict[str, object], sentence: str
@@ -351,6 +407,12 @@ def test_whiskeye_runs_in_three_different_containers(bench: ContainerBench) -> N
     picture = finished.run_folder / "visualiser/head_direction.png"
     assert picture.exists()
     assert f"picture: {picture}" in finished.output, "as it is called here"
+    for name, image in (("robot", "neuros_mujoco"), ("snn", "neuros_nest")):
+        node = finished.record["nodes"][name]
+        assert node["image"]["name"].startswith(f"{image}:")
+        assert node["image"]["id"].startswith("sha256:")
+        assert node["python"]["path"] == "/opt/neuros/bin/python"
+        assert node["python"]["version"].startswith("3.")
 
 
 # ------------------------------------------------------------------ sessions
