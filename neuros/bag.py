@@ -8,8 +8,28 @@ with neuros.bag.open("runs/whiskeye/2026-11-21T15-00-00.000000Z") as bag:
     frame = bag["/clock"].frame()             # pandas, if it is installed
 """
 
+import os
+import warnings
+
 from neuros.observe.bag.opened import Bag, RecordedTopic, open_bag
 
-open = open_bag
+
+def open(run: str | os.PathLike[str]) -> Bag:
+    """Open what a run has recorded; one that was cut off is completed first.
+
+    Warns where packets are missing that were there when the run ended.
+
+    Args:
+        run: the run folder, or a rosbag2 folder.
+
+    Raises:
+        UsageError: if there is none, or this version of NeuROS cannot read it.
+        EnvironmentFault: if it is damaged.
+    """
+    bag = open_bag(run)
+    if bag.damage is not None:
+        warnings.warn(bag.damage, stacklevel=2)
+    return bag
+
 
 __all__ = ["Bag", "RecordedTopic", "open"]

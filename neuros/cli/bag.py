@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+EXIT_DAMAGED = 4
+
 
 def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the grammar."""
@@ -36,7 +38,10 @@ def _info(options: argparse.Namespace) -> int:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
         print(tabulate(rows, headers=["topic", "type", "packets"], disable_numparse=True))
         print(f"\n{opened.folder}: {opened.duration_s:.2f} s, project {opened.project or '?'}")
-    return 0
+    if opened.damage is None:
+        return 0
+    print(f"neuros: {opened.damage}", file=sys.stderr)
+    return EXIT_DAMAGED
 
 
 def _repair(options: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -51,6 +52,8 @@ def _replay(options: argparse.Namespace) -> int:
     from neuros.transport.playing import PlayedTopic, play
 
     with open_bag(options.run) as bag:
+        if bag.damage is not None:
+            print(f"neuros: {bag.damage}", file=sys.stderr)
         chosen = _chosen([*bag.topics.values()], options.replay_topics)
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)

@@ -66,4 +66,9 @@ def open_run(folder: Path) -> PastRun:
             f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
             " version that the run was made with, or run the project again"
         )
-    return PastRun(folder, record)
+    run = PastRun(folder, record)
+    try:
+        _ = [run.connection(name) for name in run.connections]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(f"{file} is broken (its connections cannot be read: {error!r})") from error
+    return run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 import neuros.bag
+from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.observe.bag.columns import columns_of
 
@@ -169,6 +172,32 @@ def test_what_was_cut_off_is_completed_when_it_is_opened(tmp_path: Path) -> None
         assert bag["a.number -> b.n"].array()["data"].tolist() == [1]
     with Reader(tmp_path / "bag") as reader:
         assert reader.message_count == 2
+
+
+def test_what_has_gone_since_the_run_ended_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan().save(tmp_path)
+    spool(tmp_path, "a", [(at, None, number(at)) for at in range(1, 1001)])
+    neuros.bag.open(tmp_path).close()
+    topics = {NUMBER.name: {"recorded": 1000}}
+    (tmp_path / "run.json").write_text(json.dumps({"recording": {"topics": topics}}))
+    with neuros.bag.open(tmp_path) as bag:
+        assert bag.missing == {}
+    assert main(["bag", "info", str(tmp_path)]) == 0
+    os.truncate(tmp_path / "bag" / "bag.mcap", 40_000)
+    with pytest.warns(UserWarning, match="damaged since the run"):
+        bag = neuros.bag.open(tmp_path)
+    with bag:
+        left = bag["a.number -> b.n"].array()["data"].tolist()
+        assert bag.missing == {NUMBER.name: 1000 - len(left)}
+    assert left == [*range(1, len(left) + 1)]
+    assert left
+    capsys.readouterr()
+    assert main(["bag", "info", str(tmp_path)]) == 4
+    shown = capsys.readouterr()
+    assert NUMBER.name in shown.out
+    assert f"missing: {1000 - len(left)} of {NUMBER.name}" in shown.err
 
 
 def test_a_run_that_was_not_recorded_and_one_of_another_version_are_said(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -125,9 +126,15 @@ class Bag:
         custom: what its metadata says of the run: ``run_id``, ``project``, ``project_sha256``,
             ``versions``, ``seeds``.
         duration_s: from the first packet to the last.
+        missing: by topic, how many packets were in the bag when the run ended, and are not now.
     """
 
-    def __init__(self, folder: Path, connections: Mapping[str, str | None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        connections: Mapping[str, str | None],
+        recorded: Mapping[str, int] | None = None,
+    ) -> None:
         self.folder = folder
         try:
             with Reader(folder) as reader:
@@ -143,7 +150,20 @@ class Bag:
         self.topics = {
             name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
         }
+        self.missing = {
+            name: lost
+            for name, count in (recorded or {}).items()
+            if (lost := count - (self.topics[name].count if name in self.topics else 0)) > 0
+        }
         self._packets: dict[str, list[RawPacket]] = {}
+
+    @property
+    def damage(self) -> str | None:
+        """What is missing, in a sentence."""
+        if not self.missing:
+            return None
+        topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
+        return f"{self.folder} has been damaged since the run; packets that are missing: {topics}"
 
     @property
     def project(self) -> str | None:
@@ -205,7 +225,17 @@ def open_bag(run: str | os.PathLike[str]) -> Bag:
     plan = load_plan(folder)
     if needs_repair(folder, plan):
         _repair_if_possible(folder)
-    return Bag(folder / BAG_NAME, {topic.name: topic.connection for topic in plan.topics})
+    connections = {topic.name: topic.connection for topic in plan.topics}
+    return Bag(folder / BAG_NAME, connections, _recorded(folder))
+
+
+def _recorded(run: Path) -> dict[str, int]:
+    """By topic, the packets that were in the bag when the run ended, as far as is known."""
+    try:
+        topics = json.loads((run / "run.json").read_text("utf-8"))["recording"]["topics"]
+        return {name: int(topic["recorded"]) for name, topic in topics.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def _repair_if_possible(run: Path) -> None:
