@@ -32,6 +32,7 @@ from neuros.cli.network import add_network
 from neuros.cli.observation import add_observation
 from neuros.cli.recording_options import add_recorder, add_recording_options
 from neuros.cli.replay import add_replay
+from neuros.cli.report import add_report
 from neuros.cli.reproduce import add_reproduce
 from neuros.cli.sessions import add_sessions
 from neuros.cli.verify import add_verify
@@ -103,6 +104,7 @@ def parser() -> argparse.ArgumentParser:
     _add_graph(commands)
     add_sessions(commands)
     add_verify(commands)
+    add_report(commands)
     add_bag(commands)
     add_replay(commands)
     add_doctor(commands)

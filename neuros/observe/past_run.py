@@ -28,17 +28,14 @@ class PastRun:
 
     def connection(self, name: str) -> Connection:
         """A connection as the project has it."""
-        figures = self.connections[name]
-        (source, output), (destination, input_) = (end.split(".") for end in name.split(" -> "))
-        return Connection(
-            source,
-            output,
-            destination,
-            input_,
-            figures["discard_limit"],
-            figures["queue_size"],
-            figures["index"],
-        )
+        return connection_of(name, self.connections[name])
+
+
+def connection_of(name: str, figures: Mapping[str, Any]) -> Connection:
+    """A connection as the project has it, from what ``run.json`` has of it."""
+    (source, output), (destination, input_) = (end.split(".") for end in name.split(" -> "))
+    limit, queue_size = figures.get("discard_limit"), figures.get("queue_size", 1)
+    return Connection(source, output, destination, input_, limit, queue_size, figures["index"])
 
 
 def open_run(folder: Path) -> PastRun:
