@@ -40,6 +40,7 @@ def run_node(options: argparse.Namespace) -> int:
             on_failure,
             in_memory=options.in_memory,
             digests=options.digests,
+            record=options.record,
             debug=options.debug,
         )
         leave.has_leftovers = lambda: middleware.has_leftovers

@@ -1,4 +1,4 @@
-"""``neuros replay``: what was recorded, once more."""
+"""``neuros replay``: what was recorded, once more: to one node, or on the ROS graph."""
 
 from __future__ import annotations
 
@@ -17,11 +17,35 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add the command to the grammar."""
     replay = commands.add_parser(
         "replay",
-        help="publish recorded topics on the ROS graph",
-        description="Publish recorded topics on the ROS graph, spaced as they were sent.",
+        help="run one node of a run once more, or publish recorded topics",
+        description="With --node: run one node once more on exactly what it received, and compare"
+        " what it sends, packet by packet. With --topic: publish recorded topics on the ROS graph,"
+        " spaced as they were sent.",
+        epilog="exit codes of --node: 0 identical, 1 different, 2 nothing to compare",
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")
+    add("-n", "--node", metavar="NAME", help="the node to run once more")
+    debugger = replay.add_mutually_exclusive_group()
+    debugger.add_argument(
+        "--pdb",
+        "--debug",
+        action="store_true",
+        help="with --node: under Python's debugger, which stops at the start of each hook, and"
+        " after a failure",
+    )
+    debugger.add_argument(
+        "--debugpy",
+        type=int,
+        metavar="PORT",
+        help="with --node: wait until an editor's debugger attaches there (pip install debugpy)",
+    )
+    add(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        help="with --node: keep what the node writes to node.run_dir (default: it is removed)",
+    )
     add(
         "-t",
         "--topic",
@@ -41,11 +65,36 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     add("-d", "--domain-id", type=int, metavar="ID", help="default: ROS_DOMAIN_ID, else 0")
     replay.set_defaults(command=_replay)
+    _add_replayed(commands)
+
+
+def _add_replayed(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """What ``replay --node`` becomes; it is not started by people."""
+    replayed = commands.add_parser("replayed", add_help=False)
+    replayed.add_argument("node_file")
+    replayed.add_argument("--run", required=True)
+    replayed.add_argument("--pdb", action="store_true")
+    replayed.add_argument("--debugpy", type=int)
+    replayed.add_argument("--remove", action="store_true")
+    replayed.set_defaults(command=_run_replayed)
+
+
+def _run_replayed(options: argparse.Namespace) -> int:
+    from neuros.cli.replay_node import run_replayed
+
+    return run_replayed(options)
 
 
 def _replay(options: argparse.Namespace) -> int:
+    if options.node is not None:
+        return _replay_node(options)
+    if options.pdb or options.debugpy is not None or options.output is not None:
+        raise UsageError("replay: --pdb, --debugpy and --output are for a node: name it, --node")
     if not options.replay_topics:
-        raise UsageError("replay: name what to publish with --topic NAME, or --topic '*' for all")
+        raise UsageError(
+            "replay: name a node to run once more (--node NAME), or what to publish (--topic NAME,"
+            " or --topic '*' for all)"
+        )
     if not options.rate > 0 or options.delay < 0:
         raise UsageError("replay: --rate must be above 0, and --delay not below")
     from neuros.observe.bag.opened import open_bag
@@ -69,6 +118,14 @@ def _replay(options: argparse.Namespace) -> int:
         )
     print(f"{count} packets on {len(chosen)} topics")
     return 0
+
+
+def _replay_node(options: argparse.Namespace) -> int:
+    if options.replay_topics:
+        raise UsageError("replay: --node runs a node, --topic publishes: choose one of them")
+    from neuros.cli.replay_node import replay_node
+
+    return replay_node(options)
 
 
 def _chosen(topics: Sequence[RecordedTopic], patterns: Sequence[str]) -> list[RecordedTopic]:

@@ -132,21 +132,29 @@ def _first_difference(a: Numbers, b: Numbers) -> int:
     return int(unequal[0]) if len(unequal) else common
 
 
-def differing_fields(a: Any, b: Any, name: str = "") -> Iterator[str]:
+def differing_fields(
+    a: Any, b: Any, name: str = "", sides: tuple[str, str] = ("A", "B")
+) -> Iterator[str]:
     """What differs between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
     fields = getattr(a, "__dataclass_fields__", None)
     if fields:
         for field in fields:
             if not field.startswith("__"):
                 inner = f"{name}.{field}" if name else field
-                yield from differing_fields(getattr(a, field), getattr(b, field), inner)
+                yield from differing_fields(getattr(a, field), getattr(b, field), inner, sides)
         return
     if isinstance(a, np.ndarray | list | tuple) and not isinstance(b, str):
         if len(a) != len(b):
-            yield f"{name}: {len(a)} elements in A, {len(b)} in B"
+            yield f"{name}: {len(a)} elements in {sides[0]}, {len(b)} in {sides[1]}"
             return
         for place, (left, right) in enumerate(zip(a, b, strict=True)):
-            yield from differing_fields(left, right, f"{name}[{place}]")
+            yield from differing_fields(left, right, f"{name}[{place}]", sides)
         return
     if not (a == b or (a != a and b != b)):  # NaN is what it was
-        yield f"{name}: {a!r} in A, {b!r} in B"
+        left, right = _plain(a), _plain(b)
+        yield f"{name}: {left!r} in {sides[0]}, {right!r} in {sides[1]}"
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy as Python's own, which is shown without its type."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -37,6 +37,7 @@ class NodeRuntime:
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
+        make_engine: the engine, called like its class.
 
     Attributes:
         waiting_threads: those that wait until packets that they have offered are sent.
@@ -55,6 +56,7 @@ class NodeRuntime:
         duration_sim_s: float | None,
         on_initialised: Callable[[], None] = lambda: None,
         clock: Callable[[], int] = time.monotonic_ns,
+        make_engine: Callable[..., Engine] = Engine,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -71,6 +73,7 @@ class NodeRuntime:
         self._duration_sim_s = duration_sim_s if file.node.owns_time else None
         self._on_initialised = on_initialised
         self._clock = clock
+        self._make_engine = make_engine
         self._has_run = False
         self._read_time_s: Callable[[], float] | None = None
         self._timeline = Timeline() if file.node.owns_time else None
@@ -92,6 +95,11 @@ class NodeRuntime:
         return self.file.folders.run / self.name
 
     @property
+    def specs(self) -> Sequence[HookSpec]:
+        """The hooks of its plugin, once that is loaded."""
+        return self._specs
+
+    @property
     def is_on_stage(self) -> bool:
         """Whether the process has the surroundings of this node now."""
         return self._stage.has(self._scope)
@@ -111,7 +119,7 @@ class NodeRuntime:
         types = {
             port.name: self._middleware.message_class(port.type) for port in self.file.node.outputs
         }
-        self.engine = Engine(
+        self.engine = self._make_engine(
             self.file.node,
             self.file.connections,
             self._specs,
@@ -126,7 +134,7 @@ class NodeRuntime:
         """Let the engine run hooks as soon as every receiver is there."""
         if any(spec.kind is HookKind.TICK for spec in self._specs):
             engine = self._loaded
-            self._middleware.loop.add_timer(lambda: engine.next_due_ns, self._on_timer)
+            self._middleware.loop.add_timer(lambda: engine.next_due_ns, self.on_timer)
         self._guard(self._loaded.start)
 
     def drain(self) -> None:
@@ -184,7 +192,8 @@ class NodeRuntime:
         """The receiver of a connection is there."""
         self._guard(lambda: self._loaded.on_registered(connection))
 
-    def _on_timer(self) -> None:
+    def on_timer(self) -> None:
+        """The next due time of a hook has come."""
         self._guard(self._loaded.on_timer)
 
     # ------------------------------------------------------------------ effects

@@ -14,6 +14,9 @@ taken_ns  when that was
 ``hooks.json``, start and end), ``credits`` the acknowledgements that arrived meanwhile (index of
 the connection, position, time): three 8-byte numbers each.
 
+Where packets are recorded, ``journal`` has what happened to the engine (see
+:mod:`neuros.core.journal`), so that the node can be replayed.
+
 An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
 out once per second.
 """
@@ -28,9 +31,11 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
+from neuros.core.journal import JournalledEngine
 from neuros.project.model import Connection
 
 FOLDER = "packets"
+JOURNAL = "journal"
 
 MOST_ENTRIES = 8_000_000
 """Of a file, 64 MB; what comes later is counted and not listed."""
@@ -83,6 +88,8 @@ class PacketBooks:
             yield name and f"{name}taken_ns", inlet.taken_ns
         yield "executions", self._engine.trace.executions
         yield "credits", self._engine.trace.credits
+        if isinstance(self._engine, JournalledEngine):
+            yield JOURNAL, self._engine.journal
         for connection, digests in self._digests.items():
             yield f"{connection.index}.digests", digests
 

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines, connect
+from neuros.core.engine import Engine
+from neuros.core.journal import JournalledEngine
 from neuros.errors import NeurosError, NodeError
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
@@ -188,6 +190,7 @@ class NodeProcess:
                 tell=self._tell,
                 fail=self._fail,
                 tap=None if self._open_tap is None else self._open_tap(file),
+                make_engine=Engine if self._open_tap is None else JournalledEngine,
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
                 on_initialised=_keep_for_good,

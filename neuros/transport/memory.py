@@ -73,7 +73,8 @@ class MemoryTransport:
     """Carries the packets of one node to the others in the same process.
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
-    serialised for one, which is not done here otherwise.
+    serialised for one, which is not done here otherwise. ``digests_of`` tells of which connections
+    they are kept.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class MemoryTransport:
         hub: MemoryHub,
         outside: Outside,
         digest: Callable[[Any], int] | None = None,
+        digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
         self._name = file.node.name
         self._connections = file.connections
@@ -91,7 +93,8 @@ class MemoryTransport:
         self._given_up: list[Any] = []
         self._digest = digest
         elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
-        self.digests = {c: array("Q") for c in elsewhere} if digest is not None else {}
+        digested = [c for c in elsewhere if digest is not None and digests_of(c)]
+        self.digests = {c: array("Q") for c in digested}
         hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
@@ -114,11 +117,8 @@ class MemoryTransport:
         """
         if not self._is_open:
             return
-        if self._digest is not None:
-            digest = self._digest(packet)
-            for connection in connections:
-                self.digests[connection].append(digest)
-                self._channels[connection].announce(digest)
+        if self.digests:
+            self._note_digest([c for c in connections if c in self.digests], packet)
         *others, last = connections
         for connection in others:
             self._channels[connection].send(self._hub.copy(packet))
@@ -155,6 +155,14 @@ class MemoryTransport:
         self._given_up = []
         self._hub.leave(self._name)
         self._outside.close()
+
+    def _note_digest(self, connections: Sequence[Connection], packet: Any) -> None:
+        if not connections or self._digest is None:
+            return
+        digest = self._digest(packet)
+        for connection in connections:
+            self.digests[connection].append(digest)
+            self._channels[connection].announce(digest)
 
     def _is_unshared(self, packet: Any) -> bool:
         """Whether the hook gave the packet up, and no part of it is held anywhere."""

@@ -37,7 +37,8 @@ _CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service",
 class RosProcess:
     """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
 
-    ``digests``: in memory, too, where a packet is serialised only for that.
+    ``digests``: in memory, too, where a packet is serialised only for that. ``record``: at least
+    those that tell which packets have arrived where some may be lost.
 
     Attributes:
         has_leftovers: whether :meth:`close` has left ROS as it was. Python would destroy it at its
@@ -51,6 +52,7 @@ class RosProcess:
         *,
         in_memory: bool,
         digests: bool = False,
+        record: bool = False,
         debug: bool = False,
     ) -> None:
         self.has_leftovers = False
@@ -67,6 +69,7 @@ class RosProcess:
         )
         self._loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
+        self._is_recorded = record
         self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
         self._ros_nodes: dict[str, RosNode] = {}
         self._own_entities: dict[str, set[int]] = {}
@@ -87,8 +90,14 @@ class RosProcess:
             transport = RosTransport(file, ros_node, self._loop)
         else:
             outside = RosOutside(file, ros_node, self._loop)
-            digest = digest_of if self._has_digests else None
-            transport = MemoryTransport(file, self._hub, outside, digest)
+            digest = digest_of if self._has_digests or self._is_recorded else None
+            transport = MemoryTransport(
+                file,
+                self._hub,
+                outside,
+                digest,
+                lambda c: self._has_digests or not c.is_reliable,
+            )
         self._transports.append(transport)
         return transport
 

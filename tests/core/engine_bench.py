@@ -120,6 +120,7 @@ class Bench:
         packet_types: dict[str, type] | None = None,
         is_started: bool = True,
         is_registered: bool = True,
+        make_engine: Callable[..., Engine] = Engine,
     ) -> None:
         self.clock = Clock()
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
@@ -132,7 +133,7 @@ class Bench:
         self.posted: deque[tuple[str, Callable[[], None]]] = deque()
         node = node_for("node", specs, connections, external_inputs, external_outputs)
         self.by_name: dict[str, Any] = {str(c): c for c in connections}
-        self.engine = Engine(node, connections, specs, self, self.clock, packet_types)
+        self.engine = make_engine(node, connections, specs, self, self.clock, packet_types)
         if is_registered:
             for connection in self.engine.outlets:
                 self.engine.on_registered(connection)

@@ -1,0 +1,172 @@
+"""What happened to an engine, as a row of numbers: enough to make it happen once more.
+
+An engine decides by its events, and, where hooks have a period, by what its clock says. So both
+are noted, in their order, and each start of a hook besides, to check against. A number below zero
+is an event (its complement has the kind in 4 bits, a place in 20 and a position in 39), any other
+one a reading of the clock. An entry costs some 0.1 us.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from neuros.core.effects import Effects
+from neuros.core.engine import Engine
+from neuros.core.hook import Hook
+from neuros.hooks import HookKind, HookSpec
+from neuros.project.model import Connection, Node
+
+_KIND_BITS, _PLACE_BITS = 4, 20
+_POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
+
+
+class What(IntEnum):
+    """The kinds of entries; ``place`` and ``position`` where they have one."""
+
+    BEGIN = 0  # never written: what comes before the first event
+    START = 1
+    PACKET = 2  # place: index of the connection
+    HEARD = 3  # place: of the input, bound to an external topic, among the inputs of the node
+    ACKNOWLEDGEMENT = 4  # place: index of the connection; position
+    REGISTERED = 5  # place: index of the connection
+    TIMER = 6
+    LOOP_BACK = 7
+    OFFER = 8
+    DRAIN = 9
+    STOP = 10  # no further hook starts: the journal is whole
+    HOOK = 11  # place: of the hook that starts, in the order of declaration
+
+
+class Event(NamedTuple):
+    """An event, and what the clock said from then to the next one."""
+
+    what: What
+    place: int
+    position: int
+    readings: list[int]
+
+
+class JournalledEngine(Engine):
+    """Notes what happens to it in :attr:`journal`, until somebody takes the entries away."""
+
+    def __init__(
+        self,
+        node: Node,
+        connections: Sequence[Connection],
+        specs: Sequence[HookSpec],
+        effects: Effects,
+        clock: Callable[[], int],
+        packet_types: Mapping[str, type] | None = None,
+    ) -> None:
+        self.journal = array("q")
+        self._note = self.journal.append
+        has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
+        own_clock = self._noting(clock) if has_ticks else clock
+        super().__init__(node, connections, specs, effects, own_clock, packet_types)
+        self._hook_entries = {
+            hook: _entry(What.HOOK, place) for place, hook in enumerate(self.all_hooks)
+        }
+        self._packet_entries: dict[Connection | str, int] = {
+            connection: _entry(What.PACKET, connection.index) for connection in connections
+        } | {port.name: _entry(What.HEARD, place) for place, port in enumerate(node.inputs)}
+        self._acknowledgement_entries = {
+            connection: _entry(What.ACKNOWLEDGEMENT, connection.index) for connection in connections
+        }
+
+    def start(self) -> None:
+        self._note(_entry(What.START))
+        super().start()
+
+    def on_packet(self, key: Connection | str, packet: Any) -> None:
+        self._note(self._packet_entries[key])
+        super().on_packet(key, packet)
+
+    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+        self._note(self._acknowledgement_entries[connection] - (position << _POSITION_SHIFT))
+        super().on_acknowledgement(connection, position)
+
+    def on_registered(self, connection: Connection) -> None:
+        self._note(_entry(What.REGISTERED, connection.index))
+        super().on_registered(connection)
+
+    def on_timer(self) -> None:
+        self._note(_TIMER)
+        super().on_timer()
+
+    def on_loop_back(self) -> None:
+        self._note(_LOOP_BACK)
+        super().on_loop_back()
+
+    def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
+        self._note(_OFFER)
+        return super().offer(packets, accepted)
+
+    def drain(self) -> None:
+        self._note(_entry(What.DRAIN))
+        super().drain()
+
+    def stop_hooks(self) -> None:
+        super().stop_hooks()
+        self._note(_entry(What.STOP))
+
+    def _run(self, hook: Hook) -> None:
+        entry = self._hook_entries.get(hook)  # packets from a plugin's thread have none
+        if entry is not None:
+            self._note(entry)
+        super()._run(hook)
+
+    def _noting(self, clock: Callable[[], int]) -> Callable[[], int]:
+        note = self._note
+
+        def noted() -> int:
+            now_ns = clock()
+            note(now_ns)
+            return now_ns
+
+        return noted
+
+
+def events_of(journal: Iterable[int]) -> Iterator[Event]:
+    """The events in a journal; the first, ``BEGIN``, has the readings before all others."""
+    event = Event(What.BEGIN, 0, 0, [])
+    for number in journal:
+        if number >= 0:
+            event.readings.append(number)
+            continue
+        what, place, position = _parts(number)
+        if what is not What.HOOK:
+            yield event
+            event = Event(what, place, position, [])
+    yield event
+
+
+def starts_of(journal: Iterable[int]) -> Iterator[int]:
+    """The hooks that have started, by their places in the order of declaration."""
+    for number in journal:
+        if number < 0 and (~number & _mask(_KIND_BITS)) == What.HOOK:
+            yield _parts(number)[1]
+
+
+def is_whole(journal: Iterable[int]) -> bool:
+    """Whether it goes to the end of the run."""
+    return _entry(What.STOP) in journal
+
+
+def _entry(what: What, place: int = 0, position: int = 0) -> int:
+    return ~(what | place << _KIND_BITS | position << _POSITION_SHIFT)
+
+
+def _parts(entry: int) -> tuple[What, int, int]:
+    value = ~entry
+    place = value >> _KIND_BITS & _mask(_PLACE_BITS)
+    return What(value & _mask(_KIND_BITS)), place, value >> _POSITION_SHIFT
+
+
+def _mask(bits: int) -> int:
+    return (1 << bits) - 1
+
+
+_TIMER, _LOOP_BACK, _OFFER = map(_entry, (What.TIMER, What.LOOP_BACK, What.OFFER))

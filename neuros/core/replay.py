@@ -1,0 +1,178 @@
+"""An engine that goes through what is in a journal: the same events, in their order.
+
+Neighbours, timers and the wall clock are the journal's. What the plugin does is new, so it may
+differ from what the journal expects: then it is told where, and nothing is guessed.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+from neuros.core.engine import Engine
+from neuros.core.hook import Hook
+from neuros.core.journal import Event, What, events_of, starts_of
+from neuros.project.model import Connection
+
+_NO_START = -1
+
+
+class ReplayOver(Exception):
+    """A hook would start after the last one of the journal."""
+
+
+class ReplayParted(Exception):
+    """The replay cannot go on as the run did; the text says why."""
+
+
+class Source(Protocol):
+    """Where packets come from that are not in the journal itself."""
+
+    def packet(self, key: Connection | str, number: int) -> Any:
+        """The packet that arrived as the ``number``-th (from 1) there; raises ``ReplayOver``."""
+
+    def offer(self) -> None:
+        """Have the plugin's thread offer packets, as soon as it does; raises ``ReplayParted``."""
+
+
+class Inbox(Protocol):
+    """What the events go through on their way to the engine."""
+
+    def start(self) -> None: ...
+    def on_packet(self, connection: Connection, packet: Any) -> None: ...
+    def on_external_packet(self, port: Any, packet: Any) -> None: ...
+    def on_acknowledgement(self, connection: Connection, position: int) -> None: ...
+    def on_registered(self, connection: Connection) -> None: ...
+    def on_timer(self) -> None: ...
+    def drain(self) -> None: ...
+    def stop(self) -> None: ...
+
+
+class Script:
+    """A journal that is gone through.
+
+    Attributes:
+        started: how many hooks have started.
+        deliveries: packets of the node to itself that are on their way.
+        loop_back: the one that is on its way, if any.
+    """
+
+    def __init__(self, journal: array[int]) -> None:
+        self._events = events_of(journal)
+        self._starts = starts_of(journal)
+        self._next = next(self._starts, _NO_START)
+        self._readings: Iterator[int] = iter(next(self._events).readings)
+        self._now_ns = 0
+        self.started = 0
+        self.deliveries: deque[Callable[[], None]] = deque()
+        self.loop_back: Callable[[], None] | None = None
+
+    def clock(self) -> int:
+        """What the clock said at this point; at least what it said last."""
+        self._now_ns = next(self._readings, self._now_ns)
+        return self._now_ns
+
+    def events(self) -> Iterator[Event]:
+        """The events, in their order."""
+        for event in self._events:
+            self._readings = iter(event.readings)
+            yield event
+
+    @property
+    def expects_start(self) -> bool:
+        """Whether the journal has further starts of hooks."""
+        return self._next != _NO_START
+
+    def check_start(self, place: int, names: Mapping[int, str]) -> None:
+        """A hook is about to start: whether it did in the journal, too.
+
+        Raises:
+            ReplayOver, ReplayParted: if not.
+        """
+        if self._next == _NO_START:
+            raise ReplayOver
+        if place != self._next:
+            expected = names.get(self._next, "one that the plugin no longer has")
+            raise ReplayParted(
+                f"start {self.started + 1} of a hook is of '{names[place]}', and was of"
+                f" '{expected}' in the run"
+            )
+        self.started += 1
+        self._next = next(self._starts, _NO_START)
+
+
+class ReplayedEngine(Engine):
+    """Starts hooks where the journal has them start, and nowhere else."""
+
+    def __init__(self, script: Script, *arguments: Any) -> None:
+        node, connections, specs, effects, _, types = arguments
+        super().__init__(node, connections, specs, effects, script.clock, types)
+        self._script = script
+        self._places = {hook: place for place, hook in enumerate(self.all_hooks)}
+        self._names = {place: hook.name for hook, place in self._places.items()}
+        self.has_offer = False
+
+    def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
+        self.has_offer = True
+        return super().offer(packets, accepted)
+
+    def _run(self, hook: Hook) -> None:
+        place = self._places.get(hook)
+        if place is not None:
+            self._script.check_start(place, self._names)
+        super()._run(hook)
+
+
+class Player:
+    """Takes a node through a script, event by event."""
+
+    def __init__(self, script: Script, engine: Engine, inbox: Inbox, source: Source) -> None:
+        self._script, self._engine, self._inbox, self._source = script, engine, inbox, source
+        self._arrived: dict[Connection | str, int] = {}
+        ends = [*engine.inlets, *engine.outlets]
+        self._connections = {key.index: key for key in ends if isinstance(key, Connection)}
+
+    def play(self, event: Event) -> None:
+        """Let an event happen.
+
+        Raises:
+            ReplayOver, ReplayParted: if the replay ends with it.
+        """
+        what = event.what
+        if what is What.PACKET:
+            self._packet(self._connections[event.place])
+        elif what is What.ACKNOWLEDGEMENT:
+            connection = self._connections[event.place]
+            # A plugin that was changed may have sent less.
+            position = min(event.position, self._engine.outlets[connection].sent)
+            self._inbox.on_acknowledgement(connection, position)
+        elif what is What.HEARD:
+            port = self._engine.node.inputs[event.place]
+            self._inbox.on_external_packet(port, self._arriving(port.name))
+        elif what is What.REGISTERED:
+            self._inbox.on_registered(self._connections[event.place])
+        elif what is What.LOOP_BACK:
+            loop_back, self._script.loop_back = self._script.loop_back, None
+            if loop_back is not None:
+                loop_back()
+        elif what is What.OFFER:
+            self._source.offer()
+        else:
+            {
+                What.START: self._inbox.start,
+                What.TIMER: self._inbox.on_timer,
+                What.DRAIN: self._inbox.drain,
+                What.STOP: self._inbox.stop,
+            }[what]()
+
+    def _packet(self, connection: Connection) -> None:
+        if connection.source_node != connection.destination_node:
+            self._inbox.on_packet(connection, self._arriving(connection))
+        elif self._script.deliveries:
+            self._script.deliveries.popleft()()
+
+    def _arriving(self, key: Connection | str) -> Any:
+        number = self._arrived[key] = self._arrived.get(key, 0) + 1
+        return self._source.packet(key, number)

@@ -1,0 +1,139 @@
+"""The middleware of one node without neighbours: it has a real ROS node, and nobody to talk to.
+
+What arrives, and when, is up to whoever plays the neighbours; what is sent goes nowhere. The ROS
+node is one of rclpy, so that plugins find all that they are used to, but callbacks that a plugin
+registers there are not served.
+"""
+
+from __future__ import annotations
+
+import queue
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+from neuros.ports import Inbox, Voice
+from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.carriers import message_carrier
+from neuros.transport.copying import copy_packet
+from neuros.transport.making import make_packet
+from neuros.transport.messages import message_class
+from neuros.transport.plain_node import PlainNode
+
+Event = Callable[[], None]
+
+
+class HeldLoop:
+    """A loop that handles nothing by itself (:class:`neuros.ports.EventLoop`).
+
+    Attributes:
+        from_threads: events that threads have posted.
+
+    Args:
+        post, post_loop_back: where events go that the node posts itself.
+    """
+
+    def __init__(
+        self, post: Callable[[Event], None], post_loop_back: Callable[[Event], None]
+    ) -> None:
+        self.post = post
+        self.post_loop_back = post_loop_back
+        self.from_threads: queue.SimpleQueue[Event] = queue.SimpleQueue()
+
+    @property
+    def has_waiting_events(self) -> bool:
+        """Nothing waits for this loop."""
+        return False
+
+    def post_from_thread(self, event: Event) -> None:
+        """Keep an event for whoever takes it."""
+        self.from_threads.put(event)
+
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
+        """Timers are up to whoever plays the neighbours."""
+
+    def run(self) -> None:
+        """There is nothing to run."""
+
+    def stop(self) -> None:
+        """There is nothing to stop."""
+
+
+class _Nowhere:
+    """A transport that carries nothing (:class:`neuros.ports.Transport`)."""
+
+    digests: Mapping[Connection, array[int]] = {}
+
+    def open(self, inbox: Inbox) -> None: ...
+    def note_result(self, box: Sequence[Any]) -> None: ...
+    def send_external(self, port: Port, packet: Any) -> None: ...
+    def acknowledge(self, connection: Connection, position: int) -> None: ...
+    def close(self) -> None: ...
+
+    def send(self, connections: Sequence[Connection], packet: Any) -> None:
+        return None
+
+    def waiting_for(self) -> Sequence[Connection]:
+        return ()
+
+    def make_packet(self, type_name: str) -> Any:
+        return make_packet(type_name)
+
+
+class Alone:
+    """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
+
+    def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
+        self.loop = loop
+        self._context = rclpy.Context()
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs"],
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._ros_node = PlainNode(file.node.name, self._context)
+
+    def transport(self, file: NodeFile) -> _Nowhere:
+        """One that carries nothing."""
+        return _Nowhere()
+
+    def ros_node(self, file: NodeFile) -> Any:
+        """The ROS node."""
+        return self._ros_node
+
+    def mark_own_entities(self, file: NodeFile, enter: Event) -> None:
+        """Nothing of it is served."""
+
+    def has_foreign_entities(self, file: NodeFile) -> bool:
+        """Nothing can call back."""
+        return False
+
+    def join_sides(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        heard: Callable[[str, str | None], None],
+    ) -> Voice:
+        """There is no other side. Raises ``NotImplementedError``."""
+        raise NotImplementedError("a node without neighbours runs in one part")
+
+    def copy(self, packet: Any) -> Any:
+        """A packet that shares nothing with this one."""
+        return copy_packet(packet)
+
+    def encode(self, packet: Any) -> bytes:
+        """A packet as ROS serialises it."""
+        kind: type = type(packet)
+        return message_carrier(kind).encode(packet)
+
+    def message_class(self, type_name: str) -> type:
+        """The class of a message type in ROS notation."""
+        return message_class(type_name)
+
+    def close(self) -> None:
+        """Give up ROS."""
+        self._ros_node.destroy_node()
+        rclpy.shutdown(context=self._context)
