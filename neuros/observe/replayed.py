@@ -101,6 +101,16 @@ class RecordedNode:
             ]
         return found
 
+    def lacking(self) -> dict[str, tuple[int, int]]:
+        """Connections of which the bag has lost packets: how many it has, of how many."""
+        found = {}
+        for topics in self.sent().values():
+            for name, _, packets in topics:
+                sent = self._run.connections.get(name, {}).get("sent") or 0
+                if len(packets) < sent:
+                    found[name] = len(packets), sent
+        return found
+
     def message(self, data: bytes, type_name: str) -> Any:
         """A message of a type that the bag has."""
         return self._bag.store.deserialize_cdr(data, type_name)

@@ -45,10 +45,15 @@ class ReplayedNode:
         self._script = Script(recorded.journal)
         self._loop = HeldLoop(self._script.deliveries.append, self._note_loop_back)
         self._middleware = Alone(file, self._loop)
-        self.comparison = Comparison(recorded.sent(), recorded.message)
+        lacking = recorded.lacking()
+        self.comparison = Comparison(recorded.sent(), recorded.message, lacking)
         self.failure: NeurosError | None = None
-        self.notes: list[str] = []
+        self.notes = [
+            f"the bag has {there} of {sent} packets on {name}: the others are not compared"
+            for name, (there, sent) in lacking.items()
+        ]
         self.difference: str | None = None
+        self._is_cut_off = False
         self._runtime = NodeRuntime(
             file,
             self._middleware,
@@ -103,6 +108,7 @@ class ReplayedNode:
             self.notes.append(
                 f"the bag ends before packet {number} that arrived on {key}: the replay ends there"
             )
+            self._is_cut_off = True
             raise ReplayOver
         return decode((message_class(self._types[str(key)]), data))
 
@@ -154,7 +160,7 @@ class ReplayedNode:
                 f"the run's list of what happened to the node ends after {self.starts} starts of"
                 " hooks (it was killed, or ran for very long): what it sent later is not compared"
             )
-        elif self.notes:  # the bag has lost its end
+        elif self._is_cut_off:
             return
         elif self._script.expects_start:
             self.difference = (
