@@ -226,6 +226,7 @@ def test_only_what_is_named_is_recorded(tmp_path: Path) -> None:
     [
         (("-t", "source.nmber"), "the project has no such topic, connection or output"),
         (("-r", "-t", "/neuros/a/b/c/d/data"), "the project has no such topic"),
+        (("-r", "--exclude", "source.nmber"), "--exclude source.nmber: the project has no such"),
         (("--exclude", "/clock"), "--exclude: nothing is recorded; add -r"),
         (("--storage", "sqlite3"), "--storage: nothing is recorded; add -r"),
     ],

@@ -57,6 +57,7 @@ def plan_recording(
     Raises:
         UsageError: if something is asked for that does not exist.
     """
+    _check_excluded(request, project)
     places = [place for place in _places(project, names) if _is_chosen(place.topic, request)]
     known = {place.topic.name for place in _places(project, names)}
     wanted = _asked_of_ros(request, known, project)
@@ -165,10 +166,24 @@ def _asked_of_ros(request: Request, known: Collection[str], project: Project) ->
         if in_project:
             continue
         if not text.startswith("/") or text.startswith("/neuros/") or set(text) & set("*?["):
-            outputs = dict.fromkeys(label.partition(" -> ")[0] for label in labels)
-            raise UsageError(
-                f"--topic {text}: the project has no such topic, connection or output; outputs:"
-                f" {', '.join(outputs) or 'none'}"
-            )
+            raise _unknown("--topic", text, project)
         found.append(text)
     return tuple(dict.fromkeys(found))
+
+
+def _check_excluded(request: Request, project: Project) -> None:
+    """Raise ``UsageError`` for what leaves nothing out, nor could on the ROS graph."""
+    everywhere = _places(project, [node.name for node in project.nodes])
+    topics = [place.topic for place in everywhere]
+    for text in request.exclude:
+        is_of_ros = text.startswith("/") and not text.startswith("/neuros/")
+        if not is_of_ros and not any(is_named(t.name, t.connection, [text]) for t in topics):
+            raise _unknown("--exclude", text, project)
+
+
+def _unknown(option: str, text: str, project: Project) -> UsageError:
+    outputs = dict.fromkeys(str(each).partition(" -> ")[0] for each in project.connections)
+    return UsageError(
+        f"{option} {text}: the project has no such topic, connection or output; outputs:"
+        f" {', '.join(outputs) or 'none'}"
+    )
