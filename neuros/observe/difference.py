@@ -65,10 +65,10 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
             if run.connections[name]["sent"] and not len(packets.sent)
         ]
         if missing:
+            where = " and ".join(dict.fromkeys(map(str, missing)))
             remarks.append(
-                f"{name}: not compared, since {' and '.join(map(str, missing))} has no digests of"
-                " it (in process they are kept with --digests, and never of packets that a node"
-                " sends to itself)"
+                f"{name}: not compared, there are no digests of it in {where} (in process they are"
+                " kept with --digests, and never of packets that a node sends to itself)"
             )
             continue
         difference = _sent(name, in_a, in_b)

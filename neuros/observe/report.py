@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -56,7 +56,8 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, ledgers, running_s, run_folder) for c in _connections(files)
+            _connection(c, ledgers, running_s, run_folder, _cut_off(ended))
+            for c in _connections(files)
         ],
         "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
         "expanded_project": project_to_json(project),
@@ -126,6 +127,7 @@ def _connection(
     ledgers: Mapping[str, Mapping[str, Any]],
     running_s: float | None,
     run_folder: Path,
+    cut_off: Collection[str],
 ) -> dict[str, Any]:
     from neuros.observe.packets import packet_figures, read_packets
 
@@ -134,6 +136,8 @@ def _connection(
     incoming = ledgers.get(connection.destination_node, {}).get("incoming", {}).get(key, {})
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
+    # Counts that a node has last reported before it was killed are older than those of the other.
+    is_known = not {connection.source_node, connection.destination_node} & set(cut_off)
     return {
         "connection": key,
         "index": connection.index,
@@ -141,13 +145,18 @@ def _connection(
         "queue_size": connection.queue_size,
         "sent": sent,
         "rate_hz": sent / running_s if sent is not None and running_s else None,
-        "lost": None if sent is None or received is None else sent - received,
+        "lost": sent - received if is_known and None not in (sent, received) else None,
         **{field: incoming.get(field) for field in fields},
         **packet_figures(
             read_packets(run_folder, connection),
             may_lose=not connection.is_reliable and sent != received,
         ),
     }
+
+
+def _cut_off(ended: Ended) -> list[str]:
+    """The nodes that have not reported their end."""
+    return [name for name, report in ended.reports.items() if not report.get("is_final")]
 
 
 def _node(name: str, ended: Ended) -> dict[str, Any]:
