@@ -87,7 +87,8 @@ def test_the_tick_table_has_published_shares_below_ours(tmp_path: Path) -> None:
         target = tmp_path / name / file
         target.parent.mkdir(parents=True)
         target.write_text(json.dumps(moments))
-    (tmp_path / "neuros/run.json").write_text(json.dumps({"format": FORMAT, "backend": "docker"}))
+    record = {"format": FORMAT, "backend": "docker", "connections": []}
+    (tmp_path / "neuros/run.json").write_text(json.dumps(record))
     readings = {
         name: [tick.read(tmp_path / name, Entry(name, 1, 0.0, 0.0))] for name in ("neuros", "rclpy")
     }
