@@ -24,7 +24,8 @@ _CAUSES = (
     ),
     (
         r"ERROR: ResolutionImpossible|have conflicting dependencies",
-        "its requirements.txt cannot be satisfied, as packages in it exclude each other",
+        "its requirements.txt cannot be satisfied, as packages in it exclude each other: loosen"
+        " their versions",
     ),
     (
         r"pull access denied for (?P<what>[^\s,]+)|manifest for (?P<also>\S+) not found",

@@ -113,14 +113,20 @@ def added_tag(image: Any) -> str:
 
 def _built(recipe: Recipe, project_folder: Path | None, engine: DockerClient) -> Image:
     image = built_image(recipe, engine)
-    is_projects = project_folder is not None and recipe.folder.is_relative_to(project_folder)
-    remedy = f"run ./install.py --containers {project_folder if is_projects else recipe.name}"
+    remedy = f"run ./install.py --containers {_to_build(recipe, project_folder)}"
     if image is None:
         raise EnvironmentFault(f"the image of container '{recipe.name}' is not built: {remedy}")
     notice = ""
     if not is_current(image, recipe):
         notice = f"the image of container '{recipe.name}' is older than its recipe: {remedy}"
     return _labelled(image, recipe.tags[0], notice)
+
+
+def _to_build(recipe: Recipe, project_folder: Path | None) -> Path | str:
+    """What to name for an image to be built; a project can do without a ``project.json``."""
+    if project_folder is None or not recipe.folder.is_relative_to(project_folder):
+        return recipe.name
+    return project_folder if (project_folder / "project.json").is_file() else recipe.folder
 
 
 def _labelled(image: Any, name: str, notice: str = "") -> Image:
