@@ -20,7 +20,6 @@ from neuros.ports import Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
 
 if TYPE_CHECKING:
-    from neuros.launch.docker.images import Image
     from neuros.launch.docker.launcher import Containers
 
 BACK_ENDS = ("auto", "docker", "process", "in-process")
@@ -39,10 +38,6 @@ class BackEnd:
     def as_seen(self, file: NodeFile) -> NodeFile:
         """The node with all paths as it sees them itself."""
         return inside(file) if self.containers else file
-
-    def image_of(self, node: Node) -> Image | None:
-        """What the container of a node is made from, ``None`` where nodes are processes."""
-        return self.containers.images[node.container] if self.containers else None
 
     def as_here(self, text: str, folders: Folders) -> str:
         """What a node has said, with the names that its paths have on this machine."""

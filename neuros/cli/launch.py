@@ -122,8 +122,6 @@ class _Run:
             outcome.reason = self._as_here(outcome.reason)
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self._run_folder)
-            for name, node in record["nodes"].items():
-                node |= self._plan.software(name)
             record |= {
                 "backend": self._plan.backend,
                 **self._plan.back_end.record(),

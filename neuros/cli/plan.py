@@ -9,14 +9,12 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any
 
 from neuros.cli.back_end import BackEnd, choose_back_end
 from neuros.cli.network import THIS_MACHINE, Network, chosen_network
 from neuros.cli.projects import load
 from neuros.cli.recording_options import is_recorded
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
-from neuros.installation.machine import dotted
 from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
 from neuros.launch.guardian import Guardian
@@ -94,17 +92,6 @@ class Plan:
         cores = usable_cores() if is_spread else ()
         # The first domain that runs pick is 1.
         return place(nodes, cores, os.environ, begin=max(domain_id - 1, 0))
-
-    def software(self, name: str) -> dict[str, Any]:
-        """What a node runs on, for ``run.json``: its Python, and its image if it has one."""
-        image = self.back_end.image_of(self.project.node(name))
-        if image is None:
-            path, version = self.pythons.of(name)
-            return {"python": {"version": dotted(version), "path": str(path)}, "image": None}
-        return {
-            "python": {"version": dotted(image.python_version), "path": image.start[-1]},
-            "image": {"name": image.name, "id": image.id},
-        }
 
     def launcher(self, domain_id: int, guardian: Guardian | None = None) -> Launcher:
         """The launcher of the back end in a ROS domain; ``guardian`` hears of all it starts."""

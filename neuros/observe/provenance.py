@@ -49,7 +49,11 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
 
 def python_versions() -> dict[str, Any]:
     """Of this Python and of what it finds."""
-    return {"python": platform.python_version(), "packages": installed_packages(sys.path)}
+    return {
+        "python": platform.python_version(),
+        "executable": sys.executable,
+        "packages": installed_packages(sys.path),
+    }
 
 
 def note_versions(node_folder: Path) -> None:

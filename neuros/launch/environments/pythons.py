@@ -12,8 +12,7 @@ from neuros.installation.machine import dotted
 from neuros.installation.progress import Progress
 from neuros.launch.containers import ContainerFolder, find_container
 from neuros.launch.environments.cache import cache_folder, sweep
-from neuros.launch.environments.choice import HERE, Choice, choose, choose_here
-from neuros.launch.environments.interpreters import Version
+from neuros.launch.environments.choice import Choice, choose, choose_here
 from neuros.launch.environments.making import make
 from neuros.launch.environments.requirements import unmet
 from neuros.project.model import Node
@@ -52,13 +51,6 @@ class Pythons:
         """The Python of each node that does not run on this very one."""
         pythons = {name: choice.path for name, choice in self._choices.items()}
         return {name: path for name, path in pythons.items() if path != Path(sys.executable)}
-
-    def of(self, name: str) -> tuple[Path, Version]:
-        """The Python of a node, and its version."""
-        choice = self._choices.get(name)
-        if choice is None or choice.path == Path(sys.executable):
-            return Path(sys.executable), HERE
-        return choice.path, choice.version
 
     @property
     def notices(self) -> list[str]:

@@ -407,12 +407,6 @@ def test_whiskeye_runs_in_three_different_containers(bench: ContainerBench) -> N
     picture = finished.run_folder / "visualiser/head_direction.png"
     assert picture.exists()
     assert f"picture: {picture}" in finished.output, "as it is called here"
-    for name, image in (("robot", "neuros_mujoco"), ("snn", "neuros_nest")):
-        node = finished.record["nodes"][name]
-        assert node["image"]["name"].startswith(f"{image}:")
-        assert node["image"]["id"].startswith("sha256:")
-        assert node["python"]["path"] == "/opt/neuros/bin/python"
-        assert node["python"]["version"].startswith("3.")
 
 
 # ------------------------------------------------------------------ sessions

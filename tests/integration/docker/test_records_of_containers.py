@@ -59,3 +59,4 @@ def test_its_record_names_engine_images_and_what_is_in_them(run: Finished) -> No
         assert inside["packages"]["ros_jazzy_rclpy"]
         assert inside["packages"] != run.record["versions"]["packages"]
         assert inside["python"].startswith("3.")
+        assert inside["executable"] == "/opt/neuros/bin/python"
