@@ -1,15 +1,17 @@
 """What limits the speed of a run, and what it would gain without a discard limit.
 
-The search begins at the node that sets the pace and asks what took most of its time. Blocked on a
-connection: the receiver holds it up, which is asked next. Waiting for an input: its sender is. A
-node that mostly executes is the bottleneck, and so is one that waits for its own clock. Where the
-search comes back to a node that it has seen, the nodes wait for each other in a loop.
+The search begins at the node that sets the pace and asks what holds it up. Blocked on a connection:
+the receiver does, which is asked next. Waiting for an input: its sender does. A node that nothing
+holds up for long is the bottleneck, and so is one that mostly waits for its own clock. Where the
+search comes back to a node that it has seen, the nodes wait for each other in a loop, and the
+bottleneck is the one that executes most, if it does so more than half of the time.
 
-The prediction is a bound. Without the discard limit of a connection its sender loses no time any
-more in which that connection blocked it, and whatever happens later in the run happens earlier by
-no more than the sum of that; nor is the pacing node faster than any node that remains coupled to it
-by lossless connections needs for its own hooks. It holds as long as a packet costs every hook what
-it cost before: where processors are short, less is gained.
+The prediction is a bound for a run whose hooks cost what they cost in this one. Without the discard
+limit of a connection its sender loses no time any more in which that connection blocked it, and
+whatever happens later in the run happens earlier by no more than the sum of that; nor is the pacing
+node faster than any node that remains coupled to it by lossless connections needs for its own
+hooks. Where processors are short, hooks cost more when others run more often, and less when packets
+are lost that need not be worked on: then it may be off either way.
 """
 
 from __future__ import annotations
@@ -22,6 +24,9 @@ from neuros.project.model import Connection
 
 WORTH_NAMING = 0.02
 """Share of the time below which a cause is noise."""
+
+HELD_UP = 0.1
+"""Share of the time from which on a node counts as held up by others."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +50,11 @@ class Gain:
 
     Attributes:
         connections: those that would have none.
-        at_most: how many times as fast the run would be at most; 1 is nothing.
+        up_to: how many times as fast the run would be if hooks cost what they cost; 1 is nothing.
     """
 
     connections: tuple[str, ...]
-    at_most: float
+    up_to: float
 
 
 @dataclass(frozen=True)
@@ -93,13 +98,12 @@ def find_bottleneck(
     pacing = time_owner if time_owner in spending else _most_held_up(spending)
     assert pacing is not None
     steps, loop = _follow(pacing, spending, connections, running_s)
-    last = steps[-1]
-    root: str | None = last.node if last.state in ("executing", "idle") else None
-    if loop:
-        root = max(loop, key=lambda node: spending[node].own_s)
+    root: str | None = steps[-1].node
+    if steps[-1].state not in ("executing", "idle"):
+        root = max(loop or (steps[-1].node,), key=lambda node: spending[node].own_s)
         if spending[root].own_s < running_s / 2:
             root = None
-    gains = _gains(pacing, root, spending, connections, running_s)
+    gains = _gains(pacing, spending, connections, running_s)
     return Bottleneck(pacing, tuple(steps), root, loop, gains)
 
 
@@ -139,7 +143,13 @@ def _largest(node: str, spent: Spending, running_s: float) -> Step:
         "waiting": sum(spent.waiting.values()),
         "idle": spent.idle_s,
     }
-    state = max(sums, key=lambda state: sums[state])
+    held_s = sums["blocked"] + sums["waiting"]
+    if spent.idle_s > max(spent.own_s, held_s):
+        state = "idle"
+    elif held_s < HELD_UP * running_s:
+        state = "executing"
+    else:
+        state = "blocked" if sums["blocked"] >= sums["waiting"] else "waiting"
     causes: Mapping[str, float] = {}
     if state == "executing":
         causes = spent.executing
@@ -172,7 +182,6 @@ def _held_up_by(
 
 def _gains(
     pacing: str,
-    root: str | None,
     spending: Mapping[str, Spending],
     connections: Mapping[str, Connection],
     running_s: float,
@@ -187,20 +196,21 @@ def _gains(
         and spending[c.source_node].blocked.get(name, 0.0) > WORTH_NAMING * running_s
     ]
     cuts: list[tuple[str, ...]] = [(name,) for name in limiting]
-    into_root = tuple(
-        name
-        for name, c in connections.items()
-        if c.discard_limit is not None
-        and c.destination_node == root != c.source_node
-        and c.source_node in spending
-    )
-    if len(into_root) > 1 and {*into_root} & {*limiting}:
-        cuts.append(into_root)
+    for receiver in dict.fromkeys(connections[name].destination_node for name in limiting):
+        together = tuple(
+            name
+            for name, c in connections.items()
+            if c.discard_limit is not None
+            and c.destination_node == receiver != c.source_node
+            and c.source_node in spending
+        )
+        if len(together) > 1:
+            cuts.append(together)
     gains = [
         Gain(cut, running_s / _least_s(pacing, cut, spending, connections, running_s))
         for cut in cuts
     ]
-    return tuple(sorted(gains, key=lambda gain: (-round(gain.at_most, 2), len(gain.connections))))
+    return tuple(sorted(gains, key=lambda gain: (-round(gain.up_to, 2), len(gain.connections))))
 
 
 def _least_s(

@@ -47,7 +47,7 @@ def findings_of(run: Run) -> Findings:
     gains = [_gain(gain, run.record) for gain in found.gains]
     if not gains:
         gains = ["No discard limit holds this run up: without them it would gain nothing."]
-    best = next((gain for gain in found.gains if gain.at_most >= _WORTH_A_TRY), None)
+    best = next((gain for gain in found.gains if gain.up_to >= _WORTH_A_TRY), None)
     return Findings(
         _headline(found, spending, run.running_s),
         tuple(reasons),
@@ -122,21 +122,21 @@ def _caveats(run: Run, spending: Mapping[str, Spending], running_s: float) -> li
         return []
     subject = "The processor was" if cores == 1 else f"The {cores} processors were"
     return [
-        f"{subject} {min(1.0, max(shares)):.0%} busy: what runs more often takes from the others."
-        " Expect less than predicted."
+        f"{subject} {min(1.0, max(shares)):.0%} busy: what a hook costs depends on what else runs,"
+        " and predictions may be off either way."
     ]
 
 
 def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
     names = " and ".join(gain.connections)
     one = len(gain.connections) == 1
-    if gain.at_most < _WORTH_A_TRY:
+    if gain.up_to < _WORTH_A_TRY:
         return f"Without the discard limit{'' if one else 's'} of {names}: next to nothing."
-    text = f"Without the discard limit{'' if one else 's'} of {names}: at most"
-    text += f" {gain.at_most:.1f} times as fast"
+    text = f"Without the discard limit{'' if one else 's'} of {names}: up to"
+    text += f" {gain.up_to:.1f} times as fast"
     factor = record.get("real_time_factor")
     if factor:
-        text += f" (real-time factor {factor:.2f}, then at most {factor * gain.at_most:.2f})"
+        text += f" (real-time factor {factor:.2f}, then up to {factor * gain.up_to:.2f})"
     return f"{text}. Packets may then be lost there."
 
 

@@ -29,8 +29,8 @@ def test_the_hook_the_share_and_the_gain_are_named(tmp_path: Path) -> None:
     )
     assert found.reasons[0] == (f"fast is blocked 80% of the time ({WIRE} 80%), and executes 20%.")
     assert found.gains == (
-        f"Without the discard limit of {WIRE}: at most 5.0 times as fast (real-time factor 2.00,"
-        " then at most 10.00). Packets may then be lost there.",
+        f"Without the discard limit of {WIRE}: up to 5.0 times as fast (real-time factor 2.00,"
+        " then up to 10.00). Packets may then be lost there.",
     )
 
 
