@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import socket
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -133,10 +135,7 @@ class _Run:
                 for problem in recording.report(recorded, record):
                     outcome.fail(problem, EXIT_ENVIRONMENT)
             self._judge(record, outcome)
-            try:
-                write_record(record, self._run_folder)
-            except OSError as error:
-                self._console.log("ERROR", f"run.json cannot be written: {error.strerror}")
+            self._save(record, outcome)
         self._console.write("\n" + run_table(record) + "\n")
         for reason in outcome.failures:
             if reason != outcome.reason:
@@ -163,6 +162,19 @@ class _Run:
             outcome.fail(f"budget broken: {text}", EXIT_BUDGET)
         record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
         record["broken_budgets"] = broken
+
+    def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
+        """Write ``run.json``; where there is no room for it, among the temporary files."""
+        try:
+            write_record(record, self._run_folder)
+        except OSError as error:
+            spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
+            problem = f"{self._run_folder / 'run.json'} cannot be written ({error.strerror})"
+            outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
+            record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
+            with contextlib.suppress(OSError):
+                spare.mkdir()
+                write_record(record, spare)
 
     def _observation(self, options: argparse.Namespace) -> Observation:
         names = [file.node.name for file in self._files]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
-from launching import BACKENDS, EXAMPLES, Finished, launch
+from launching import BACKENDS, EXAMPLES, Finished, launch, start
 
 PROJECT = EXAMPLES / "1_tick/clock"
 TIME = Path(__file__).parent / "back_ends/time"
@@ -75,3 +76,31 @@ def test_simulated_time_has_a_point_per_second(tmp_path: Path, back_end: str) ->
     walls = [wall_s for _, wall_s in points]
     assert walls == sorted(walls)
     assert -1.0 < walls[0] < finished.record["wall_s"] + 1.0
+
+
+def test_a_record_that_cannot_be_written_is_put_elsewhere(tmp_path: Path) -> None:
+    """A plugin puts a folder where ``run.json`` would go."""
+    plugin = """
+import os
+from neuros.hooks import neuros_tick
+@neuros_tick(seconds=0.05)
+def block(node):
+    os.mkdir("run.json")
+    node.shutdown("done")
+"""
+    (tmp_path / "a.py").write_text(plugin)
+    node = {"name": "a", "container": "neuros_python", "plugin": "a.py"}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node], "connections": []}))
+    spare = tmp_path / "spare"
+    spare.mkdir()
+    options = ("--backend", "process", "-o", str(tmp_path / "run"))
+    with start(tmp_path, *options, cwd=spare, TMPDIR=str(spare)) as running:
+        finished = running.finish(30.0)
+    assert finished.exit_code == 4, finished.output
+    (record,) = spare.glob("neuros-*/run.json")
+    assert f"run.json cannot be written (Is a directory): it is in {record.parent}" in (
+        finished.output
+    )
+    written = json.loads(record.read_text())
+    assert written["exit_code"] == 4
+    assert written["nodes"]["a"]["report"] == "final"
