@@ -48,7 +48,7 @@ def open_run(folder: Path) -> PastRun:
     try:
         record = json.loads(file.read_text("utf-8"))
     except FileNotFoundError as error:
-        if (folder / "project.json").is_file() and (folder / "control.sock").exists():
+        if any(folder.glob("*/node.json")):
             why = "its run goes on, or its launcher was killed"
         else:
             why = "it is no folder that a run has left behind"

@@ -193,7 +193,7 @@ def test_what_is_no_run_of_this_version_is_refused(
 
 
 def test_a_run_that_goes_on_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "project.json").write_text("{}")
-    (tmp_path / "control.sock").touch()
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/node.json").write_text("{}")
     with pytest.raises(UsageError, match="its run goes on"):
         open_run(tmp_path)
