@@ -97,10 +97,11 @@ def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> by
         for run, label in zip(runs, labels_of(runs), strict=True)
     ]
     try:
-        picture = png(comparison_figure(runs))
+        figure = comparison_figure(runs)
     except ModuleNotFoundError as error:
         raise _no_matplotlib(error) from error
-    parts.append(figure_part("Side by side", "", picture))
+    if figure is not None:
+        parts.append(figure_part("Side by side", "", png(figure)))
     parts.append(table_part("All figures", header, rows))
     return page("Comparison of runs", parts).encode()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from pathlib import Path
 
@@ -19,6 +20,11 @@ time_s,unix_time_s,core0_percent,memory_used_bytes,a.cpu_percent,a.memory_bytes,
 2.0,1700000002,60.0,1000000,,,
 3.0,1700000003,
 """
+OLD = {
+    "project": "old",
+    "connections": [{"connection": "a.out -> b.in", "sent": 3, "received": 3, "consumed": 3}],
+    "nodes": {"a": {"report": None}, "b": {"report": None}},
+}
 PNG = b"\x89PNG\r\n"
 
 
@@ -82,6 +88,15 @@ def test_a_run_without_anything_is_no_failure(
     assert "missing: run.json" in out
 
 
+def test_an_older_run_has_the_figures_that_it_has_data_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.json").write_text(json.dumps(OLD))
+    assert main(["report", str(tmp_path)]) == 0
+    assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {"graph", "packets"}
+    assert "missing: run.json has format 1" in capsys.readouterr().out
+
+
 def test_what_is_no_run_is_a_wrong_usage(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,3 +137,10 @@ def test_more_than_two_runs_have_no_ratio(run: Path, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert "ratio" not in out
     assert "1: " in out
+
+
+def test_runs_without_figures_are_compared_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"format": 2}')
+    page = tmp_path / "out.html"
+    assert main(["compare", str(tmp_path), str(tmp_path), "-o", str(page)]) == 0
+    assert "<img" not in page.read_text("utf-8")

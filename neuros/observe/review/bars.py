@@ -127,7 +127,7 @@ def _draw_ticks(axes: Any, name: str, ticks: Mapping[str, Any]) -> None:
     within = ", ".join(f"{share:.1%} within {ms}" for ms, share in ticks["within"].items())
     axes.set_title(
         f"{name}: period {ticks['period_ms']:g} ms (dashed), standard deviation"
-        f" {ticks['std_ms']:.2f} ms; {within}",
+        f" {ticks['std_ms']:.2f} ms\n{within}",
         fontsize=9, loc="left",
     )  # fmt: skip
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))

@@ -117,8 +117,8 @@ def _processor(name: str) -> _Cells:
     return cell
 
 
-def comparison_figure(runs: Sequence[Run]) -> Any:
-    """Real-time factor, delivery, latency and executing share of all runs."""
+def comparison_figure(runs: Sequence[Run]) -> Any | None:
+    """Real-time factor, delivery, latency and executing share; ``None`` if no run has any."""
     panels = [
         (name, [(label, cell) for label, cell in cells])
         for name, cells in (
@@ -134,12 +134,14 @@ def comparison_figure(runs: Sequence[Run]) -> Any:
     panels = [
         (n, cells) for n, cells in panels if any(c(r) is not None for _, c in cells for r in runs)
     ]
+    if not panels:
+        return None
     bar = 0.8 / len(runs)
     heights = [max(1.0, len(cells) * (0.2 + 0.16 * len(runs))) for _, cells in panels]
     figure = new_figure(sum(heights) + 0.75 * len(panels) + 0.4)
     ratios = {"height_ratios": heights}
-    rows = figure.subplots(max(1, len(panels)), squeeze=False, gridspec_kw=ratios or None)[:, 0]
-    for axes, (title, cells) in zip(rows, panels, strict=False):
+    rows = figure.subplots(len(panels), squeeze=False, gridspec_kw=ratios)[:, 0]
+    for axes, (title, cells) in zip(rows, panels, strict=True):
         places = np.arange(len(cells))[::-1]
         for number, (run, label) in enumerate(zip(runs, labels_of(runs), strict=True)):
             values = [cell(run) for _, cell in cells]

@@ -16,10 +16,12 @@ _COLUMN_IN, _ROW_IN = 2.45, 1.12
 _NODE, _BOX = (1.75, 0.8), (2.05, 0.8)
 
 
-def graph_figure(run: Run) -> Any:
+def graph_figure(run: Run) -> Any | None:
     """Nodes with how they spent their time, connections with what they carried and how fast."""
+    if not run.nodes:
+        return None
     spending = spending_of(run)
-    first = run.time_owner or next(iter(run.nodes), "")
+    first = run.time_owner or next(iter(run.nodes))
     known = {
         name: end
         for name, end in run.ends.items()
