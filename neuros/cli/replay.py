@@ -21,7 +21,8 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="With --node: run one node once more on exactly what it received, and compare"
         " what it sends, packet by packet. With --topic: publish recorded topics on the ROS graph,"
         " spaced as they were sent.",
-        epilog="exit codes of --node: 0 identical, 1 different, 2 nothing to compare",
+        epilog="exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
+        " 4 the node needs what this machine does not have",
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")

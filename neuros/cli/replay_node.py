@@ -19,11 +19,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import NodeFile
 
 if TYPE_CHECKING:
     from neuros.hooks import HookSpec
+    from neuros.observe.past_run import PastRun
     from neuros.replay.node import ReplayedNode
 
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
@@ -36,23 +37,21 @@ def replay_node(options: argparse.Namespace) -> int:
         UsageError: if the run, the node or the recording is not there.
         EnvironmentFault: if the node's Python cannot be made.
     """
-    from neuros.cli.environments import make_environments
-    from neuros.launch.environments.pythons import Pythons
+    from neuros.cli.projects import WORKSPACE
     from neuros.observe.replayed import RecordedNode, recorded_node
+    from neuros.replay.containers import as_on_this_machine, ran_in_container
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
+    if ran_in_container(run):
+        file = as_on_this_machine(run, file, WORKSPACE)
     if not file.node.plugin.is_file():
         raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
     RecordedNode(run, file)
-    is_process = run.record.get("backend") == "process"
-    pythons = Pythons.choose(
-        [file.node] if is_process else [], file.folders.project, dict(os.environ)
-    )
-    if ended := make_environments(pythons, []):
+    python, ended = _python(run, file)
+    if ended:
         return ended
     folder = _folder(options.output)
     file = replace(file, folders=replace(file.folders, run=folder))
-    python = pythons.paths.get(options.node, Path(sys.executable))
     command = [str(python), "-m", "neuros.cli", "replayed", "--run", str(run.folder)]
     command += ["--pdb"] if options.pdb else []
     command += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
@@ -61,11 +60,33 @@ def replay_node(options: argparse.Namespace) -> int:
     return 0
 
 
+def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
+    """The Python that a node is replayed with, made if it has to be; and the exit code of a signal
+    that ended that, else 0.
+
+    Raises:
+        EnvironmentFault: if it cannot be made.
+    """
+    from neuros.cli.environments import make_environments
+    from neuros.launch.environments.pythons import Pythons
+    from neuros.replay.containers import not_here, ran_in_container
+
+    own = [] if run.record.get("backend") == "in-process" else [file.node]
+    try:
+        pythons = Pythons.choose(own, file.folders.project, dict(os.environ))
+        ended = make_environments(pythons, [])
+    except EnvironmentFault as fault:
+        raise not_here(run, file.node.name, fault) if ran_in_container(run) else fault from fault
+    return pythons.paths.get(file.node.name, Path(sys.executable)), ended
+
+
 def run_replayed(options: argparse.Namespace) -> int:
     """The process that :func:`replay_node` becomes."""
     from neuros.observe.past_run import open_run
+    from neuros.observe.provenance import python_versions
     from neuros.observe.replayed import RecordedNode
     from neuros.project.split import node_file_from_json
+    from neuros.replay.containers import note_on_versions, ran_in_container
     from neuros.replay.debugging import debugpy_on
     from neuros.replay.node import ReplayedNode, files_changed_since
 
@@ -78,11 +99,13 @@ def run_replayed(options: argparse.Namespace) -> int:
     run = open_run(run_folder)
     for path in files_changed_since(run_folder, file):
         print(f"note: {path} was changed after the run had begun")
+    if ran_in_container(run) and (note := note_on_versions(run, file.node.name, python_versions())):
+        print(f"note: {note}")
     node = ReplayedNode(file, RecordedNode(run, file))
     with debugpy_on(options.debugpy):
         sys.stdout.flush()
         is_left = _run(node, use_pdb=options.pdb)
-    return _verdict(node, run.record, file.node.name, is_left=is_left)
+    return _verdict(node, run, file.node.name, is_left=is_left)
 
 
 def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
@@ -110,14 +133,18 @@ def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
     return False
 
 
-def _verdict(node: ReplayedNode, record: dict[str, Any] | Any, name: str, *, is_left: bool) -> int:
+def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> int:
+    from neuros.replay.containers import missing_module, not_here, ran_in_container
+
     compared = node.comparison
     count = f"{_count(compared.packets, 'packet')} on {_count(compared.connections, 'connection')}"
     if is_left:
         print(f"left after {_count(node.starts, 'start')} of hooks; identical so far: {count}")
         return EXIT_LEFT
     if node.failure is not None and node.difference is None:
-        if not _failed_alike(node, record, name):
+        if not _failed_alike(node, run.record, name):
+            if ran_in_container(run) and (lack := missing_module(node.failure)):
+                raise not_here(run, name, lack)
             first = str(node.failure).partition("\n")[0]
             print(f"different: it failed, and did not in the run: {first}")
             return EXIT_DIFFERENT

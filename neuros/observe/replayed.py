@@ -21,7 +21,7 @@ _RECORD = "run the project again with -r (--record), and replay that run"
 
 
 def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
-    """A run, and what one of its nodes was told.
+    """A run, and what one of its nodes was told: in a container, with the paths of that.
 
     Raises:
         UsageError: if the run or the node does not exist, or was not recorded so that the node
@@ -31,11 +31,6 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
     if name not in run.record["nodes"]:
         names = ", ".join(run.record["nodes"])
         raise UsageError(f"replay: {run_folder} has no node '{name}'; it has {names}")
-    if run.record.get("backend") == "docker":
-        raise UsageError(
-            f"replay: in {run_folder} the nodes ran in containers, and a replay is a process of"
-            " this machine: record the project with --backend process"
-        )
     load_plan(run_folder)
     if not _journal_of(run_folder, name).is_file():
         raise UsageError(

@@ -11,7 +11,7 @@ from neuros.errors import EnvironmentFault
 from neuros.launch.docker.container import how_it_ended
 from neuros.launch.docker.images import Image
 from neuros.launch.docker.launcher import user_for
-from neuros.launch.docker.layout import as_here, inside
+from neuros.launch.docker.layout import as_here, inside, outside
 from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings
 from neuros.project.model import Folders, Node, NodeFile
 from neuros.project.resources import Access, Resources
@@ -173,6 +173,22 @@ def test_it_executes_the_python_of_its_image_and_writes_its_own_log() -> None:
         *("/opt/neuros/bin/python", "-m", "neuros.cli", "node", "/neuros/run/snn/node.json"),
     ]
     assert found["working_dir"] == "/neuros/run"
+
+
+def test_what_a_node_was_told_is_translated_back() -> None:
+    file = node_file(
+        script=HERE.workspace / "prepare.sh",
+        environment={"MODEL": "/home/me/robot/a.xml", "DATA": "/data", "NOTE": "/home/me/robot"},
+        environment_paths=("DATA", "MODEL"),
+    )
+    assert inside(file).node.script == Path("/neuros/workspace/prepare.sh")
+    assert outside(inside(file), HERE) == file
+    moved = Folders(Path("/srv/robot"), HERE.workspace, Path("/srv/run"))
+    there = outside(inside(file), moved)
+    assert there.folders == moved
+    assert there.node.plugin == Path("/srv/robot/nodes/snn.py")
+    assert there.node.environment["MODEL"] == "/srv/robot/a.xml"
+    assert there.node.environment["DATA"] == "/data", "it was never mounted"
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,13 @@ def inside(file: NodeFile) -> NodeFile:
     )
 
 
+def outside(file: NodeFile, folders: Folders) -> NodeFile:
+    """The inverse of :func:`inside`: the node with the paths of a machine with these folders."""
+    return replace(
+        file, node=translated(file.node, lambda path: _path_outside(path, folders)), folders=folders
+    )
+
+
 def as_here(text: str, folders: Folders) -> str:
     """What a node has said, with the names that its paths have on this machine."""
     here = {each.name: str(getattr(folders, each.name)) for each in fields(Folders)}
@@ -46,4 +53,12 @@ def path_inside(path: Path, folders: Folders) -> Path:
     for here, there in sorted(mounted, key=lambda pair: -len(pair[0].parts)):
         if path.is_relative_to(here):
             return there / path.relative_to(here)
+    return path
+
+
+def _path_outside(path: Path, folders: Folders) -> Path:
+    for each in fields(Folders):
+        there: Path = getattr(FOLDERS, each.name)
+        if path.is_relative_to(there):
+            return Path(getattr(folders, each.name)) / path.relative_to(there)
     return path

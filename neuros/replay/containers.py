@@ -1,0 +1,67 @@
+"""A node that ran in a container is replayed as a process of this machine, with what that has."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from neuros.errors import EnvironmentFault, NeurosError
+from neuros.launch.docker.layout import outside
+from neuros.observe.past_run import PastRun
+from neuros.project.model import Folders, NodeFile
+
+_FEW = 5
+_INSTALLERS = {"pip", "setuptools", "wheel"}  # nothing that a node computes depends on them
+
+
+def ran_in_container(run: PastRun) -> bool:
+    """Whether the nodes of a run had containers of their own."""
+    return run.record.get("backend") == "docker"
+
+
+def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path) -> NodeFile:
+    """The node with the paths of this machine; ``file`` is what it was told in its container."""
+    return outside(file, Folders(Path(run.record["file"]).parent, workspace, run.folder))
+
+
+def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
+    """What to raise where this machine lacks something that a node had in its container."""
+    return EnvironmentFault(
+        f"replay: in {run.folder} '{name}' ran in a container, a replay is a process of this"
+        f" machine, and here it lacks something: {cause}"
+    )
+
+
+def missing_module(failure: NeurosError | None) -> str:
+    """What to tell of a failure if the node lacks a module, else an empty text."""
+    cause = None if failure is None else failure.__cause__
+    if not isinstance(cause, ModuleNotFoundError):
+        return ""
+    return (
+        f"{cause}: install it for {sys.executable}, or name it in the requirements.txt of the"
+        " container"
+    )
+
+
+def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
+    """What a node had in its image and has in another version here; empty if nothing.
+
+    Args:
+        here: as from :func:`neuros.observe.provenance.python_versions`.
+    """
+    versions = run.record["versions"]
+    there = versions["nodes"].get(name, versions)  # not noted where it is the launcher's own
+    had = {"Python": there["python"], **there["packages"]}
+    has = {"Python": here["python"], **here["packages"]}
+    rows = [
+        f"{what} {version} (here {has[what]})"
+        for what, version in had.items()
+        if what not in _INSTALLERS and has.get(what, version) != version
+    ]
+    if not rows:
+        return ""
+    more = f" and {len(rows) - _FEW} more" if len(rows) > _FEW else ""
+    image = run.record["nodes"][name]["image"]["name"]
+    return f"the node ran in image {image} with {', '.join(rows[:_FEW])}{more}"
