@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 from launching import Running, start
+from outside_asker import PROGRAM
 
 from neuros.doctor.delivery import PROJECT as IMAGES
 from neuros.launch.domain import choose_domain
@@ -57,25 +58,6 @@ APART = {
     "both": (*OWN_IPC, *OTHER_USER),
     "no rights": LOCKED_DOWN,
 }
-
-# Asks until it hears the answer to one of its questions.
-PROGRAM = """
-import sys, time
-import rclpy
-from std_msgs.msg import String
-rclpy.init()
-node = rclpy.create_node("asker")
-publisher = node.create_publisher(String, "/question", 10)
-heard = []
-node.create_subscription(String, "/answer", heard.append, 10)
-mark = sys.argv[1]
-end = time.monotonic() + 20
-while not any(each.data == f"{mark} heard" for each in heard):
-    if time.monotonic() > end:
-        sys.exit(f"no answer; {publisher.get_subscription_count()} listen")
-    publisher.publish(String(data=mark))
-    rclpy.spin_once(node, timeout_sec=0.05)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +156,7 @@ def test_a_program_that_is_kept_apart_hears_and_is_heard(
     if discovery:
         environment[RANGE_VARIABLE] = discovery
     program = subprocess.run(
-        [*apart, sys.executable, "-c", PROGRAM, everybodys.name],
+        [*apart, sys.executable, "-c", PROGRAM, everybodys.name, "20"],
         env=environment,
         capture_output=True,
         text=True,

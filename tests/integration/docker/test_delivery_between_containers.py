@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from docker import DockerClient
 from launching import Running, start
+from outside_asker import PROGRAM
 
 from containers import nothing_left, require_containers
 from neuros.doctor.delivery import PROJECT as IMAGES
@@ -36,25 +37,6 @@ PROGRAMS: Mapping[str, Mapping[str, Any]] = {
     "discovery on this machine": {"environment": {RANGE_VARIABLE: "LOCALHOST"}},
     "no rights": {"cap_drop": ["ALL"], "security_opt": ["no-new-privileges"]},
 }
-
-# Asks until it hears the answer to one of its questions.
-PROGRAM = """
-import sys, time
-import rclpy
-from std_msgs.msg import String
-rclpy.init()
-node = rclpy.create_node("asker")
-publisher = node.create_publisher(String, "/question", 10)
-heard = []
-node.create_subscription(String, "/answer", heard.append, 10)
-mark, limit_s = sys.argv[1], float(sys.argv[2])
-end = time.monotonic() + limit_s
-while not any(each.data == f"{mark} heard" for each in heard):
-    if time.monotonic() > end:
-        sys.exit(f"no answer; {publisher.get_subscription_count()} listen")
-    publisher.publish(String(data=mark))
-    rclpy.spin_once(node, timeout_sec=0.05)
-"""
 
 
 @pytest.fixture(scope="module")
