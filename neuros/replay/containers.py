@@ -63,5 +63,8 @@ def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
     if not rows:
         return ""
     more = f" and {len(rows) - _FEW} more" if len(rows) > _FEW else ""
-    image = run.record["nodes"][name]["image"]["name"]
+    nodes = run.record["expanded_project"]["nodes"]
+    (container,) = (node["container"] for node in nodes if node["name"] == name)
+    docker = run.record["docker"]  # None where the engine had gone away
+    image = docker["images"][container]["name"] if docker else container
     return f"the node ran in image {image} with {', '.join(rows[:_FEW])}{more}"

@@ -21,6 +21,7 @@ from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.run_processes import RUN_ID
 from neuros.launch.shared_memory import remove_segments, sweep
+from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 
 SHM = Path("/dev/shm")
 PORT = ("fastrtps_port7411", "fastrtps_port7411_el", "sem.fastrtps_port7411_mutex")
@@ -152,7 +153,10 @@ class RosNode:
     """A process with a real ROS node: a talker, or a listener that prints what it hears."""
 
     def __init__(self, name: str, domain: int, run_id: str = "") -> None:
-        environment = {**os.environ, **({RUN_ID: run_id} if run_id else {})}
+        # NeuROS's own settings, where a test before this has taken them on, do without this memory.
+        unwanted = (PROFILES_VARIABLE, RANGE_VARIABLE)
+        environment = {key: value for key, value in os.environ.items() if key not in unwanted}
+        environment |= {RUN_ID: run_id} if run_id else {}
         self.process = subprocess.Popen(
             [sys.executable, "-c", NODE, name, str(domain)],
             stdout=subprocess.PIPE,

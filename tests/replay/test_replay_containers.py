@@ -16,7 +16,8 @@ def versions(python: str = "3.11.2", **packages: str) -> dict[str, Any]:
 def run(in_image: dict[str, Any] | None, of_launcher: dict[str, Any]) -> PastRun:
     record = {
         "backend": "docker",
-        "nodes": {"snn": {"image": {"name": "neuros_nest:1"}}},
+        "expanded_project": {"nodes": [{"name": "snn", "container": "neuros_nest"}]},
+        "docker": {"images": {"neuros_nest": {"name": "neuros_nest:1"}}},
         "versions": {**of_launcher, "nodes": {} if in_image is None else {"snn": in_image}},
     }
     return PastRun(Path("/runs/1"), record)
