@@ -83,15 +83,19 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
         sender, receiver = connection.source_node, connection.destination_node
         if sender not in probes or receiver not in probes:
             continue
-        outgoing = probes[sender]["ledger"]["outgoing"][key]
-        if outgoing["is_blocked"]:
-            outstanding = outgoing["outstanding"]
-            result[sender][receiver] = f"is blocked on `{key}` ({outstanding} outstanding)"
         state = probes[receiver]["ledger"]["state"]
-        if state["state"] == "waiting" and state["cause"] == connection.destination_input:
-            result[receiver].setdefault(
-                sender, f"waits for `{connection.destination_input}` from {sender}"
+        is_waiting = state["state"] == "waiting"
+        outgoing = probes[sender]["ledger"]["outgoing"][key]
+        # A packet to itself stays unread for as long as the node waits for another input: then
+        # it is that input that it lacks.
+        if outgoing["is_blocked"] and not (sender == receiver and is_waiting):
+            outstanding = outgoing["outstanding"]
+            result[sender].setdefault(
+                receiver, f"is blocked on `{key}` ({outstanding} outstanding)"
             )
+        is_cause = is_waiting and state["cause"] == connection.destination_input
+        if is_cause and not probes[receiver]["ledger"]["incoming"][key]["unread"]:
+            result[receiver][sender] = f"waits for `{connection.destination_input}` from {sender}"
     return result
 
 

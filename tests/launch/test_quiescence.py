@@ -145,11 +145,41 @@ def test_a_ring_of_full_connections_is_named_with_its_connections() -> None:
 def test_a_ring_of_missing_inputs_is_named_with_the_inputs() -> None:
     a, b = sender(AB, 0, 0), sender(BA, 0, 0)
     for node, source in ((a, BA), (b, AB)):
-        node["ledger"]["incoming"][str(source)] = {"received": 0, "acknowledged": 0}
+        node["ledger"]["incoming"][str(source)] = {"received": 0, "acknowledged": 0, "unread": 0}
         node["ledger"]["state"] = {"state": "waiting", "cause": "x"}
     assert cycle(waits({"a": a, "b": b}, [AB, BA])) == [
         ("a", "waits for `x` from b"),
         ("b", "waits for `x` from a"),
+    ]
+
+
+def test_who_has_delivered_is_not_waited_for_nor_a_packet_to_itself() -> None:
+    """a takes all of b and c, and its own; only c's is missing, and c is blocked on b."""
+    own, from_b, from_c = wire("a.o -> a.own"), wire("b.o -> a.x", index=1), wire("c.o -> a.x")
+    to_b, missing = wire("c.o -> b.y"), wire("a.o -> b.z")
+    full = {"sent": 1, "acknowledged": 0, "outstanding": 1, "is_blocked": True}
+    free = {"sent": 1, "acknowledged": 1, "outstanding": 0, "is_blocked": False}
+    unread, none = {"unread": 1}, {"unread": 0}
+    a = probe(
+        ledger={
+            "outgoing": {str(own): full, str(missing): free},
+            "incoming": {str(own): unread, str(from_b): unread, str(from_c): none},
+            "state": {"state": "waiting", "cause": "x"},
+        }
+    )
+    b = probe(
+        ledger={
+            "outgoing": {str(from_b): full},
+            "incoming": {str(to_b): unread, str(missing): none},
+            "state": {"state": "waiting", "cause": "z"},
+        }
+    )
+    c = probe(ledger={"outgoing": {str(from_c): free, str(to_b): full}})
+    graph = waits({"a": a, "b": b, "c": c}, [own, from_b, from_c, to_b, missing])
+    assert cycle(graph) == [
+        ("a", "waits for `x` from c"),
+        ("c", "is blocked on `c.o -> b.y` (1 outstanding)"),
+        ("b", "waits for `z` from a"),
     ]
 
 

@@ -1,4 +1,8 @@
-"""Sees votes as they come; one of its two inputs never gets any."""
+"""Sees votes as they come, and those of the other voter that are there by then.
+
+The others may be late, also for the last vote: with room for fewer than all of them their sender
+could wait for this node, and this node for the next vote, for ever.
+"""
 
 from neuros.hooks import All, Optional, neuros_finalise, neuros_function, neuros_initialise
 
