@@ -9,15 +9,14 @@ one a reading of the clock. An entry costs some 0.1 us.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from neuros.core.effects import Effects
 from neuros.core.engine import Engine
 from neuros.core.hook import Hook
-from neuros.hooks import HookKind, HookSpec
-from neuros.project.model import Connection, Node
+from neuros.hooks import HookKind
+from neuros.project.model import Connection
 
 _KIND_BITS, _PLACE_BITS = 4, 20
 _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
@@ -50,22 +49,18 @@ class Event(NamedTuple):
 
 
 class JournalledEngine(Engine):
-    """Notes what happens to it in :attr:`journal`, until somebody takes the entries away."""
+    """Notes what happens to it in :attr:`journal`, until somebody takes the entries away.
 
-    def __init__(
-        self,
-        node: Node,
-        connections: Sequence[Connection],
-        specs: Sequence[HookSpec],
-        effects: Effects,
-        clock: Callable[[], int],
-        packet_types: Mapping[str, type] | None = None,
-    ) -> None:
+    Its arguments are those of :class:`Engine`.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        node, connections, specs, effects, clock, types = arguments
         self.journal = array("q")
         self._note = self.journal.append
         has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
         own_clock = self._noting(clock) if has_ticks else clock
-        super().__init__(node, connections, specs, effects, own_clock, packet_types)
+        super().__init__(node, connections, specs, effects, own_clock, types)
         self._hook_entries = {
             hook: _entry(What.HOOK, place) for place, hook in enumerate(self.all_hooks)
         }

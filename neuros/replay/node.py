@@ -173,7 +173,7 @@ class ReplayedNode:
     def _fail(self, _: str, error: NeurosError) -> None:
         self.failure = error
         if not is_quit(error):
-            self._runtime.log_failure(error)
+            self._runtime.failures.log(error)
 
 
 def _has_threads() -> bool:

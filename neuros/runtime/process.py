@@ -18,6 +18,7 @@ from neuros.errors import NeurosError, NodeError
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
+from neuros.runtime.failures import as_node_error
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.plugin import describe, plugin_traceback
 from neuros.runtime.scope import Stage
@@ -114,7 +115,7 @@ class NodeProcess:
         is_idle = not self._middleware.loop.has_waiting_events
         has_free_threads = self._has_free_threads()
         for node in self._nodes:
-            fields = node.probe()
+            fields = node.reports.probe()
             # A thread of a plugin may submit packets, or end the project, at any time.
             fields["is_wakeable"] = fields["is_wakeable"] or has_free_threads
             self._tell("report", **fields, probe=number, is_idle=is_idle)
@@ -122,14 +123,14 @@ class NodeProcess:
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
-            node.write_books()
-            self._tell("report", **node.report(), is_final=is_final)
+            node.reports.write_books()
+            self._tell("report", **node.reports.state(), is_final=is_final)
 
     def explain(self) -> None:
         """Report why nothing moves, but for nodes whose hook runs. Any thread."""
         for node in tuple(self._nodes):
             if node.engine is None or node.engine.executing is None:
-                self._tell("explanation", node=node.name, lines=node.explain())
+                self._tell("explanation", node=node.name, lines=node.reports.explain())
 
     def say(self, text: str) -> None:
         """Pass on to nodes elsewhere what the launcher says. Any thread."""
@@ -215,7 +216,7 @@ class NodeProcess:
         self._has_failed = True
         node = next((node for node in self._nodes if node.name == name), None)
         if node is not None:
-            node.log_failure(error)
+            node.failures.log(error)
         else:  # there is no logger yet
             traceback.print_exception(error, file=sys.stderr)
         self._tell(
@@ -230,7 +231,8 @@ class NodeProcess:
     def _fail_outside_hooks(self, error: BaseException) -> None:
         """A callback that a plugin registered with ROS has failed, or NeuROS itself."""
         if not self._nodes:
-            self._fail(self._files[0].node.name, _as_neuros_error(error))
+            known = error if isinstance(error, NeurosError) else as_node_error(error)
+            self._fail(self._files[0].node.name, known)
             return
         names = set(_filenames(error))
         suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
@@ -249,14 +251,6 @@ def _keep_for_good() -> None:
     """
     gc.collect()
     gc.freeze()
-
-
-def _as_neuros_error(error: BaseException) -> NeurosError:
-    if isinstance(error, NeurosError):
-        return error
-    wrapped = NodeError(describe(error))
-    wrapped.__cause__ = error
-    return wrapped
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

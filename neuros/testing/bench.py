@@ -163,7 +163,7 @@ class NodeBench:
 
     def explain(self) -> list[str]:
         """Why nothing moves, in the words of the stall explainer."""
-        return self._runtime.explain()
+        return self._runtime.reports.explain()
 
     # ------------------------------------------------------------------ inside
 

@@ -1,0 +1,91 @@
+"""What a node says of itself: to the supervisor, in its log, and in its books."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from neuros.core.engine import Engine
+from neuros.core.explain import explain
+from neuros.core.ledger import snapshot
+from neuros.ports import Logger, Middleware, Transport
+from neuros.project.model import NodeFile
+from neuros.runtime.effects import NodeEffects
+from neuros.runtime.packet_books import PacketBooks
+from neuros.runtime.simulated_time import SimulatedTime
+
+
+class NodeReports:
+    """State and counters of one running node.
+
+    Args:
+        clock: monotonic clock in nanoseconds.
+    """
+
+    def __init__(
+        self,
+        file: NodeFile,
+        middleware: Middleware,
+        transport: Transport,
+        time: SimulatedTime,
+        effects: NodeEffects,
+        clock: Callable[[], int],
+    ) -> None:
+        self._file = file
+        self._middleware = middleware
+        self._transport = transport
+        self._time = time
+        self._effects = effects
+        self._clock = clock
+        self._engine: Engine | None = None
+        self._books: PacketBooks | None = None
+
+    def open(self, engine: Engine, logger: Logger) -> None:
+        """There is an engine to report of; what is special about it is logged."""
+        self._engine = engine
+        folder = self._file.folders.run / self._file.node.name
+        self._books = PacketBooks(engine, self._transport.digests, folder)
+        for hook in engine.free_running_hooks():
+            logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
+        for inlet in engine.untaken_inlets():
+            logger.warning(
+                f"no hook takes input '{inlet.input_name}': packets on {inlet.name} are"
+                " acknowledged on arrival and dropped"
+            )
+
+    def write_books(self) -> None:
+        """Write out when packets were sent and taken. Any thread."""
+        if self._books is not None:
+            self._books.write()
+
+    def state(self) -> dict[str, Any]:
+        """State and counters. Any thread."""
+        now_ns, engine = self._clock(), self._engine
+        return {
+            "node": self._file.node.name,
+            "has_run": self._effects.has_run,
+            "waiting_for": [str(each) for each in self._transport.waiting_for()],
+            **self._time.report(now_ns),
+            "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
+            "ledger": None if engine is None else snapshot(engine, now_ns),
+            "fault": None if self._books is None else self._books.failure,
+        }
+
+    def probe(self) -> dict[str, Any]:
+        """The state with what only a moment between two events can tell. Loop thread only."""
+        engine = self._engine
+        assert engine is not None
+        return {
+            **self.state(),
+            "is_startable": engine.has_startable_packet,
+            "is_wakeable": engine.is_wakeable
+            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
+            "is_running": engine.is_running,
+        }
+
+    def explain(self) -> list[str]:
+        """Why nothing moves here. Any thread."""
+        engine = self._engine
+        if engine is None:
+            return [f"imports its plugin {self._file.node.plugin.name}"]
+        return explain(engine, self._clock())

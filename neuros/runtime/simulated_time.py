@@ -1,0 +1,74 @@
+"""Simulated time of a node: where it comes from, how it goes on, and when it is over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from neuros.project.model import Node
+from neuros.runtime.timeline import Timeline
+
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+
+
+class SimulatedTime:
+    """The time of a simulator that the node owns, or else of a clock that it publishes.
+
+    Args:
+        duration_s: when a node that owns time ends the project, ``None``: never.
+        clock: monotonic clock in nanoseconds.
+        on_over: called once with the duration when it has passed.
+
+    Attributes:
+        is_watched: whether the node owns time, so that :meth:`look` is wanted after each hook.
+        clock_outputs: the outputs whose packets :meth:`hear` wants.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        duration_s: float | None,
+        clock: Callable[[], int],
+        on_over: Callable[[float], None],
+    ) -> None:
+        self.is_watched = node.owns_time
+        self.clock_outputs = {port.name for port in node.outputs if port.type == CLOCK_TYPE}
+        self._duration_s = duration_s if node.owns_time else None
+        self._clock = clock
+        self._on_over = on_over
+        self._timeline = Timeline()
+        self._read_s: Callable[[], float] | None = None
+
+    @property
+    def now_s(self) -> float | None:
+        """Simulated seconds, ``None`` where nobody tells them."""
+        return None if self._read_s is None else self._read_s()
+
+    def own(self, read_s: Callable[[], float]) -> None:
+        """Take it from a simulator, rather than from a clock that the node publishes."""
+        self._read_s = read_s
+        self.clock_outputs.clear()
+
+    def hear(self, packet: Any) -> None:
+        """A clock was published."""
+        seconds = packet.clock.sec + packet.clock.nanosec * 1e-9
+        self._read_s = lambda: seconds
+        if self.is_watched:
+            self.look()
+
+    def look(self) -> None:
+        """It may have gone on; it may be over."""
+        time_s = self.now_s
+        if time_s is None:
+            return
+        self._timeline.note(time_s, self._clock() / 1e9)
+        if self._duration_s is not None and time_s >= self._duration_s - 1e-9:
+            duration_s, self._duration_s = self._duration_s, None
+            self._on_over(duration_s)
+
+    def report(self, now_ns: int) -> dict[str, Any]:
+        """The time, and the points ``(simulated, wall)`` since this was last asked. Any thread."""
+        time_s = self.now_s
+        if self.is_watched and time_s is not None:
+            self._timeline.note(time_s, now_ns / 1e9)
+        return {"sim_time": time_s, "timeline": self._timeline.take()}
