@@ -1,4 +1,4 @@
-"""Two machines for each test of this folder."""
+"""Two machines for the tests of this folder."""
 
 from __future__ import annotations
 
@@ -7,9 +7,34 @@ from collections.abc import Iterator
 import pytest
 from two_machines import TwoMachines, two_machines
 
+from containers import IMAGES, require_containers
 
-@pytest.fixture
-def machines() -> Iterator[TwoMachines]:
-    """Joined by a cable that loses nothing and lets multicast pass."""
+
+@pytest.fixture(scope="session")
+def joined() -> Iterator[TwoMachines]:
     with two_machines() as machines:
         yield machines
+
+
+@pytest.fixture(scope="session")
+def with_engines(joined: TwoMachines) -> Iterator[TwoMachines]:
+    require_containers(*IMAGES)
+    with joined.engines():
+        yield joined
+
+
+@pytest.fixture(params=["process", pytest.param("docker", marks=pytest.mark.acceptance)])
+def backend(request: pytest.FixtureRequest) -> str:
+    """What nodes run on: containers, too, among the long runs."""
+    return str(request.param)
+
+
+@pytest.fixture
+def machines(backend: str, request: pytest.FixtureRequest) -> Iterator[TwoMachines]:
+    """Joined by a cable that loses nothing and lets multicast pass."""
+    machines: TwoMachines = request.getfixturevalue(
+        "with_engines" if backend == "docker" else "joined"
+    )
+    yield machines
+    machines.repair()
+    assert not machines.containers()

@@ -1,4 +1,7 @@
-"""One project on two machines: how the sides find each other, what arrives, and how they end."""
+"""One project on two machines: how the sides find each other, what arrives, and how they end.
+
+In containers, too, with an engine on each machine; all but the first test of that are long runs.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,21 @@ ENDLESS = ("--set", "nodes.source.environment.COUNT=0")
 IMAGES = ("--set", "nodes.source.environment.SIZE=921600")
 BEST_EFFORT = ("--set", "connections.source.image.sink.image.discard_limit=")
 
+NETWORK = ("--network",)
+TO_RIGHT = ("--peers", ADDRESSES["right"])
+TO_LEFT = ("--peers", f"198.51.100.1,{ADDRESSES['left']}")  # and one that is not there
+
 Start = Callable[..., Running]
 
 
 @pytest.fixture
-def start(machines: TwoMachines, tmp_path: Path) -> Start:
+def start(machines: TwoMachines, backend: str, tmp_path: Path) -> Start:
     """``start("source", ...)`` on the left machine, ``start("sink", ...)`` on the right one."""
     sides = {"source": "left", "sink": "right"}
 
-    def start_node(node: str, *arguments: str, reach: tuple[str, ...] = ("--network",)) -> Running:
-        return machines.start(sides[node], STREAM, "-n", node, *reach, *arguments, cwd=tmp_path)
+    def start_node(node: str, *arguments: str, reach: tuple[str, ...] = NETWORK) -> Running:
+        options = ("-n", node, "--backend", backend, *reach, *arguments)
+        return machines.start(sides[node], STREAM, *options, cwd=tmp_path)
 
     return start_node
 
@@ -54,8 +62,16 @@ def assert_all_arrived(source: Finished, sink: Finished, count: int) -> None:
 # ------------------------------------------------------------------ finding each other
 
 
-def test_two_sides_find_each_other_and_end_together(start: Start) -> None:
-    with start("source") as source, start("sink") as sink:
+@pytest.mark.parametrize(
+    ("backend", "has_multicast"), [("process", True), ("docker", True), ("docker", False)]
+)
+def test_two_sides_find_each_other_and_end_together(
+    machines: TwoMachines, start: Start, backend: str, has_multicast: bool
+) -> None:
+    if not has_multicast:
+        machines.stop_multicast()
+    left, right = (NETWORK, NETWORK) if has_multicast else (TO_RIGHT, TO_LEFT)
+    with start("source", reach=left) as source, start("sink", reach=right) as sink:
         sink_ended, source_ended = sink.finish(FOUND_S), source.finish()
     assert_all_arrived(source_ended, sink_ended, 100)
     reason = "source ended the project: all sent"
@@ -63,17 +79,15 @@ def test_two_sides_find_each_other_and_end_together(start: Start) -> None:
     assert sink_ended.said("neuros")[-1] == f"the project ended elsewhere (left): {reason}"
     assert "found elsewhere: sink (right)" in source_ended.said("neuros")
     assert "found elsewhere: source (left)" in sink_ended.said("neuros")
+    assert source_ended.record["backend"] == sink_ended.record["backend"] == backend
 
 
 @pytest.mark.parametrize("first", ["source", "sink"])
-def test_without_multicast_by_peers_and_who_is_there_first_names_the_other(
+def test_without_multicast_who_is_there_first_names_the_other(
     first: str, machines: TwoMachines, start: Start
 ) -> None:
     machines.stop_multicast()
-    peers = {
-        "source": ("--peers", ADDRESSES["right"]),
-        "sink": ("--peers", f"198.51.100.1,{ADDRESSES['left']}"),  # and one that is not there
-    }
+    peers = {"source": TO_RIGHT, "sink": TO_LEFT}
     second = "sink" if first == "source" else "source"
     with start(first, reach=peers[first]) as one:
         one.wait_for(f"nodes elsewhere are still waited for: {second} (", FOUND_S)

@@ -19,10 +19,10 @@ LATE_MS = 50.0  # at most, for 95 of 100 packets at limit 0
 
 
 def test_at_limit_0_all_packets_arrive_and_nineteen_of_twenty_within_50_ms(
-    machines: TwoMachines, tmp_path: Path
+    machines: TwoMachines, backend: str, tmp_path: Path
 ) -> None:
     machines.lose(0.1)
-    count = ("--set", "nodes.source.environment.COUNT=2000", "--network")
+    count = ("--set", "nodes.source.environment.COUNT=2000", "--network", "--backend", backend)
     with (
         machines.start("left", STREAM, "-n", "source", *count, cwd=tmp_path) as source,
         machines.start("right", STREAM, "-n", "sink", *count, cwd=tmp_path) as sink,
@@ -39,14 +39,15 @@ def test_at_limit_0_all_packets_arrive_and_nineteen_of_twenty_within_50_ms(
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 @pytest.mark.parametrize("variant", ["project.json", "strict.json", "asynchronous.json"])
 def test_whiskeye_on_two_machines(
-    variant: str, loss: float, machines: TwoMachines, tmp_path: Path
+    variant: str, loss: float, machines: TwoMachines, backend: str, tmp_path: Path
 ) -> None:
     if loss:
         machines.lose(loss)
-    here, there = ("-n", "robot", "--network"), ("-n", "snn", "-n", "visualiser", "--network")
+    here, there = ("-n", "robot"), ("-n", "snn", "-n", "visualiser")
+    common = ("--network", "--backend", backend)
     with (
-        machines.start("left", WHISKEYE / variant, *here, cwd=tmp_path) as robot,
-        machines.start("right", WHISKEYE / variant, *there, cwd=tmp_path) as rest,
+        machines.start("left", WHISKEYE / variant, *here, *common, cwd=tmp_path) as robot,
+        machines.start("right", WHISKEYE / variant, *there, *common, cwd=tmp_path) as rest,
     ):
         ended = [rest.finish(PATIENCE_S), robot.finish(PATIENCE_S)]
     for finished in ended:

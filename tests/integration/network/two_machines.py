@@ -1,57 +1,47 @@
-"""Two network namespaces joined by a cable (a veth pair): two machines, as far as DDS can tell.
+"""Two machines joined by a cable: network namespaces and a veth pair, as far as DDS can tell.
 
 Each has addresses of its own (192.0.2.1 and 192.0.2.2, which are reserved for such ends: RFC 5737),
-a host name, and shared memory of its own. Nothing outside the namespaces is touched. It takes root.
+a host name, shared memory, and an engine of its own where a test asks for one.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from docker import DockerClient
+from engines import OwnEngine, own_engine
 from launching import Running, start
+from machines import Machine, require_machines, run
 
 ADDRESSES = {"left": "192.0.2.1", "right": "192.0.2.2"}
-_INSIDE = 'mount -t tmpfs tmpfs /dev/shm && hostname "$0" && exec "$@"'
+CABLE = "cable"
 
 
 class TwoMachines:
     """``left`` and ``right``, and the cable between them."""
 
-    def __init__(self) -> None:
-        self._namespaces = {side: f"neuros-{os.getpid()}-{side}" for side in ADDRESSES}
-        self._ends = {side: f"v{os.getpid()}{side[0]}" for side in ADDRESSES}
+    def __init__(self, machines: Mapping[str, Machine]) -> None:
+        self._machines = machines
+        self._engines: Mapping[str, OwnEngine] = {}
+        left, right = (machine.pid for machine in machines.values())
+        link = f"ip link add {CABLE} netns {left} type veth peer name {CABLE} netns {right}"
+        run(*link.split())
+        for side, machine in machines.items():
+            machine.run("ip", "address", "add", f"{ADDRESSES[side]}/24", "dev", CABLE)
+            machine.run("ip", "link", "set", "lo", "up")
+        self.repair()
 
-    def try_to_set_up(self) -> str | None:
-        """Make all of it; says why, if that is impossible (root in a container may not)."""
-        try:
-            self._set_up()
-        except AssertionError as error:
-            return str(error)
-        return None
-
-    def _set_up(self) -> None:
-        for name in self._namespaces.values():
-            run("ip", "netns", "add", name)
-        end, other = self._ends.values()
-        here, there = self._namespaces.values()
-        run(*f"ip link add {end} netns {here} type veth peer name {other} netns {there}".split())
-        for side, address in ADDRESSES.items():
-            ip = ("ip", "-n", self._namespaces[side])
-            run(*ip, "addr", "add", f"{address}/24", "dev", self._ends[side])
-            run(*ip, "link", "set", "lo", "up")
-            run(*ip, "link", "set", self._ends[side], "up")
-            run(*ip, "route", "add", "default", "dev", self._ends[side])
-
-    def remove(self) -> None:
-        for name in self._namespaces.values():
-            if Path("/run/netns", name).exists():
-                run("ip", "netns", "del", name)  # the cable goes with it
+    def repair(self) -> None:
+        """The cable is in, loses nothing, and lets multicast pass."""
+        for machine in self._machines.values():
+            machine.run("iptables", "--flush", "INPUT")
+            machine.run("ip", "link", "set", CABLE, "up")
+        for machine in self._machines.values():
+            machine.run("ip", "route", "replace", "default", "dev", CABLE)
 
     def lose(self, share: float) -> None:
         """Lose this share of what arrives, at both ends."""
@@ -63,7 +53,17 @@ class TwoMachines:
 
     def unplug(self) -> None:
         """Pull the cable."""
-        run("ip", "-n", self._namespaces["left"], "link", "set", self._ends["left"], "down")
+        self._machines["left"].run("ip", "link", "set", CABLE, "down")
+
+    @contextmanager
+    def engines(self) -> Iterator[None]:
+        """An engine on each of them, with the images of the engine for tests."""
+        with ExitStack() as stack:
+            self._engines = {
+                side: stack.enter_context(own_engine(machine))
+                for side, machine in self._machines.items()
+            }
+            yield
 
     def start(
         self, side: str, project: Path, *arguments: str, cwd: Path, **environment: str
@@ -71,38 +71,36 @@ class TwoMachines:
         """``neuros launch PROJECT ARGUMENTS`` on one of them; run folders are in ``cwd/SIDE``."""
         folder = cwd / side
         folder.mkdir(exist_ok=True)
-        enter = ["ip", "netns", "exec", self._namespaces[side], "unshare", "--mount", "--uts"]
-        inside = [*enter, "sh", "-c", _INSIDE, side]
+        if side in self._engines:
+            environment = {"DOCKER_HOST": self._engines[side].address, **environment}
+        inside = self._machines[side].inside(folder)
         return start(project, *arguments, cwd=folder, through=inside, **environment)
 
+    def containers(self) -> list[str]:
+        """What the engines have, running or not."""
+        found: list[str] = []
+        for engine in self._engines.values():
+            client: DockerClient = engine.connect()
+            found += [container.name for container in client.containers.list(all=True)]
+            client.close()
+        return found
+
     def _filter(self, *rule: str) -> None:
-        for side, name in self._namespaces.items():
-            enter = ("ip", "netns", "exec", name)
-            run(*enter, "iptables", "-A", "INPUT", "-i", self._ends[side], *rule, "-j", "DROP")
-
-
-def run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{' '.join(command)}: {done.stderr}"
-
-
-def why_not() -> str | None:
-    """What is missing for this, if anything is."""
-    if os.geteuid() != 0:
-        return "two network namespaces take root"
-    missing = [tool for tool in ("ip", "iptables", "unshare") if shutil.which(tool) is None]
-    return f"there is no {', '.join(missing)}" if missing else None
+        for machine in self._machines.values():
+            machine.run("iptables", "-A", "INPUT", "-i", CABLE, *rule, "-j", "DROP")
 
 
 @contextmanager
 def two_machines() -> Iterator[TwoMachines]:
     """Made, and removed; skips the test where that is impossible, but in CI it has to be."""
-    machines = TwoMachines()
-    try:
-        reason = why_not() or machines.try_to_set_up()
-        if reason is not None and os.environ.get("CI") != "true":
-            pytest.skip(reason)
-        assert reason is None, reason
-        yield machines
-    finally:
-        machines.remove()
+    require_machines("ip", "iptables")
+    with ExitStack() as stack:
+        try:
+            machines = {
+                side: stack.enter_context(Machine(side, own_network=True)) for side in ADDRESSES
+            }
+        except RuntimeError as error:
+            if os.environ.get("CI") == "true":
+                raise
+            pytest.skip(str(error))
+        yield TwoMachines(machines)

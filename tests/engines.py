@@ -1,0 +1,126 @@
+"""Docker engines of a test's own: on another machine, on a small disk, or to be killed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from docker import DockerClient
+from machines import Machine
+
+from containers import connected, wait_until
+from neuros.errors import EnvironmentFault
+from neuros.launch.docker.engine import connect
+
+_SOON_S = 30.0
+
+
+class OwnEngine:
+    """A daemon on a machine, with its data on a disk in memory that goes with that machine.
+
+    Attributes:
+        address: what ``DOCKER_HOST`` is to be.
+    """
+
+    def __init__(self, machine: Machine, folder: Path, disk: str) -> None:
+        self.address = f"unix://{folder / 'docker.sock'}"
+        self._machine, self._folder = machine, folder
+        self._daemon: subprocess.Popen[bytes] | None = None
+        (folder / "data").mkdir()
+        machine.run("mount", "-t", "tmpfs", "-o", f"size={disk}", "tmpfs", str(folder / "data"))
+
+    @property
+    def data(self) -> Path:
+        """The folder with its data, as it is reached from this machine."""
+        return Path(f"/proc/{self._machine.pid}/root{self._folder}/data")
+
+    def start(self) -> None:
+        """Start the daemon, and wait until it answers."""
+        folder = self._folder
+        options = {
+            "host": self.address,
+            "data-root": folder / "data",
+            "exec-root": folder / "exec",
+            "pidfile": folder / "pid",
+            "iptables": "false",
+            "bridge": "none",
+        }
+        with (folder / "log").open("ab") as log:
+            self._daemon = subprocess.Popen(
+                [
+                    *self._machine.inside(),
+                    *("setpriv", "--pdeathsig", "TERM"),  # it ends with this process
+                    *("dockerd", *(f"--{name}={value}" for name, value in options.items())),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        wait_until(self._answers, _SOON_S)
+
+    def connect(self) -> DockerClient:
+        """A client, which the caller closes."""
+        return connect({"DOCKER_HOST": self.address})
+
+    def kill(self) -> None:
+        """End the daemon with SIGKILL; its containers run on."""
+        assert self._daemon is not None
+        self._daemon.kill()
+        self._daemon.wait()
+
+    def stop(self) -> None:
+        """End the daemon, and its containers with it."""
+        if self._daemon is not None and self._daemon.poll() is None:
+            self._daemon.terminate()
+            self._daemon.wait(_SOON_S)
+
+    def _answers(self) -> bool:
+        assert self._daemon is not None
+        if self._daemon.poll() is not None:
+            raise RuntimeError((self._folder / "log").read_text()[-2000:])
+        try:
+            self.connect().close()
+        except EnvironmentFault:
+            return False
+        return True
+
+
+@contextmanager
+def own_engine(
+    machine: Machine, *, disk: str = "1g", has_images: bool = True
+) -> Iterator[OwnEngine]:
+    """An engine at work, with the images of the engine for tests; it is ended in the end."""
+    folder = Path(tempfile.mkdtemp(prefix="neuros-engine-"))  # short: it holds sockets
+    engine = OwnEngine(machine, folder, disk)
+    try:
+        if has_images:
+            _lend_images(engine.data)
+        engine.start()
+        yield engine
+    finally:
+        engine.stop()
+        machine.run("umount", str(folder / "data"))
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _lend_images(folder: Path) -> None:
+    """Let a daemon that has not yet run have the images of the engine for tests, in no time.
+
+    ``docker save | docker load`` takes half a minute. Layers never change, so links to them do.
+    """
+    with connected() as engine:
+        facts = engine.info()
+    lender = Path(facts["DockerRootDir"])
+    assert facts["Driver"] == "overlay2", f"no layers can be lent from {facts['Driver']}"
+    shutil.copytree(lender / "image", folder / "image", symlinks=True)
+    layers = folder / "overlay2"
+    layers.mkdir(mode=0o710)
+    for layer in (lender / "overlay2").iterdir():
+        if layer.name == "l":  # short names, as links
+            shutil.copytree(layer, layers / "l", symlinks=True)
+        else:
+            (layers / layer.name).symlink_to(layer)

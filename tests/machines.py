@@ -1,0 +1,89 @@
+"""Machines within this one: namespaces of their own for mounts, host name and network.
+
+Each has shared memory of its own, too. Nothing outside of them is touched, and they are gone with
+the process that holds them. It takes root.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from types import TracebackType
+
+import pytest
+
+_HOLD = 'mount -t tmpfs tmpfs /dev/shm && hostname "$0" && echo ready && exec cat'
+
+
+class Machine:
+    """A machine called ``name``; its network is this machine's, or one without any cable.
+
+    Raises:
+        RuntimeError: if that is impossible here (root in a container may not).
+    """
+
+    def __init__(self, name: str, *, own_network: bool = False) -> None:
+        namespaces = ["--mount", "--uts", *(["--net"] if own_network else [])]
+        # It reads until the test closes the pipe, or has ended in whatever way.
+        self._holder = subprocess.Popen(
+            ["unshare", *namespaces, "sh", "-c", _HOLD, name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        assert self._holder.stdout is not None
+        if (said := self._holder.stdout.readline()) != b"ready\n":
+            self.close()
+            raise RuntimeError(f"no namespaces: {said.decode().strip()}")
+
+    @property
+    def pid(self) -> int:
+        """Of the process that holds the namespaces."""
+        return self._holder.pid
+
+    def inside(self, folder: Path = Path("/")) -> list[str]:
+        """The command that executes the one behind it there, with the same process id."""
+        return ["nsenter", f"--target={self.pid}", "--mount", "--uts", "--net", f"--wd={folder}"]
+
+    def run(self, *command: str) -> None:
+        """Run a command there, which must succeed."""
+        run(*self.inside(), *command)
+
+    def close(self) -> None:
+        """Leave it; processes that are still there keep it until they end."""
+        assert self._holder.stdin is not None
+        assert self._holder.stdout is not None
+        self._holder.stdin.close()
+        self._holder.stdout.close()
+        self._holder.wait()
+
+    def __enter__(self) -> Machine:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def run(*command: str) -> None:
+    """Run a command, which must succeed."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(command)}: {done.stderr}"
+
+
+def require_machines(*tools: str) -> None:
+    """Skip the test where it cannot have machines or these tools; in CI it has to."""
+    missing = [tool for tool in ("unshare", "nsenter", *tools) if shutil.which(tool) is None]
+    reason = f"there is no {', '.join(missing)}" if missing else ""
+    if os.geteuid() != 0:
+        reason = "machines within this one take root"
+    if reason and os.environ.get("CI"):
+        pytest.fail(reason)
+    if reason:
+        pytest.skip(reason)
