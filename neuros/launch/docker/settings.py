@@ -159,6 +159,7 @@ def _environment(
         **DEFAULTS,
         **{key: user.environ[key] for key in PASSED_ON if key in user.environ},
         "HOME": "/tmp",
+        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that go by the user's entry instead
         "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
         **(thread_limits([file.node]) if cores else {}),
         **node_environment(inside(file)),
