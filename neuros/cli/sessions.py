@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.launch.dead_runs import remove_dead_runs
 from neuros.launch.sessions import Session, sessions
 
 _SHOWN = 8  # digits of a run's id
@@ -69,6 +70,8 @@ def _stop(options: argparse.Namespace) -> int:
     _await_end(chosen)
     for session in chosen:
         print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
+    for name in remove_dead_runs():
+        print(f"removed {name} from shared memory: its run was killed, and its guardian, too")
     return 0
 
 

@@ -81,6 +81,7 @@ def _import_the_rest() -> None:
     with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
         import shutil  # noqa: F401
 
+        import neuros.launch.dead_runs
         import neuros.launch.domain
         import neuros.launch.leftover_containers
         import neuros.launch.shared_memory  # noqa: F401
@@ -97,6 +98,7 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
 
     from pathlib import Path
 
+    from neuros.launch.dead_runs import remove_dead_runs
     from neuros.launch.domain import remove_lock
     from neuros.launch.shared_memory import remove_segments, sweep
 
@@ -105,6 +107,7 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
     _remove(orders.paths)
     for descriptor, path in orders.locks:
         remove_lock(descriptor, Path(path))
+    remove_dead_runs()
 
 
 def _end_all(processes: RunProcesses, grace_s: float) -> None:

@@ -13,6 +13,7 @@ ordinary memory (Intel SDM, volume 3, "Memory Ordering"); elsewhere it is not us
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 import stat
@@ -216,6 +217,8 @@ def _create(folder: Path, owner: str, slots: int, slot_bytes: int) -> _Mapping:
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     descriptor = os.open(folder / name, flags, 0o600)
     try:
+        # Until this process unmaps it, or ends: whoever looks for leftovers can tell.
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
         # Room that is only promised would be missed later, by a SIGBUS in the midst of a copy.
         os.posix_fallocate(descriptor, 0, size)
         memory = mmap.mmap(descriptor, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)

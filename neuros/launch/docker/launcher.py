@@ -14,6 +14,7 @@ from typing import Any
 from docker import DockerClient
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.dead_runs import hold
 from neuros.launch.docker.container import RunningContainer
 from neuros.launch.docker.engine import connect, engine_faults
 from neuros.launch.docker.images import Image, images_for
@@ -94,6 +95,7 @@ class DockerLauncher:
             self._on_started(engine_socket(self._engine), folder)
         try:
             folder.mkdir(mode=0o700)
+            hold(folder)
         except OSError as error:
             raise EnvironmentFault(f"no shared memory for containers: {error}") from error
         with engine_faults("the engine's events cannot be listened to"):

@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         yield tmp_path
 
 
-@pytest.mark.parametrize("opengl", ["egl", "osmesa"])
+@pytest.mark.parametrize("opengl", ["egl", pytest.param("osmesa", marks=pytest.mark.acceptance)])
 def test_images_at_30_hz_arrive_whole_and_none_is_lost(folder: Path, opengl: str) -> None:
     finished = launch(CAMERA, "--backend", "docker", cwd=folder, timeout_s=60.0, MUJOCO_GL=opengl)
     assert finished.exit_code == 0, finished.output

@@ -97,7 +97,7 @@ def two_machines() -> Iterator[TwoMachines]:
     with ExitStack() as stack:
         try:
             machines = {
-                side: stack.enter_context(Machine(side, own_network=True)) for side in ADDRESSES
+                side: stack.enter_context(Machine(side, is_apart=True)) for side in ADDRESSES
             }
         except RuntimeError as error:
             if os.environ.get("CI") == "true":
