@@ -12,7 +12,8 @@ import json
 import os
 import signal
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from neuros.launch.run_processes import RunProcesses, environ_of, started_at
 
@@ -81,7 +82,12 @@ def _found() -> Iterator[Session]:
     for name in filter(str.isdigit, os.listdir("/proc")):
         for variable in environ_of(int(name)):
             if variable.startswith(mark):
-                fields = json.loads(variable.removeprefix(mark))
-                fields["nodes"] = tuple(fields["nodes"])
-                fields["launcher"] = tuple(fields["launcher"])
-                yield Session(**fields)
+                with contextlib.suppress(KeyError):  # of another version of NeuROS
+                    yield _session(json.loads(variable.removeprefix(mark)))
+
+
+def _session(described: Mapping[str, Any]) -> Session:
+    """What a guardian's environment describes; raises ``KeyError`` if something lacks."""
+    known = {field.name: described[field.name] for field in fields(Session)}
+    known |= {name: tuple(described[name]) for name in ("nodes", "launcher")}
+    return Session(**known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import signal
@@ -42,6 +43,21 @@ def session() -> Iterator[Session]:
     yield session
     guardian.finish()
     assert session not in sessions()
+
+
+def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) -> None:
+    ((variable, text),) = guardian_environment(session).items()
+    said = json.loads(text)
+    newer = {**said, "run": secrets.token_hex(8), "colour": "red"}
+    older = {"run": secrets.token_hex(8), "project": "demo"}
+    guardians = [
+        Guardian.start(each["run"], None, {variable: json.dumps(each)}) for each in (newer, older)
+    ]
+    runs = {each.run for each in sessions()}
+    for guardian in guardians:
+        guardian.finish()
+    assert newer["run"] in runs
+    assert older["run"] not in runs
 
 
 @pytest.fixture
