@@ -260,6 +260,10 @@ class RunningNode(Protocol):
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended: "exit code 1", "killed by SIGKILL"."""
 
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether what it ran in has gone (its engine), so that its node is not to blame."""
+
     def terminate(self) -> None:
         """Ask it to end (SIGTERM)."""
 

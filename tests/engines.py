@@ -69,8 +69,10 @@ class OwnEngine:
     def kill(self) -> None:
         """End the daemon with SIGKILL; its containers run on."""
         assert self._daemon is not None
+        part = Path("/proc", (self._folder / "exec/containerd/containerd.pid").read_text())
         self._daemon.kill()
         self._daemon.wait()
+        wait_until(lambda: not part.exists())  # it would be in the way of the next one
 
     def stop(self) -> None:
         """End the daemon, and its containers with it."""

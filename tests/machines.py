@@ -1,7 +1,7 @@
 """Machines within this one: namespaces of their own for mounts, host name and network.
 
-Each has shared memory of its own, too. Nothing outside of them is touched, and they are gone with
-the process that holds them. It takes root.
+Nothing outside of them is touched, and they are gone with the process that holds them. It takes
+root.
 """
 
 from __future__ import annotations
@@ -14,21 +14,25 @@ from types import TracebackType
 
 import pytest
 
-_HOLD = 'mount -t tmpfs tmpfs /dev/shm && hostname "$0" && echo ready && exec cat'
+_APART = 'mount -t tmpfs tmpfs /dev/shm && hostname "$0" && '
+_HOLD = "echo ready && exec cat"
 
 
 class Machine:
-    """A machine called ``name``; its network is this machine's, or one without any cable.
+    """A machine called ``name``.
+
+    Apart from this one it has a network without any cable, shared memory and its name to itself;
+    else it is this one, but for what is mounted.
 
     Raises:
         RuntimeError: if that is impossible here (root in a container may not).
     """
 
-    def __init__(self, name: str, *, own_network: bool = False) -> None:
-        namespaces = ["--mount", "--uts", *(["--net"] if own_network else [])]
+    def __init__(self, name: str, *, is_apart: bool = False) -> None:
+        namespaces = ["--mount", *(["--uts", "--net"] if is_apart else [])]
         # It reads until the test closes the pipe, or has ended in whatever way.
         self._holder = subprocess.Popen(
-            ["unshare", *namespaces, "sh", "-c", _HOLD, name],
+            ["unshare", *namespaces, "sh", "-c", _APART * is_apart + _HOLD, name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -71,9 +71,9 @@ class Ending:
         self._channels.send("drain")
         self._probing.drain(self._processes.killed, now_s)
 
-    def fail(self, reason: str) -> None:
+    def fail(self, reason: str, exit_code: int = 1) -> None:
         """End as failed, at once."""
-        self._outcome.fail(reason)
+        self._outcome.fail(reason, exit_code)
         if self.phase in (Phase.RUNNING, Phase.DRAINING):
             self._stop()
 

@@ -70,6 +70,10 @@ class HostProcess:
             return None
         return (script_failure(self._log) if code == 1 else None) or _in_words(code)
 
+    @property
+    def is_abandoned(self) -> bool:
+        return False
+
     def wait(self, timeout_s: float) -> str | None:
         """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
         with contextlib.suppress(subprocess.TimeoutExpired):

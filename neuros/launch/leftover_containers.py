@@ -26,7 +26,9 @@ def remove_containers(engine_socket: str, run_id: str, *, settle_s: float, give_
     """Kill and remove what carries the label of a run, until nothing does; how many are left.
 
     ``settle_s``: how long nothing must have been there, since what a killed launcher had asked
-    the engine for may still be on its way. After ``give_up_s`` seconds it ends in any case.
+    the engine for may still be on its way. With 0 it had ended by itself; then an engine that is
+    away is not waited for, since all nodes have ended. After ``give_up_s`` seconds it ends in any
+    case.
     """
     now_s = time.monotonic()
     give_up_at, clean_since = now_s + give_up_s, now_s
@@ -36,8 +38,11 @@ def remove_containers(engine_socket: str, run_id: str, *, settle_s: float, give_
             left = _containers(engine_socket, run_id)
             for container in left:
                 _request(engine_socket, "DELETE", f"/containers/{container}?force=1&v=1")
+        except (ConnectionRefusedError, FileNotFoundError):
+            if not settle_s:
+                break
         except (OSError, http.client.HTTPException, ValueError):
-            pass  # the engine is away, or busy: it may be back in a moment
+            pass  # it is busy, or just going away
         else:
             if not left and time.monotonic() - clean_since >= settle_s:
                 break

@@ -40,8 +40,8 @@ class Outcome:
     """How a run ended, and what its nodes said last.
 
     Attributes:
-        exit_code: 0 ended normally, 1 a node failed or deadlock, 4 what should have been recorded
-            could not be, 5 a budget was broken, 130 and 143 by signal.
+        exit_code: 0 ended normally, 1 a node failed or deadlock, 4 the engine went away or what
+            should have been recorded could not be, 5 a budget was broken, 130 and 143 by signal.
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.

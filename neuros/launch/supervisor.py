@@ -178,7 +178,8 @@ class Supervisor:
             is_stopping = self._ending.phase is Phase.STOPPING
             if not self._processes.may_end(process, is_stopping=is_stopping):
                 self._ending.fail(
-                    self._processes.how_it_failed(process, how, is_stopping=is_stopping)
+                    self._processes.how_it_failed(process, how, is_stopping=is_stopping),
+                    exit_code=4 if process.is_abandoned else 1,
                 )
 
     # ------------------------------------------------------------------ time

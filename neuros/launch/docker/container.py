@@ -67,6 +67,10 @@ class RunningContainer:
             return f"the Docker engine went away ({self._watch.lost}): start it again"
         return None
 
+    @property
+    def is_abandoned(self) -> bool:
+        return bool(self._watch.lost) and self._watch.end_of(self._id) is None
+
     def terminate(self) -> None:
         self._signal(signal.SIGTERM)
 
