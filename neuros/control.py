@@ -13,18 +13,45 @@ shutdown    when a plugin calls ``node.shutdown``                     node, reas
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines
 heard       from a node of another launcher; null: it is gone         node, text
+glimpse     in answer to ``look``                                     node, ... (see runtime)
 =========== ========================================================= =====================
 
-======= ================================================ ======
+======= ================================================ =================
 kind    sent by the supervisor                           fields
-======= ================================================ ======
+======= ================================================ =================
 probe   report between two events, all at one moment     number
 explain say why nothing moves
 drain   stop the hooks that send unasked
 stop    start no further hook, finalise and end
 say     let nodes elsewhere hear this (see launch.sides) text
 leave   all is said and heard: a node at its end may go
-======= ================================================ ======
+pause   start no further hook
+resume  go on
+step    while paused, go on by so many steps             count, is_driven
+look    show what you do; what to sample, by node        wanted
+======= ================================================ =================
+
+Onlookers (the dashboard) are on the same channel, and get no more than they ask for:
+
+======= ================================================ =================
+kind    sent by an onlooker                              fields
+======= ================================================ =================
+watch   it is there
+look    all nodes are to show what they do, once         wanted
+pause   the run stands still
+resume  the run goes on
+step    while it stands still, let it do so many steps   count
+end     end the run, drained, with exit code 0           reason
+======= ================================================ =================
+
+======= ================================================ =================
+kind    sent to onlookers                                fields
+======= ================================================ =================
+glimpse what a node does, passed on                      node, ...
+phase   where the run is in its life                     phase, is_paused
+log     what the launcher itself tells the user          severity, text
+ended   all nodes have ended                             exit_code, reason
+======= ================================================ =================
 """
 
 from __future__ import annotations

@@ -42,6 +42,7 @@ SUPERVISOR = (
     "supervisor",
     "channels",
     "ending",
+    "onlookers",
     "outcome",
     "probing",
     "processes",
@@ -63,6 +64,7 @@ ROOMS = (
     Room(4, ("transport",)),
     Room(4, ("simulators",)),
     Room(4, ("observe",)),
+    Room(4, ("dashboard",)),
     Room(5, ("runtime",)),
     Room(6, ("cli", "doctor", "replay")),
     Room(6, ("bag",)),
@@ -88,6 +90,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
     "observe.bag": {"rosbags", "numpy", "pandas"},
     "cli.bag": {"tabulate"},
+    "dashboard": {"starlette", "uvicorn"},
     "testing": {"pytest", "hypothesis"},
 }
 # The core is pure: no threads, no wall clock, no files.

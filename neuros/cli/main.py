@@ -27,6 +27,7 @@ from neuros import __version__
 from neuros.cli.bag import add_bag
 from neuros.cli.benchmark import add_benchmark
 from neuros.cli.containers import add_containers
+from neuros.cli.dashboard import add_dashboard, add_dashboard_options
 from neuros.cli.doctor import add_doctor
 from neuros.cli.network import add_network
 from neuros.cli.observation import add_observation
@@ -113,6 +114,7 @@ def parser() -> argparse.ArgumentParser:
     add_reproduce(commands)
     _add_node(commands)
     add_recorder(commands)
+    add_dashboard(commands)
     return result
 
 
@@ -167,6 +169,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         help="leave it to the kernel which node runs on which core; affinity has no effect",
     )
     add_observation(launch)
+    add_dashboard_options(launch)
     add_recording_options(launch)
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,6 +100,17 @@ def _monitor(
     from neuros.observe.load_table import LoadTable
     from neuros.observe.monitor import LoadMonitor
 
+    groups = [HOST] if is_one_process else list(names)
+    table = LoadTable([*groups, LAUNCHER], os.cpu_count() or 1)
+    meter = LoadMeter(owner_of_processes(run_id, names, is_one_process=is_one_process))
+    return LoadMonitor(run_folder, meter, table)
+
+
+def owner_of_processes(
+    run_id: str, names: Sequence[str], *, is_one_process: bool
+) -> Callable[[Mapping[str, str]], str | None]:
+    """What tells whose a process of a run is, by the environment that it was started with."""
+
     def owner(environment: Mapping[str, str]) -> str | None:
         if environment.get(RUN_ID) != run_id:
             return None
@@ -109,6 +120,4 @@ def _monitor(
         name = os.path.basename(environment.get("NEUROS_RUN_DIR", "").rstrip("/"))
         return name if name in names else None
 
-    groups = [HOST] if is_one_process else list(names)
-    table = LoadTable([*groups, LAUNCHER], os.cpu_count() or 1)
-    return LoadMonitor(run_folder, LoadMeter(owner), table)
+    return owner

@@ -1,4 +1,4 @@
-"""Where a node's wall time goes: executing, waiting for input, blocked by a receiver, or idle.
+"""Where a node's wall time goes: executing, waiting, blocked by a receiver, idle, or paused.
 
 Between two events nothing of a node changes, so the time between them has one cause, which is
 asked for once, when the next event arrives.
@@ -25,6 +25,7 @@ class State(str, Enum):
     BLOCKED = "blocked"
     IDLE = "idle"
     SCHEDULING = "scheduling"
+    PAUSED = "paused"
 
     __hash__ = str.__hash__  # time is booked at every event, and Enum's own is ten times slower
 
@@ -39,6 +40,7 @@ class Rest(NamedTuple):
 REGISTERING = Rest(State.REGISTERING)
 SCHEDULING = Rest(State.SCHEDULING)
 IDLE = Rest(State.IDLE)
+PAUSED = Rest(State.PAUSED)
 
 
 @dataclass

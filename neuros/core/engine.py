@@ -14,6 +14,7 @@ from typing import Any
 
 from neuros.core.accounting import (
     IDLE,
+    PAUSED,
     REGISTERING,
     SCHEDULING,
     Accounts,
@@ -23,6 +24,7 @@ from neuros.core.accounting import (
 )
 from neuros.core.effects import Effects
 from neuros.core.exchange import Exchange
+from neuros.core.gate import Gate, drives
 from neuros.core.hook import Hook, Source
 from neuros.core.inputs import Inlet
 from neuros.core.life import Life
@@ -76,6 +78,7 @@ class Engine:
         self._life = Life(self._schedule, self.outlets, clock)
         self._sources: dict[tuple[str, ...], Source] = {}
         self._ticks = [h for h in self.all_hooks if h.spec.kind is HookKind.TICK]
+        self._gate = Gate(self._life, self._ticks)
         self._has_posted_loop_back = False
         self._is_passing = False
         self.executing: Hook | None = None
@@ -147,6 +150,33 @@ class Engine:
         self._wake()
         self._life.drain()
         self._cause = self.rest()
+        if self._gate.is_closed:
+            self.resume()
+
+    def pause(self) -> None:
+        """Start no further hook until :meth:`resume`, but for initialise hooks and steps.
+
+        Where draining has begun it has no effect.
+        """
+        now_ns = self._wake()
+        if not self._life.is_draining:
+            self._gate.close(now_ns)
+        self._cause = self.rest()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._gate.open(self._wake())
+        self._pass()
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        """While paused, let each hook that starts unasked do so ``count`` times more.
+
+        The others answer what they receive; where nothing drives the project (``is_driven`` is
+        false), each hook starts so many times. See :mod:`neuros.core.gate`.
+        """
+        self._wake()
+        self._gate.grant(count, is_driven=is_driven)
+        self._pass()
 
     def stop_hooks(self) -> None:
         """Start no further hook, ever (what the running one returns is still sent). Any thread."""
@@ -170,13 +200,25 @@ class Engine:
         return self._life.is_stopped
 
     @property
+    def is_paused(self) -> bool:
+        """Whether hooks stand still, but for steps."""
+        return self._gate.is_closed
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether it has hooks that start unasked, and so keep a project going."""
+        return any(map(drives, tuple(self.all_hooks)))
+
+    @property
     def tick_start_ns(self) -> int:
-        """The end of initialisation, from which ticks are counted."""
+        """The end of initialisation, from which ticks are counted; pauses move it on."""
         return self._life.tick_start_ns
 
     @property
     def next_due_ns(self) -> int | None:
         """When :meth:`on_timer` is wanted next, on the clock that was given; ``None``: never."""
+        if self._gate.is_closed:
+            return None
         return min(
             (hook.due_ns for hook in self._ticks if hook.is_enabled and not hook.is_due),
             default=None,
@@ -222,6 +264,8 @@ class Engine:
             return Rest(State.EXECUTING, executing.name)
         if not self._life.has_begun:
             return REGISTERING
+        if self._gate.is_closed and not self.is_stopped:
+            return PAUSED
         cause = cause_of_rest(self._schedule.order)
         return IDLE if self.is_stopped and cause is SCHEDULING else cause
 
@@ -238,7 +282,7 @@ class Engine:
     def _pass(self) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life = self._life
+        life, gate = self._life, self._gate
         if not life.has_begun:
             return
         if self._schedule.candidates:
@@ -247,11 +291,13 @@ class Engine:
                 for hook in self._schedule.one_pass():
                     if life.is_stopped:
                         break
+                    if gate.is_closed and not gate.lets(hook):
+                        continue
                     if not hook.blocked or hook.can_send():
                         self._run(hook)
             finally:
                 self._is_passing = False
-        self._cause = self.rest() if life.is_stopped else self._schedule.cause_of_rest()
+        self._cause = self._cause_of_rest()
         if self._cause is SCHEDULING and not (self._has_posted_loop_back or life.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
@@ -260,7 +306,9 @@ class Engine:
         """Start a hook: move it to the end of the order, take its packets, send what it returns."""
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
-        if hook.ticks is not None:
+        if self._gate.is_closed:
+            self._gate.note(hook)
+        elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._life.tick_start_ns, start_ns)
         self.accounts.spend(SCHEDULING, start_ns - self.since_ns)
@@ -286,6 +334,14 @@ class Engine:
         elif hook.spec.kind is HookKind.INITIALISE:
             self._exchange.retire(hook)
             self._life.finish_initialiser(hook)
+
+    def _cause_of_rest(self) -> Rest:
+        if self._life.is_stopped:
+            return self.rest()
+        if self._gate.is_closed:
+            may_start = (self._gate.lets(h) and h.can_send() for h in self._schedule.candidates)
+            return SCHEDULING if any(may_start) else PAUSED
+        return self._schedule.cause_of_rest()
 
     def _add_source(self, names: tuple[str, ...]) -> Source:
         for name in names:

@@ -34,6 +34,8 @@ def _explain(engine: Engine, now_ns: int) -> list[str]:
         return [f"waits for these receivers to appear: {', '.join(missing)}"]
     if not engine.is_started:
         return ["has not been started yet"]
+    if engine.is_paused:
+        return ["is paused"]
     reasons = [
         reason for hook in engine.hooks() if hook.is_enabled for reason in _reasons(hook, now_ns)
     ]

@@ -167,6 +167,12 @@ class Hook:
         self.due_ns = start_ns + (ticks_passed + 1) * self.period_ns
         self.is_due = False
 
+    def postpone(self, duration_ns: int) -> None:
+        """For a tick: a time has passed that does not count."""
+        self.due_ns += duration_ns
+        if self.ticks is not None:
+            self.ticks.skip(duration_ns)
+
     def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
         """What the hook returned: the packets, each with its output.
 

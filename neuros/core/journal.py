@@ -37,6 +37,9 @@ class What(IntEnum):
     DRAIN = 9
     STOP = 10  # no further hook starts: the journal is whole
     HOOK = 11  # place: of the hook that starts, in the order of declaration
+    PAUSE = 12
+    RESUME = 13
+    STEP = 14  # place: 1 if some node of the project drives it; position: how many
 
 
 class Event(NamedTuple):
@@ -102,6 +105,19 @@ class JournalledEngine(Engine):
     def drain(self) -> None:
         self._note(_entry(What.DRAIN))
         super().drain()
+
+    def pause(self) -> None:
+        self._note(_entry(What.PAUSE))
+        super().pause()
+
+    def resume(self) -> None:
+        if not self._life.is_draining:  # a drain resumes by itself, here and in the replay
+            self._note(_entry(What.RESUME))
+        super().resume()
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        self._note(_entry(What.STEP, int(is_driven), count))
+        super().step(count, is_driven=is_driven)
 
     def stop_hooks(self) -> None:
         super().stop_hooks()

@@ -133,5 +133,6 @@ def _accounting(engine: Engine, hooks: tuple[Hook, ...], rest: Rest, now_ns: int
         "idle": in_all(State.IDLE),
         "registering": in_all(State.REGISTERING),
         "scheduling": in_all(State.SCHEDULING),
+        "paused": in_all(State.PAUSED),
         "total": sum(spent.values()) / 1e9,
     }

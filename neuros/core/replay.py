@@ -47,6 +47,9 @@ class Inbox(Protocol):
     def on_registered(self, connection: Connection) -> None: ...
     def on_timer(self) -> None: ...
     def drain(self) -> None: ...
+    def pause(self) -> None: ...
+    def resume(self) -> None: ...
+    def step(self, count: int, *, is_driven: bool) -> None: ...
     def stop(self) -> None: ...
 
 
@@ -159,11 +162,15 @@ class Player:
                 loop_back()
         elif what is What.OFFER:
             self._source.offer()
+        elif what is What.STEP:
+            self._inbox.step(event.position, is_driven=bool(event.place))
         else:
             {
                 What.START: self._inbox.start,
                 What.TIMER: self._inbox.on_timer,
                 What.DRAIN: self._inbox.drain,
+                What.PAUSE: self._inbox.pause,
+                What.RESUME: self._inbox.resume,
                 What.STOP: self._inbox.stop,
             }[what]()
 

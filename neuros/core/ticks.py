@@ -62,6 +62,11 @@ class TickBook:
                 self._within[place] += 1
         self._bins[min(interval_ns // _BIN_NS, _MOST_BINS)] += 1
 
+    def skip(self, duration_ns: int) -> None:
+        """A time has passed that is no part of an interval."""
+        if self._last_ns is not None:
+            self._last_ns += duration_ns
+
     def figures(self) -> dict[str, Any] | None:
         """Statistics of the intervals, ready for JSON; ``None`` before the second tick.
 

@@ -80,6 +80,10 @@ class Channels:
             self._ends[lines] += encode_line(kind, fields)
             self._flush(lines)
 
+    def has(self, lines: Lines) -> bool:
+        """Whether that one is still connected."""
+        return lines in self._ends
+
     def flush(self) -> None:
         """Try again to send what did not go through."""
         for lines, unsent in tuple(self._ends.items()):

@@ -47,16 +47,21 @@ class LogTail:
         files: the name to show, usually the node's, and the file, which need not exist yet.
         write: takes text of whole lines, with the line feed.
         colours: whether to colour; if not, colours that nodes write themselves go, too.
+        last_bytes: of what each file has now, begin with so many; ``None``: with all.
     """
 
     def __init__(
-        self, files: Mapping[str, Path], write: Callable[[str], None], colours: bool
+        self,
+        files: Mapping[str, Path],
+        write: Callable[[str], None],
+        colours: bool,
+        last_bytes: int | None = None,
     ) -> None:
         palette = {
             name: _NODE_COLOURS[index % len(_NODE_COLOURS)] for index, name in enumerate(files)
         }
         self._painter = _Painter(palette if colours else {})
-        self._files = [_GrowingFile(name, path) for name, path in files.items()]
+        self._files = [_GrowingFile(name, path, last_bytes) for name, path in files.items()]
         self._write = write
 
     def poll(self) -> bool:
@@ -135,10 +140,11 @@ def wants_colours(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 class _GrowingFile:
-    def __init__(self, name: str, path: Path) -> None:
+    def __init__(self, name: str, path: Path, last_bytes: int | None) -> None:
         self.name = name
         self.has_grown = False
         self._path = path
+        self._last_bytes = last_bytes
         self._descriptor: int | None = None
         self._rest = b""
         self._last_time_ns = 0
@@ -182,6 +188,9 @@ class _GrowingFile:
                 self._descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
             except OSError:
                 return b""
+            if self._last_bytes is not None:
+                size = os.fstat(self._descriptor).st_size
+                os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
         return os.read(self._descriptor, _READ_BYTES)
 
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from neuros.errors import EnvironmentFault
-from neuros.launch.host_command import host_environment
-from neuros.launch.wheels import with_libraries
+from neuros.launch.companion import start_companion
 
 END = b"end\n"
 """What the recorder is told when nothing more will come."""
 
-_NICENESS = 10
 _LOOK_S = 0.1
 
 
@@ -45,7 +41,7 @@ class RecorderProcess:
         self._command = list(command)
         self._run = run
         self._log = log
-        self._environment = with_libraries(host_environment(os.environ, environment))
+        self._environment = environment
         self._process = self._start()
 
     @property
@@ -73,22 +69,8 @@ class RecorderProcess:
         return recorded
 
     def _start(self) -> subprocess.Popen[bytes]:
-        try:
-            with open(self._log, "ab") as log:
-                process = subprocess.Popen(
-                    self._command,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    cwd=self._run,
-                    env=self._environment,
-                    start_new_session=True,
-                )
-        except OSError as error:
-            raise EnvironmentFault(f"the recorder cannot be started: {error}") from error
         # The nodes come first: what the recorder has not got to waits for it on the disk.
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-        return process
+        return start_companion("recorder", self._command, self._run, self._log, self._environment)
 
     def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
         """What it says, ``None`` if it ends without a word."""

@@ -16,6 +16,7 @@ from typing import Any
 from neuros.control import Lines
 from neuros.launch.channels import Channels
 from neuros.launch.ending import STOP_S, Ending
+from neuros.launch.onlookers import Onlookers, Overheard, Pause
 from neuros.launch.outcome import Outcome, Output, Phase
 from neuros.launch.probing import Probing, Verdict, connections_among
 from neuros.launch.processes import Processes
@@ -44,6 +45,10 @@ class Supervisor:
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
             hosts that end before they have connected, are seen a fifth of a second late.
 
+    Attributes:
+        pause: lets the run stand still.
+        onlookers: who watches it.
+
     Raises:
         EnvironmentFault: if there can be no control socket in the run folder.
     """
@@ -64,7 +69,7 @@ class Supervisor:
         self._files = files
         self._launcher = launcher
         self._environment = environment
-        self._output = output
+        self._output = output = Overheard(output, lambda *a, **k: self.onlookers.tell(*a, **k))
         self._duration_s = duration_s
         self._sides = sides or Sides("", (), files)
         names = [file.node.name for file in files]
@@ -90,6 +95,13 @@ class Supervisor:
             output,
             signals,
         )
+        self.pause = Pause(self._channels.send, time.monotonic)
+        self.onlookers = Onlookers(
+            self._channels,
+            self.pause,
+            lambda: self._watch.is_driven,
+            lambda reason: self._ending.drain(reason, STOP_S),
+        )
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
             "report": self._on_report,
@@ -98,6 +110,7 @@ class Supervisor:
             "failed": self._on_failed,
             "explanation": self._on_explanation,
             "heard": self._on_heard,
+            **self.onlookers.handlers,
         }
 
     def run(self) -> Outcome:
@@ -119,6 +132,7 @@ class Supervisor:
             for process in self._processes:
                 process.kill()
             self._hear()
+            self.onlookers.part(self.outcome)
             self._channels.close()
             self.outcome.elsewhere = self._sides.books()
             self.outcome.ended_s = time.monotonic()
@@ -137,6 +151,8 @@ class Supervisor:
         self._watch.greet(message["nodes"])
         if self._sides.exist:
             self._channels.send_to(lines, "say", text=self._sides.word)
+        if self.pause.is_on:
+            self._channels.send_to(lines, "pause")
         if self._ending.phase is not Phase.RUNNING:
             self._channels.send_to(lines, "stop")
 
@@ -191,18 +207,24 @@ class Supervisor:
         limit_s, started_s = self._duration_s, self.outcome.started_s
         if limit_s is None or started_s is None:
             return _QUIET_TICK_S
-        return min(_QUIET_TICK_S, max(0.0, started_s + limit_s - time.monotonic()))
+        end_s = started_s + limit_s + self.pause.total_s
+        return min(_QUIET_TICK_S, max(0.0, end_s - time.monotonic()))
 
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
         self._ending.heed_sides()
         self._ending.look(now_s)
+        self.onlookers.look_at(self._ending.phase)
         if self._ending.phase is Phase.RUNNING:
             self._look_at_run(now_s)
 
     def _look_at_run(self, now_s: float) -> None:
+        if self.pause.is_on:
+            self._watch.begin_anew(now_s)
+            return
         started_s, limit_s = self.outcome.started_s, self._duration_s
-        if limit_s is not None and started_s is not None and now_s - started_s >= limit_s:
+        running_s = None if started_s is None else now_s - started_s - self.pause.total_s
+        if limit_s is not None and running_s is not None and running_s >= limit_s:
             self._ending.drain(f"{limit_s:g} s are over", STOP_S)
             return
         for severity, text in (*self._watch.remarks(now_s), *self._sides.remarks(now_s)):

@@ -68,6 +68,16 @@ class Watch:
         """Whether all nodes have been loaded."""
         return not self._silent and all(map(self.is_loaded, self._names))
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether some node starts hooks with no packet for them."""
+        return any(report["is_driving"] for report in self._reports.values())
+
+    def begin_anew(self, now_s: float) -> None:
+        """Something has kept the nodes still that is no standstill of their own."""
+        self._moved_s = now_s
+        self._has_explained = False
+
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
         if any(self._executing(name) for name in self._reports):

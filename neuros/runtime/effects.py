@@ -15,6 +15,7 @@ from neuros.runtime.failures import Failures
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import describe
+from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
 
 
@@ -24,6 +25,7 @@ class NodeEffects:
     Args:
         enter: puts the surroundings of the node in place.
         keeper: where packets go that are recorded, ``None``: none are.
+        sampler: looks at packets for onlookers.
         on_first_hook: called before the first hook.
         on_initialised: called after each initialise hook.
 
@@ -39,6 +41,7 @@ class NodeEffects:
         failures: Failures,
         time: SimulatedTime,
         keeper: Keeper | None,
+        sampler: Sampler,
         *,
         enter: Callable[[], None],
         on_first_hook: Callable[[], object],
@@ -51,6 +54,7 @@ class NodeEffects:
         self._time = time
         self._clock_outputs = time.clock_outputs
         self._keeper = keeper
+        self._sampler = sampler
         self._enter = enter
         self._on_first_hook = on_first_hook
         self._on_initialised = on_initialised
@@ -88,6 +92,8 @@ class NodeEffects:
         """Send on connections to other nodes."""
         if self._clock_outputs and connections[0].source_output in self._clock_outputs:
             self._time.hear(packet)
+        if self._sampler.requests:
+            self._sampler.note(connections[0].source_output, packet)
         data = self._transport.send(connections, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
@@ -96,6 +102,8 @@ class NodeEffects:
         """Publish on an external topic."""
         if port.name in self._clock_outputs:
             self._time.hear(packet)
+        if self._sampler.requests:
+            self._sampler.note(port.name, packet)
         self._transport.send_external(port, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, port.name, packet)
@@ -114,6 +122,8 @@ class NodeEffects:
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
         """What the node gets on a connection to itself: it shares nothing with this packet."""
+        if self._sampler.requests:
+            self._sampler.note(connection.source_output, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.TO_ITSELF, str(connection), packet)
         return self._copy(packet)

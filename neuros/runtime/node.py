@@ -21,6 +21,7 @@ from neuros.runtime.host import NodeHost
 from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import load_plugin
 from neuros.runtime.reports import NodeReports
+from neuros.runtime.sampling import Sampler
 from neuros.runtime.scope import Stage
 from neuros.runtime.simulated_time import SimulatedTime
 
@@ -94,6 +95,7 @@ class NodeRuntime:
         if tap is not None:
             self._keeper = Keeper(tap, middleware.encode, self._time, self._logger)
             self._kept_on_arrival = self._keeper.wanted_on_arrival(file.connections)
+        self._sampler = Sampler()
         self._effects = NodeEffects(
             middleware,
             self._transport,
@@ -101,12 +103,13 @@ class NodeRuntime:
             self.failures,
             self._time,
             self._keeper,
+            self._sampler,
             enter=self._enter,
             on_first_hook=lambda: tell("first_hook", node=self.name),
             on_initialised=on_initialised,
         )
         self.reports = NodeReports(
-            file, middleware, self._transport, self._time, self._effects, clock
+            file, middleware, self._transport, self._time, self._effects, self._sampler, clock
         )
 
     @property
@@ -159,6 +162,18 @@ class NodeRuntime:
         """Stop the hooks that send unasked."""
         self._loaded.drain()
 
+    def pause(self) -> None:
+        """Start no further hook until :meth:`resume`."""
+        self._loaded.pause()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._guard(self._loaded.resume)
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        """While paused, let the hooks that drive the project start so many times more."""
+        self._guard(lambda: self._loaded.step(count, is_driven=is_driven))
+
     def stop(self) -> None:
         """Start no further hook. Any thread."""
         self._host.stop()
@@ -190,6 +205,8 @@ class NodeRuntime:
         """A packet has arrived on an external topic."""
         if self._keeper is not None:
             self._keeper.keep(Way.HEARD, port.name, packet)
+        if self._sampler.requests:
+            self._sampler.note(str(port.external_topic), packet)
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:

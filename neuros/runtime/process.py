@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,26 @@ class NodeProcess:
         """Stop the hooks that send unasked. Loop thread only."""
         for node in self._nodes:
             node.drain()
+
+    def pause(self) -> None:
+        """Start no further hook until :meth:`resume`. Loop thread only."""
+        for node in self._nodes:
+            node.pause()
+
+    def resume(self) -> None:
+        """Go on after a pause. Loop thread only."""
+        for node in self._nodes:
+            node.resume()
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        """While paused, go on by so many steps. Loop thread only."""
+        for node in self._nodes:
+            node.step(count, is_driven=is_driven)
+
+    def look(self, wanted: Mapping[str, Any]) -> None:
+        """Show onlookers what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
+        for node in tuple(self._nodes):
+            self._tell("glimpse", **node.reports.look(wanted.get(node.name, {})))
 
     def probe(self, number: int) -> None:
         """Report the state of all nodes at one moment. Loop thread only."""

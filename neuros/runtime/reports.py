@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from neuros.core.engine import Engine
@@ -11,7 +11,9 @@ from neuros.core.ledger import snapshot
 from neuros.ports import Logger, Middleware, Transport
 from neuros.project.model import NodeFile
 from neuros.runtime.effects import NodeEffects
+from neuros.runtime.glimpse import glimpse
 from neuros.runtime.packet_books import PacketBooks
+from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
 
 
@@ -29,6 +31,7 @@ class NodeReports:
         transport: Transport,
         time: SimulatedTime,
         effects: NodeEffects,
+        sampler: Sampler,
         clock: Callable[[], int],
     ) -> None:
         self._file = file
@@ -36,6 +39,7 @@ class NodeReports:
         self._transport = transport
         self._time = time
         self._effects = effects
+        self._sampler = sampler
         self._clock = clock
         self._engine: Engine | None = None
         self._books: PacketBooks | None = None
@@ -69,6 +73,21 @@ class NodeReports:
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "ledger": None if engine is None else snapshot(engine, now_ns),
             "fault": None if self._books is None else self._books.failure,
+            "is_driving": engine is not None and engine.is_driving,
+        }
+
+    def look(self, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """What an onlooker is shown: the node, and what was sampled of its packets. Any thread.
+
+        Args:
+            wanted: what to sample for the next time (see :class:`Sampler`).
+        """
+        engine = self._engine
+        return {
+            "node": self._file.node.name,
+            "sim_time": self._time.now_s,
+            "books": None if engine is None else glimpse(engine, self._clock()),
+            "samples": self._sampler.ask(wanted),
         }
 
     def probe(self) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def test_what_does_not_work_yet_is_not_offered(capsys: pytest.CaptureFixture[str
     with pytest.raises(SystemExit):
         main(["launch", "--help"])
     text = capsys.readouterr().out
-    for option in ("--dashboard", "--node-graph", "--visualisations"):
+    for option in ("--node-graph", "--visualisations"):
         assert option not in text
 
 

@@ -78,8 +78,12 @@ class Run:
             due_ns = bench.engine.next_due_ns
             if due_ns is not None and due_ns <= bench.clock.now_ns:
                 bench.engine.on_timer()
-        elif bench.posted:
+        elif what == 6 and bench.posted:
             bench.posted_event()
+        elif what == 7:
+            bench.engine.resume() if bench.engine.is_paused else bench.engine.pause()
+        elif what == 8:
+            bench.engine.step(2, is_driven=advance_ns % 2 == 0)
 
 
 class Again:
@@ -93,6 +97,7 @@ class Again:
         self.bench.post_loop_back = self._post_loop_back  # type: ignore[method-assign]
         engine: Any = self.bench.engine
         self.start, self.drain, self.stop = engine.start, engine.drain, engine.stop_hooks
+        self.pause, self.resume, self.step = engine.pause, engine.resume, engine.step
         self.on_packet, self.on_timer = engine.on_packet, engine.on_timer
         self.on_acknowledgement = engine.on_acknowledgement
         self.on_registered = engine.on_registered
@@ -115,7 +120,7 @@ class Again:
             player.play(event)
 
 
-steps = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 8), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)

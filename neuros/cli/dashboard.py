@@ -1,0 +1,127 @@
+"""``--dashboard``: its options, and the program of the process that serves it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import socket
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuros.cli.plan import Plan
+    from neuros.dashboard.server import Sources
+    from neuros.launch.dashboard import DashboardProcess
+
+_LAST_LOG_BYTES = 1 << 16
+
+
+def add_dashboard_options(launch: argparse.ArgumentParser) -> None:
+    """Add the options of ``neuros launch``."""
+    launch.add_argument(
+        "--dashboard",
+        action="store_true",
+        help="serve a page on 127.0.0.1 that shows the run in a browser: live graph, fields over"
+        " time, images, logs, load; it can pause, step and stop the run. Its address is printed",
+    )
+    launch.add_argument(
+        "--dashboard-port",
+        type=int,
+        metavar="PORT",
+        help="the port of the dashboard, which this switches on (default: any free one)",
+    )
+
+
+def add_dashboard(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The program that serves it; ``launch`` starts it, not people."""
+    dashboard = commands.add_parser("dashboard", add_help=False)
+    dashboard.add_argument("run")
+    dashboard.set_defaults(command=_run_dashboard)
+
+
+def dashboard_of(options: argparse.Namespace) -> DashboardProcess | None:
+    """What the command line asks for, listening already. Raises ``UsageError``."""
+    if not options.dashboard and options.dashboard_port is None:
+        return None
+    from neuros.launch.dashboard import DashboardProcess
+
+    return DashboardProcess(options.dashboard_port or 0)
+
+
+def start_dashboard(
+    dashboard: DashboardProcess,
+    plan: Plan,
+    run_id: str,
+    run_folder: Path,
+    logs: Mapping[str, Path],
+    environment: Mapping[str, str],
+) -> int:
+    """Start the process for a run that has a control socket; returns its id."""
+    from neuros.dashboard.plan import plan as shown_plan
+
+    return dashboard.start(
+        [sys.executable, "-m", "neuros.cli", "dashboard", str(run_folder)],
+        run_folder,
+        environment,
+        {
+            "run": run_id,
+            "plan": shown_plan(plan.project, plan.names),
+            "names": plan.names,
+            "logs": {name: str(path) for name, path in logs.items()},
+            "is_one_process": plan.backend == "in-process",
+        },
+    )
+
+
+def _run_dashboard(options: argparse.Namespace) -> int:
+    from neuros.dashboard.server import Dashboard
+
+    told = json.loads(sys.stdin.readline())
+    names = tuple(told["names"])
+    listening = socket.socket(fileno=told["descriptor"])
+    dashboard = Dashboard(told["plan"], names, _sources(told, names))
+    asyncio.run(dashboard.serve(listening, told["token"], told["run"], Path(options.run)))
+    return 0
+
+
+def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
+    from neuros.cli.observation import owner_of_processes
+    from neuros.dashboard.server import Sources
+    from neuros.observe.load import LAUNCHER, LoadMeter
+    from neuros.observe.load_now import LoadNow
+
+    owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
+    load_now = LoadNow(LoadMeter(owner))
+    logs = {name: Path(path) for name, path in told["logs"].items()}
+
+    def load() -> Mapping[str, Any]:
+        load = load_now()
+        # What is not a node's is this process.
+        load["groups"]["dashboard"] = load["groups"].pop(LAUNCHER)
+        return load
+
+    return Sources(lambda: _Log(logs), load)
+
+
+class _Log:
+    """The new lines of the logs of a run, as the console shows them."""
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        from neuros.launch.console import LogTail
+
+        self._lines: list[str] = []
+        self._tail = LogTail(files, self._take, colours=False, last_bytes=_LAST_LOG_BYTES)
+
+    def read(self) -> list[str]:
+        self._tail.poll()
+        lines, self._lines = self._lines, []
+        return lines
+
+    def close(self) -> None:
+        self._tail.close()
+
+    def _take(self, text: str) -> None:
+        self._lines += text.splitlines()

@@ -1,0 +1,84 @@
+"""What the page is told of a project: its nodes, connections, and what of it can be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from neuros.project.graph import guarantee
+from neuros.project.model import Connection, Node, Port, Project
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+
+
+def plan(project: Project, names: Sequence[str]) -> dict[str, Any]:
+    """The project for the page, ready for JSON.
+
+    Args:
+        names: the nodes of this run; the others run elsewhere, and nothing is seen of them.
+    """
+    return {
+        "project": project.name,
+        "nodes": [_node(node, is_here=node.name in names) for node in project.nodes],
+        "connections": [_connection(c) for c in project.connections],
+        "topics": list(_topics(project.nodes)),
+        "sources": [
+            source for node in project.nodes if node.name in names for source in _sources(node)
+        ],
+    }
+
+
+def _node(node: Node, *, is_here: bool) -> dict[str, Any]:
+    return {
+        "name": node.name,
+        "container": node.container,
+        "plugin": node.plugin.name,
+        "is_here": is_here,
+        "owns_time": node.owns_time,
+    }
+
+
+def _connection(connection: Connection) -> dict[str, Any]:
+    return {
+        "name": str(connection),
+        "from": connection.source_node,
+        "output": connection.source_output,
+        "to": connection.destination_node,
+        "input": connection.destination_input,
+        "discard_limit": connection.discard_limit,
+        "queue_size": connection.queue_size,
+        "window": connection.window,
+        "guarantee": guarantee(connection),
+    }
+
+
+def _topics(nodes: Iterable[Node]) -> Iterable[dict[str, Any]]:
+    for node in nodes:
+        for port in node.inputs:
+            if port.external_topic is not None:
+                name = f"{port.external_topic} -> {node.name}.{port.name}"
+                yield {"name": name, "topic": port.external_topic, "node": node.name, "is_in": True}
+        for port in node.outputs:
+            if port.external_topic is not None:
+                name = f"{node.name}.{port.name} -> {port.external_topic}"
+                topic = port.external_topic
+                yield {"name": name, "topic": topic, "node": node.name, "is_in": False}
+
+
+def _sources(node: Node) -> Iterable[dict[str, Any]]:
+    """What packets of this node can be sampled: those of its outputs and external inputs."""
+    for port in node.outputs:
+        yield _source(node, port, port.name)
+    for port in node.inputs:
+        if port.external_topic is not None:
+            yield _source(node, port, port.external_topic)
+
+
+def _source(node: Node, port: Port, key: str) -> dict[str, Any]:
+    return {
+        "node": node.name,
+        "port": key,
+        "name": f"{node.name}.{key}",
+        "type": port.type,
+        "is_image": port.type in IMAGES,
+    }

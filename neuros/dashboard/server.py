@@ -1,0 +1,183 @@
+"""The web server of a run: a page, a stream of events, and a few requests.
+
+======== ============= ===========================================================
+method   path          what it does
+======== ============= ===========================================================
+GET      /             the page
+GET      /static/...   what it consists of
+GET      /events       a stream of server-sent events, as long as the page is open
+POST     /want         what the page shows of packets: ``{"page": ..., "wanted": ...}``
+POST     /do/pause     the run stands still
+POST     /do/resume    it goes on
+POST     /do/step      while it stands still, ``{"count": n}`` steps
+POST     /do/stop      it ends, drained, with exit code 0
+======== ============= ===========================================================
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from neuros.dashboard.access import Access
+from neuros.dashboard.link import Link
+from neuros.dashboard.pages import Pages
+
+STATIC = Path(__file__).parent / "static"
+_LOG_S = 0.2
+_LOAD_S = 1.0
+_KEPT_LINES = 1000
+_CLOSING_S = 1
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:;"
+    " style-src 'self' 'unsafe-inline'",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class LogSource(Protocol):
+    """New lines of the logs of a run."""
+
+    def read(self) -> list[str]: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What is read on this machine while somebody looks.
+
+    Attributes:
+        open_log: begins to read the logs, with the last lines that there are.
+        load: the load of the machine and of each node, since it was last asked; JSON-serialisable.
+    """
+
+    open_log: Callable[[], LogSource]
+    load: Callable[[], Mapping[str, Any]]
+
+
+class Dashboard:
+    """Serves one run until that is over.
+
+    Args:
+        plan: what :func:`neuros.dashboard.plan.plan` tells of the project.
+        names: the nodes of the run.
+    """
+
+    def __init__(self, plan: Mapping[str, Any], names: tuple[str, ...], sources: Sources) -> None:
+        self._plan = plan
+        self._sources = sources
+        self._pages = Pages()
+        self._link = Link(self._pages, names)
+        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+
+    async def serve(self, listening: socket.socket, token: str, run: str, folder: Path) -> None:
+        """Answer requests until the supervisor hangs up. Raises ``OSError`` if it is not there."""
+        config = uvicorn.Config(
+            self.app(token, run),
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=_CLOSING_S,
+        )
+        server = uvicorn.Server(config)
+        serving = asyncio.create_task(server.serve([listening]))
+        tasks = [asyncio.create_task(each) for each in (self._read_logs(), self._read_load())]
+        try:
+            await self._link.run(folder)
+        finally:
+            for task in tasks:
+                task.cancel()
+            self._pages.part()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._pages.are_gone.wait(), _CLOSING_S)
+            server.should_exit = True
+            await serving
+
+    def app(self, token: str, run: str) -> Starlette:
+        """The ASGI application."""
+        return Starlette(
+            routes=[
+                Route("/", self._index),
+                Route("/events", self._events),
+                Route("/want", self._want, methods=["POST"]),
+                Route("/do/{what}", self._do, methods=["POST"]),
+                Mount("/static", StaticFiles(directory=STATIC)),
+            ],
+            middleware=[Middleware(Access, token=token, run=run)],
+        )
+
+    # ------------------------------------------------------------------ requests
+
+    async def _index(self, _: Request) -> Response:
+        return FileResponse(STATIC / "index.html", headers=_HEADERS)
+
+    async def _events(self, _: Request) -> Response:
+        return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
+
+    async def _stream(self) -> AsyncIterator[str]:
+        name, page = self._pages.open()
+        try:
+            page.send("begin", {"page": name, **self._plan})
+            page.send("phase", self._link.phase)
+            page.send("log", list(self._lines))
+            while (event := await page.next_event()) is not None:
+                yield event
+        finally:
+            self._pages.close(name)
+
+    async def _want(self, request: Request) -> Response:
+        asked = await request.json()
+        is_there = self._pages.want(str(asked["page"]), asked["wanted"])
+        return Response(status_code=204 if is_there else 410)
+
+    async def _do(self, request: Request) -> Response:
+        what = request.path_params["what"]
+        if what in ("pause", "resume"):
+            self._link.tell(what)
+        elif what == "step":
+            self._link.tell("step", count=int((await request.json())["count"]))
+        elif what == "stop":
+            self._link.tell("end", reason="ended from the dashboard")
+        else:
+            return JSONResponse({"error": f"nothing is called '{what}'"}, 404)
+        return Response(status_code=204)
+
+    # ------------------------------------------------------------------ what is read here
+
+    async def _read_logs(self) -> None:
+        while True:
+            await self._pages.are_watched.wait()
+            self._lines.clear()
+            log = self._sources.open_log()
+            try:
+                while self._pages.are_watched.is_set():
+                    lines = log.read()
+                    if lines:
+                        self._lines.extend(lines)
+                        self._pages.send("log", lines)
+                    else:
+                        await asyncio.sleep(_LOG_S)
+                    await asyncio.sleep(0)
+            finally:
+                log.close()
+
+    async def _read_load(self) -> None:
+        while True:
+            await self._pages.are_watched.wait()
+            self._pages.send("load", await asyncio.to_thread(self._sources.load))
+            await asyncio.sleep(_LOAD_S)

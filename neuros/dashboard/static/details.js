@@ -1,0 +1,79 @@
+// What was clicked: of a node its hooks, of a connection the fields of its packets.
+
+import {element, milliseconds, number, percent, rate, Row} from "./format.js";
+import {wantAllOf} from "./wants.js";
+
+export class Details {
+  constructor(plan, series) {
+    this.plan = plan;
+    this.series = series;
+    this.title = document.querySelector("#details-title");
+    this.box = document.querySelector("#details");
+    this.source = null;
+    this.node = null;
+  }
+
+  select(kind, name) {
+    this.node = kind === "node" ? name : null;
+    this.source = kind === "node" ? null : this.sourceOf(kind, name);
+    this.rows = new Map();
+    this.body = element("tbody");
+    this.title.textContent = name;
+    const type = this.source ? this.source.type : "";
+    this.box.replaceChildren(element("p", {}, type), element("table", {}, this.body));
+    wantAllOf(this.source ? this.source.name : null);
+    if (kind !== "node" && !this.source) this.box.append("Its sender is not part of this run.");
+  }
+
+  sourceOf(kind, name) {
+    const found = this.plan.sources.find((source) => {
+      if (kind === "topic") {
+        const topic = this.plan.topics.find((each) => each.name === name);
+        return source.node === topic.node
+          && (topic.is_in ? source.port === topic.topic : name.startsWith(`${source.name} `));
+      }
+      const connection = this.plan.connections.find((each) => each.name === name);
+      return source.node === connection.from && source.port === connection.output;
+    });
+    return found ?? null;
+  }
+
+  showFigures(figures) {
+    const node = this.node && figures.nodes[this.node];
+    if (!node || !node.hooks) return;
+    this.row("doing").show("now", `${node.state} ${node.executing ?? node.cause}`);
+    for (const [state, share] of Object.entries(node.shares)) {
+      if (share > 0.0005) this.row(`share ${state}`).show(state, percent(share));
+    }
+    for (const [hook, books] of Object.entries(node.hooks)) {
+      this.row(`hook ${hook}`).show(hook,
+        `${books.executions} times, ${rate(books.rate_hz)}/s, ${milliseconds(books.mean_ms)} each`);
+    }
+  }
+
+  showSample(name, sample) {
+    if (!this.source || name !== this.source.name) return;
+    if (sample.fault) this.row("fault").show("cannot be shown", sample.fault);
+    for (const [path, value] of Object.entries(sample.all ?? {})) {
+      const isNumber = typeof value !== "string";
+      if (!this.rows.has(path)) {
+        this.row(path).cells[0].append(isNumber ? this.button(name, path) : path);
+      }
+      this.rows.get(path).cells[1].textContent = isNumber ? number(Number(value), 6) : value;
+    }
+  }
+
+  row(name) {
+    if (!this.rows.has(name)) this.rows.set(name, new Row(this.body, name, ["", "number"]));
+    return this.rows.get(name);
+  }
+
+  button(source, path) {
+    const button = element("button", {class: "field", title: "plot this"}, path);
+    if (this.series.has(source, path)) button.classList.add("chosen");
+    button.addEventListener("click", () => {
+      button.classList.toggle("chosen", this.series.toggle(source, path));
+    });
+    return button;
+  }
+}

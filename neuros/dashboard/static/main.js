@@ -1,0 +1,109 @@
+// The page: a stream of events from the server, and who shows what of it.
+
+import {Details} from "./details.js";
+import {number} from "./format.js";
+import {Graph} from "./graph.js";
+import {Images} from "./images.js";
+import {showLoad} from "./load.js";
+import {Log} from "./log.js";
+import {Series} from "./series.js";
+import {Tables} from "./tables.js";
+import * as wants from "./wants.js";
+
+const log = new Log();
+let view = null;
+let stream = null;
+let hasEnded = false;
+
+const handlers = {
+  begin(plan) {
+    log.clear();
+    wants.begin(plan.page, plan.sources);
+    if (view) return; // the same run, seen again: charts and selection stay
+    document.title = `${plan.project} – NeuROS`;
+    document.querySelector("#project").textContent = plan.project;
+    const series = new Series(plan.project);
+    const details = new Details(plan, series);
+    const select = (kind, name) => { details.select(kind, name); view.tables.select(name); };
+    view = {
+      series, details,
+      graph: new Graph(document.querySelector("#graph"), plan, select),
+      tables: new Tables(plan, select),
+      images: new Images(plan.sources),
+    };
+    series.restore();
+    window.neuros = view; // for the console of the browser
+  },
+  figures(figures) {
+    view.graph.show(figures);
+    view.tables.show(figures);
+    view.details.showFigures(figures);
+    const factor = figures.real_time_factor;
+    document.querySelector("#times").textContent = figures.sim_time === null ? ""
+      : `simulated ${figures.sim_time.toFixed(2)} s, ${number(factor, 3)} × real time`;
+  },
+  samples(samples) {
+    for (const [name, sample] of Object.entries(samples)) {
+      view.details.showSample(name, sample);
+      view.series.show(name, sample);
+      view.images.show(name, sample);
+    }
+  },
+  phase(phase) {
+    const shown = phase.is_paused ? "paused" : phase.phase;
+    const isRunning = phase.phase === "running";
+    hasEnded = phase.phase === "ended";
+    showPhase(shown, hasEnded ? `ended: ${phase.reason} (exit code ${phase.exit_code})` : shown);
+    enable({pause: isRunning && !phase.is_paused, resume: isRunning && phase.is_paused,
+      step: isRunning && phase.is_paused, stop: isRunning});
+  },
+  log(lines) { log.add(lines); },
+  load(load) { showLoad(load); },
+};
+
+function showPhase(name, text) {
+  const phase = document.querySelector("#phase");
+  phase.className = name;
+  phase.textContent = text;
+}
+
+function enable(buttons) {
+  for (const [name, isOn] of Object.entries(buttons)) {
+    document.querySelector(`#${name}`).disabled = !isOn;
+  }
+}
+
+function open() {
+  if (stream || hasEnded) return;
+  stream = new EventSource("events");
+  for (const [name, handle] of Object.entries(handlers)) {
+    stream.addEventListener(name, (event) => handle(JSON.parse(event.data)));
+  }
+  stream.onerror = () => {
+    if (hasEnded) close();
+    else {
+      showPhase("lost", "no connection");
+      enable({pause: false, resume: false, step: false, stop: false});
+    }
+  };
+}
+
+function close() {
+  stream?.close();
+  stream = null;
+}
+
+function act(what, body = {}) {
+  fetch(`do/${what}`, {method: "POST", body: JSON.stringify(body)}).catch(() => {});
+}
+
+document.querySelector("#pause").addEventListener("click", () => act("pause"));
+document.querySelector("#resume").addEventListener("click", () => act("resume"));
+document.querySelector("#step").addEventListener("click", () => act("step",
+  {count: Math.max(1, Math.floor(Number(document.querySelector("#count").value) || 1))}));
+document.querySelector("#stop").addEventListener("click", () => {
+  if (confirm("End the run?")) act("stop");
+});
+// A page that nobody sees asks for nothing.
+document.addEventListener("visibilitychange", () => document.hidden ? close() : open());
+open();

@@ -1,0 +1,217 @@
+"""The dashboard of real runs: in a browser, click by click, and over plain HTTP."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import psutil
+import requests
+from dashboard.browser import browser_page
+from launching import REPOSITORY, Running, start
+
+WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
+IMU = "world.imu -> brain.imu"
+TIMEOUT_S = 20
+
+
+def start_watched(tmp_path: Path, *arguments: str) -> Running:
+    return start(WATCHED, "--dashboard", *arguments, cwd=tmp_path)
+
+
+def address(running: Running) -> str:
+    running.wait_for("dashboard: http://")
+    (found,) = re.findall(r"dashboard: (\S+)\n", running.output)
+    return str(found)
+
+
+class Visitor:
+    """Asks the server as no browser would."""
+
+    def __init__(self, url: str) -> None:
+        self._origin, _, self._token = url.partition("/?token=")
+        welcome = requests.get(url, allow_redirects=False, timeout=TIMEOUT_S)
+        assert welcome.status_code == 303
+        (self._cookie,) = welcome.cookies.keys()
+
+    def get(self, path: str, token: str | None = None, **headers: str) -> int:
+        return self._status("GET", path, token, headers)
+
+    def post(self, path: str, token: str | None = None, **headers: str) -> int:
+        return self._status("POST", path, token, headers)
+
+    def _status(self, method: str, path: str, token: str | None, headers: dict[str, str]) -> int:
+        cookies = {self._cookie: self._token if token is None else token}
+        url = self._origin + path
+        return requests.request(
+            method, url, headers=headers, cookies=cookies, timeout=TIMEOUT_S
+        ).status_code
+
+    @contextlib.contextmanager
+    def events(self) -> Iterator[Iterator[tuple[str, Any]]]:
+        """The events of a page, until its stream ends."""
+        with requests.get(
+            f"{self._origin}/events",
+            cookies={self._cookie: self._token},
+            stream=True,
+            timeout=TIMEOUT_S,
+        ) as answer:
+            assert answer.status_code == 200
+            yield _events(answer)
+
+
+def _events(answer: requests.Response) -> Iterator[tuple[str, Any]]:
+    name = ""
+    for line in answer.iter_lines(decode_unicode=True):
+        key, _, value = line.partition(": ")
+        if key == "event":
+            name = value
+        elif key == "data":
+            yield name, json.loads(value)
+
+
+def sent(page: Any, name: str = IMU) -> int:
+    return int(page.inner_text(f'#connections tr[data-name="{name}"] td:nth-child(3)'))
+
+
+def wait_until(page: Any, condition: str, argument: Any = None) -> None:
+    page.wait_for_function(condition, arg=argument)
+
+
+MORE_THAN = """([name, count]) => Number(document.querySelector(
+    `#connections tr[data-name="${name}"] td:nth-child(3)`).textContent) > count"""
+
+
+def test_a_visitor_sees_and_steers_a_run_in_a_browser(tmp_path: Path) -> None:
+    with start_watched(tmp_path) as running, browser_page() as page:
+        page.goto(address(running))
+        assert "token" not in page.url
+
+        # The graph: states of nodes, counters of connections.
+        wait_until(
+            page,
+            "() => ['world', 'brain'].every((name) => ['executing', 'waiting', 'blocked'].includes("
+            "window.neuros?.graph.cy.getElementById(`node ${name}`).data('state')))",
+        )
+        label = page.evaluate(
+            "(name) => window.neuros.graph.cy.getElementById(`connection ${name}`).data('label')",
+            IMU,
+        )
+        assert label.startswith("imu: lossless\n")
+        wait_until(page, MORE_THAN, [IMU, 5])
+
+        # A field of a packet, over time.
+        page.click(f'#connections tr[data-name="{IMU}"]')
+        page.click('#details tr[data-name="angular_velocity.z"] button')
+        wait_until(page, "() => document.querySelector('.chart')?.dataset.points > 20")
+        drawn = page.inner_text('#details tr[data-name="header.frame_id"] td:nth-child(2)')
+        assert drawn == "head"
+
+        # An image: 640 x 480, shown as 320 x 240.
+        wait_until(page, "() => document.querySelector('#images img').naturalWidth == 320")
+        assert page.evaluate("() => document.querySelector('#images img').naturalHeight") == 240
+
+        # The log and its filter; the load of each node.
+        page.fill("#log-filter", "turning fast")
+        wait_until(page, "() => document.querySelector('#log').childElementCount > 0")
+        lines = page.inner_text("#log").splitlines()
+        assert lines
+        assert all("turning fast" in line for line in lines)
+        page.wait_for_selector('#load tr[data-name="brain"]')
+
+        # Pause, step, resume.
+        page.click("#pause")
+        page.wait_for_selector("#phase.paused")
+        wait_until(
+            page,
+            "() => window.neuros.graph.cy.getElementById('node world').data('state') == 'paused'",
+        )
+        before = sent(page)
+        page.fill("#count", "3")
+        page.click("#step")
+        wait_until(page, MORE_THAN, [IMU, before + 2])
+        page.click("#step")
+        wait_until(page, MORE_THAN, [IMU, before + 5])
+        assert sent(page) == before + 6
+        page.click("#resume")
+        wait_until(page, MORE_THAN, [IMU, before + 20])
+
+        # Stop: the run ends well, and the page says so.
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.click("#stop")
+        page.wait_for_selector("#phase.ended")
+        assert "ended from the dashboard (exit code 0)" in page.inner_text("#phase")
+        finished = running.finish()
+    assert finished.exit_code == 0
+    assert finished.connection(IMU)["lost"] == 0
+    assert finished.record["nodes"]["world"]["accounting"]["paused"] > 0
+
+
+def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -> None:
+    with start_watched(tmp_path) as running:
+        url = address(running)
+        visitor = Visitor(url)
+        netloc = urlsplit(url).netloc
+        assert visitor.get("/") == 200
+        assert visitor.get("/", "wrong") == 403
+        assert visitor.get("/?token=wrong", "") == 403
+        assert visitor.get("/static/main.js", "") == 403
+        assert visitor.get("/events", "") == 403
+        assert visitor.post("/do/stop", "") == 403
+        assert visitor.post("/do/stop", Origin="http://example.org") == 403
+        assert visitor.post("/do/stop", Origin=f"http://{netloc.replace(':', ':1')}") == 403
+        assert visitor.get("/", Host="neuros.example.org") == 403
+        assert visitor.get("/", Host=netloc.replace("127.0.0.1", "localhost")) == 200
+        assert visitor.get("/static/../../launch.py") == 404
+        assert visitor.post("/do/something") == 404
+
+        taken = str(urlsplit(url).port)
+        with start(WATCHED, "--dashboard-port", taken, cwd=tmp_path) as second:
+            refused = second.finish()
+        assert refused.exit_code == 2
+        assert f"--dashboard-port {taken}: cannot be listened on" in refused.output
+
+        assert visitor.post("/do/stop", Origin=f"http://{netloc}") == 204
+        assert running.finish().exit_code == 0
+
+
+def is_full(figures: Any) -> bool:
+    shown = figures["connections"].get(IMU, {})
+    return bool(shown.get("rate_hz") and shown.get("latency_ms") and figures["real_time_factor"])
+
+
+def test_a_page_is_told_of_every_node_of_one_process_and_of_the_end(tmp_path: Path) -> None:
+    with start_watched(tmp_path, "--backend", "in-process") as running:
+        visitor = Visitor(address(running))
+        with visitor.events() as events:
+            figures = next(data for name, data in events if name == "figures" and is_full(data))
+            assert figures["nodes"].keys() == {"world", "brain"}
+            assert visitor.post("/do/stop") == 204
+            *_, (name, last) = events
+        assert (name, last["phase"], last["exit_code"]) == ("phase", "ended", 0)
+        finished = running.finish()
+        assert finished.exit_code == 0
+    assert finished.run_folder is not None
+    assert (finished.run_folder / "dashboard.log").read_text() == ""
+
+
+def test_a_paused_run_goes_on_when_its_dashboard_is_killed(tmp_path: Path) -> None:
+    with start_watched(tmp_path, "--duration", "1") as running:
+        visitor = Visitor(address(running))
+        assert visitor.post("/do/pause") == 204
+        with visitor.events() as events:
+            assert next(data for name, data in events if name == "phase" and data["is_paused"])
+        (dashboard,) = (
+            child
+            for child in psutil.Process(running.process.pid).children()
+            if "dashboard" in child.cmdline()
+        )
+        dashboard.kill()
+        finished = running.finish()
+    assert finished.exit_code == 0
+    assert finished.connection(IMU)["sent"] > 0

@@ -1,0 +1,146 @@
+"""Who watches a run, and may let it stand still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuros.control import Lines, connect
+from neuros.launch.channels import Channels
+from neuros.launch.onlookers import Onlookers, Pause
+from neuros.launch.outcome import Outcome, Phase
+
+
+class Run:
+    """Onlookers of a run that is not there."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.now_s = 100.0
+        self.channels = Channels(folder)
+        self.pause = Pause(self.channels.send, lambda: self.now_s)
+        self.ends: list[str] = []
+        self.is_driven = True
+        self.onlookers = Onlookers(
+            self.channels, self.pause, lambda: self.is_driven, self.ends.append
+        )
+
+    def join(self) -> Lines:
+        """Somebody connects."""
+        lines = connect(self.folder)
+        lines.socket.settimeout(5.0)
+        return lines
+
+    def hear(self, count: int = 1) -> None:
+        """Take so many messages."""
+        while count:
+            self.channels.wait(5.0)
+            for lines, message in self.channels.receive():
+                self.onlookers.handlers[message["kind"]](lines, message)
+                count -= 1
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    made = Run(tmp_path)
+    yield made
+    made.channels.close()
+
+
+def told(lines: Lines, count: int) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    while len(found) < count:
+        messages = lines.receive()
+        assert messages is not None
+        found += map(dict, messages)
+    return found
+
+
+def test_an_onlooker_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
+    lines = run.join()
+    lines.send("watch")
+    run.hear()
+    run.onlookers.look_at(Phase.RUNNING)
+    run.onlookers.look_at(Phase.RUNNING)
+    run.onlookers.look_at(Phase.DRAINING)
+    run.onlookers.part(Outcome(3, "why"))
+    assert told(lines, 3) == [
+        {"kind": "phase", "phase": "running", "is_paused": False},
+        {"kind": "phase", "phase": "draining", "is_paused": False},
+        {"kind": "ended", "exit_code": 3, "reason": "why"},
+    ]
+    lines.close()
+
+
+def test_what_nodes_show_goes_to_onlookers_only(run: Run) -> None:
+    node, onlooker = run.join(), run.join()
+    onlooker.send("watch")
+    run.hear()
+    onlooker.send("look", wanted={"a": {}})
+    run.hear()
+    assert told(node, 1) == [{"kind": "look", "wanted": {"a": {}}}]
+    node.send("glimpse", node="a", books=None)
+    run.hear()
+    assert told(onlooker, 2)[1] == {"kind": "glimpse", "node": "a", "books": None}
+    node.close()
+    onlooker.close()
+
+
+def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> None:
+    onlooker = run.join()
+    for kind, fields in (
+        ("step", {"count": 1}),  # it does not stand still: nothing happens
+        ("pause", {}),
+        ("pause", {}),
+        ("step", {"count": 3}),
+        ("step", {"count": -1}),
+    ):
+        onlooker.send(kind, **fields)
+    run.hear(5)
+    run.now_s += 7.0
+    assert run.pause.is_on
+    assert run.pause.total_s == 7.0
+    onlooker.send("resume")
+    run.hear()
+    run.now_s += 1.0
+    assert not run.pause.is_on
+    assert run.pause.total_s == 7.0
+    assert told(onlooker, 3) == [
+        {"kind": "pause"},
+        {"kind": "step", "count": 3, "is_driven": True},
+        {"kind": "resume"},
+    ]
+    onlooker.close()
+
+
+def test_a_run_goes_on_when_nobody_is_left_to_resume_it(run: Run) -> None:
+    onlooker = run.join()
+    onlooker.send("watch")
+    onlooker.send("pause")
+    run.hear(2)
+    run.onlookers.look_at(Phase.RUNNING)
+    assert run.pause.is_on
+    onlooker.close()
+    while run.pause.is_on:
+        run.channels.wait(5.0)
+        assert list(run.channels.receive()) == []
+        run.onlookers.look_at(Phase.RUNNING)
+
+
+def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
+    run.pause.begin()
+    run.now_s += 2.0
+    run.onlookers.look_at(Phase.DRAINING)
+    run.now_s += 2.0
+    assert (run.pause.is_on, run.pause.total_s) == (False, 2.0)
+
+
+def test_an_onlooker_may_end_the_run(run: Run) -> None:
+    onlooker = run.join()
+    onlooker.send("end", reason="enough")
+    run.hear()
+    assert run.ends == ["enough"]
+    onlooker.close()
