@@ -56,7 +56,7 @@ _PROOFS = {
     "tensorflow": _Proof("TensorFlow", "tensorflow-cpu", "import tensorflow"),
     "docs": _Proof("Sphinx", "sphinx", "import sphinx, furo"),
     "benchmark": _Proof("psutil", "psutil", "import psutil"),
-    "dev": _Proof("pytest", "pytest", "import pytest, hypothesis, mypy, psutil"),
+    "dev": _Proof("pytest", "pytest", "import pytest, xdist, hypothesis, mypy, psutil"),
 }
 
 
