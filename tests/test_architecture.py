@@ -65,6 +65,7 @@ ROOMS = (
     Room(4, ("simulators",)),
     Room(4, ("observe",)),
     Room(4, ("dashboard",)),
+    Room(4, ("snn",)),
     Room(5, ("runtime",)),
     Room(6, ("cli", "doctor", "replay")),
     Room(6, ("bag",)),
@@ -83,6 +84,8 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport": {"rclpy", "rpyutils", "xxhash"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
+    "snn": {"numpy"},
+    "snn.kernel": {"numpy", "nest"},
     "launch.docker": {"docker", "requests"},
     "launch.environments.requirements": {"packaging"},
     "cli.sessions": {"tabulate"},
@@ -187,6 +190,7 @@ def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
         ("neuros.launch.supervisor", "from neuros.launch.process import x", "sees ports only"),
         ("neuros.launch.process", "from neuros.launch.supervisor import x", "on floor 5"),
         ("neuros.simulators.mujoco.sensors", "import nest", "third-party package nest"),
+        ("neuros.snn.decoding", "import nest", "third-party package nest"),
         ("neuros.installation.machine", "from neuros.hooks import All", "nothing but errors"),
         ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on floor 6"),
     ],
@@ -231,6 +235,20 @@ def test_the_core_imports_where_the_outside_world_does_not_exist() -> None:
         "    sys.modules[name] = None\n"
         "sys.path.insert(0, '.')\n"
         f"import {', '.join(['neuros.core', *core])}",
+    )
+
+
+def test_coders_and_decoders_work_without_nest() -> None:
+    run_python(
+        "-c",
+        "import sys\n"
+        "sys.modules['nest'] = None\n"
+        "sys.path.insert(0, '.')\n"
+        "import numpy\n"
+        "from neuros.snn import PopulationVector, WindowRate, poisson_spikes\n"
+        "spikes = poisson_spikes([50.0] * 4, 1.0, numpy.random.default_rng(1))\n"
+        "assert WindowRate(4, 1.0).update(spikes, 1.0).sum() == len(spikes) > 0\n"
+        "assert PopulationVector([0.0, 1.0, 2.0, 3.0]).of_spikes(spikes).length > 0",
     )
 
 

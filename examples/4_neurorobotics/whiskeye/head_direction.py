@@ -8,18 +8,18 @@ those of ring R by -phi: each ring alone would push the bump, together they are 
 raises the current into one ring and lowers it in the other by the same amount; the bump moves at a
 speed proportional to the difference, to either side.
 
-No ROS and no NeuROS in here. NEST has one kernel per process: one network per process at a time.
-NEST is imported with the first network, after the number of threads has been fixed.
+No ROS and no node in here. NEST has one kernel per process: one network per process at a time.
+NEST is imported with the first network.
 """
 
 from __future__ import annotations
 
 import math
-import os
-from types import ModuleType
 from typing import Any
 
 import numpy as np
+
+from neuros.snn import PopulationVector, SpikeReader, Spikes, Stepper, reset_kernel
 
 NEURONS_PER_RING = 120
 TAU_SYNAPSE_MS = 50.0
@@ -46,24 +46,19 @@ class HeadDirectionNetwork:
     """
 
     def __init__(self, seed: int = 1) -> None:
-        self._nest = nest = _import_nest()
-        nest.ResetKernel()
-        nest.set(resolution=RESOLUTION_MS, local_num_threads=1, rng_seed=seed, print_time=False)
+        self._nest = nest = reset_kernel(seed, resolution_ms=RESOLUTION_MS)
         self._angles = 2.0 * np.pi * (np.arange(NEURONS_PER_RING) + 0.5) / NEURONS_PER_RING
         self._left, self._right = self._ring(), self._ring()
-        self._neurons = self._left + self._right
         for ring, rotation in ((self._left, ROTATION_RAD), (self._right, -ROTATION_RAD)):
             self._connect(ring, rotation)
         self._drive_left, self._drive_right = nest.Create("dc_generator", 2)
         nest.Connect(self._drive_left, self._left, syn_spec={"delay": DELAY_MS})
         nest.Connect(self._drive_right, self._right, syn_spec={"delay": DELAY_MS})
-        self._recorder = nest.Create("spike_recorder")
-        nest.Connect(self._neurons, self._recorder, syn_spec={"delay": DELAY_MS})
-        self._first_id = int(self._neurons[0].global_id)
-        self._phasors = np.tile(np.exp(1j * self._angles), 2)
+        self._stepper = Stepper(strict=True)
+        self._reader = SpikeReader(self._left + self._right, self._stepper, DELAY_MS)
+        self._population = PopulationVector(np.tile(self._angles, 2))
         self._raw_rad = self._zero_rad = self._heading_rad = 0.0
         self._rate_rad_s = 0.0
-        self._min_delay_ms = float(nest.min_delay)
 
     @property
     def heading_rad(self) -> float:
@@ -73,7 +68,7 @@ class HeadDirectionNetwork:
     @property
     def quantum_s(self) -> float:
         """Steps must last a whole number of these: other lengths change the spikes."""
-        return self._min_delay_ms / 1000.0
+        return self._stepper.min_delay_ns * 1e-9
 
     def settle(self, duration_s: float = 1.5) -> float:
         """Start the bump and let it come to rest; what is decoded at the end becomes heading zero.
@@ -98,15 +93,9 @@ class HeadDirectionNetwork:
 
         Raises ``ValueError`` where the duration is not a whole number of :attr:`quantum_s`.
         """
-        quanta = round(duration_s / self.quantum_s)
-        if quanta < 1 or abs(quanta * self.quantum_s - duration_s) > 1e-6:
-            raise ValueError(
-                f"a step of {duration_s!r} s is not a whole number of {self.quantum_s} s"
-            )
         self._set_drive(rate_rad_s)
-        self._recorder.n_events = 0
-        self._nest.Simulate(quanta * self._min_delay_ms)
-        self._decode()
+        self._stepper.advance_s(duration_s)
+        self._decode(self._reader.read())
         return self._heading_rad
 
     def _set_drive(self, rate_rad_s: float) -> None:
@@ -115,13 +104,12 @@ class HeadDirectionNetwork:
             self._drive_right.amplitude = -DRIVE_PA_PER_RAD_S * rate_rad_s
             self._rate_rad_s = rate_rad_s
 
-    def _decode(self) -> None:
+    def _decode(self, spikes: Spikes) -> None:
         """Population vector over the spikes of the last step; without spikes the heading stays."""
-        senders = self._recorder.events["senders"]
-        if len(senders) == 0:
+        decoded_rad = self._population.of_spikes(spikes).angle_rad
+        if math.isnan(decoded_rad):
             return
-        vector = self._phasors[np.asarray(senders) - self._first_id].sum()
-        self._raw_rad = float(np.angle(vector))
+        self._raw_rad = decoded_rad
         turned = self._raw_rad - self._zero_rad
         self._heading_rad = math.atan2(math.sin(turned), math.cos(turned))
 
@@ -173,13 +161,3 @@ class HeadDirectionNetwork:
         )
         for ring in (self._left, self._right):
             self._nest.Connect(generators, ring, "one_to_one", {"delay": DELAY_MS})
-
-
-def _import_nest() -> ModuleType:
-    """NEST in one thread. More threads only lose time here, and OpenMP reads its limit once."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("PYNEST_QUIET", "1")
-    import nest
-
-    nest.verbosity = nest.VerbosityLevel.ERROR
-    return nest

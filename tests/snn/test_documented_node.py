@@ -1,0 +1,43 @@
+"""The node of docs/neural_simulators.md does what the page says."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from std_msgs.msg import Float64
+
+from neuros.testing import PluginHarness
+
+pytest.importorskip("nest")
+
+PAGE = Path(__file__).resolve().parents[2] / "docs/neural_simulators.md"
+FLOAT = "std_msgs/msg/Float64"
+
+
+def estimates(folder: Path, seed: str) -> list[float]:
+    (plugin,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    (folder / "snn.py").write_text(plugin)
+    with PluginHarness(
+        str(folder / "snn.py"),
+        inputs={"direction": FLOAT},
+        outputs={"estimate": FLOAT},
+        environment={"SEED": seed},
+        name="snn",
+    ) as harness:
+        for step in range(50):
+            harness.send("direction", Float64(data=0.02 * step))
+            harness.run()
+        return [packet.data for packet in harness.received("estimate")]
+
+
+def test_it_decodes_the_direction_that_its_spikes_stand_for_and_repeats_it(tmp_path):
+    """100 neurons of 50 Hz are 100 spikes in 20 ms: a standard error of 8 degrees."""
+    found = estimates(tmp_path, "1")
+    assert found == estimates(tmp_path, "1") != estimates(tmp_path, "2")
+    error = np.array(found) - 0.02 * np.arange(50)
+    assert np.all(np.abs(error) < math.radians(5 * 8))
+    assert np.sqrt(np.mean(error[1:] ** 2)) < math.radians(10)
