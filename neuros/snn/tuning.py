@@ -117,7 +117,8 @@ class PopulationVector:
     def of_rates(self, rates_hz: object) -> Direction:
         """From the rate (or the number of spikes, or any activity from 0 up) of each, ``(n,)``."""
         rates = checked_rates(rates_hz, self._phasors.size)
-        return self._direction(complex(rates @ self._phasors), float(rates.sum()))
+        # Not with @: the last digit of a BLAS product depends on the kind of processor.
+        return self._direction(complex((rates * self._phasors).sum()), float(rates.sum()))
 
     def of_spikes(self, spikes: Spikes) -> Direction:
         """From spikes, each of which counts one."""
@@ -144,7 +145,7 @@ def centre_of_mass(rates_hz: object, preferred: Floats) -> float:
     values = np.asarray(preferred, dtype=np.float64)
     rates = checked_rates(rates_hz, values.size)
     total = float(rates.sum())
-    return float(rates @ values) / total if total > 0.0 else float("nan")
+    return float((rates * values).sum()) / total if total > 0.0 else float("nan")
 
 
 def _check_range(low_hz: float, high_hz: float) -> None:
