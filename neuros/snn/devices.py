@@ -42,8 +42,9 @@ class RateInput:
         Raises ``ValueError`` where the shape is another one, or a rate is negative or not finite.
         """
         rates = checked_rates(rates_hz, self._rates_hz.size)
-        for index in np.flatnonzero(rates != self._rates_hz):
-            self._generators[int(index)].rate = float(rates[index])
+        changed = np.flatnonzero(rates != self._rates_hz)
+        if changed.size:  # all at once: one by one takes ten times as long
+            self._generators[changed].rate = rates[changed]
         self._rates_hz = rates.copy()
 
 
@@ -81,15 +82,18 @@ class SpikeInput:
                 f"a spike at {float(spikes.time_s.min())!r} s: the network is at "
                 f"{self._stepper.time_s!r} s already"
             )
-        for gone in np.setdiff1d(self._loaded, index):
-            self._generators[int(gone)].spike_times = []
-        self._loaded = np.unique(index)
-        for neuron in self._loaded:
-            own, multiplicity = np.unique(steps[index == neuron], return_counts=True)
-            self._generators[int(neuron)].set(
-                spike_times=own * self._stepper.resolution_ns / NS_PER_MS,
-                spike_multiplicities=multiplicity.astype(np.int64),
-            )
+        firing = np.unique(index)
+        changed = np.union1d(self._loaded, firing)
+        if changed.size:
+            trains = [self._train(steps[index == neuron]) for neuron in changed]
+            self._generators[changed].set(trains)
+        self._loaded = firing
+
+    def _train(self, steps: Indices) -> dict[str, Any]:
+        """The parameters of one generator."""
+        own, multiplicities = np.unique(steps, return_counts=True)
+        times_ms = own * self._stepper.resolution_ns / NS_PER_MS
+        return {"spike_times": times_ms, "spike_multiplicities": multiplicities.astype(np.int64)}
 
     def _steps_of(self, time_s: Floats) -> Indices:
         """The step that each time lies in: (k - 1, k] is k, and the start of a step is in it."""

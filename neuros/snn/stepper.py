@@ -64,6 +64,7 @@ class Stepper:
     @property
     def min_delay_ns(self) -> int:
         """The shortest delay of the network in nanoseconds."""
+        self._look_at_delays()
         return self._grid.min_delay_ns
 
     @property
@@ -100,9 +101,7 @@ class Stepper:
         self._kernel.check()
         if self._is_closed:
             raise ValueError("the stepper is closed")
-        if not self._knows_delays:
-            self._read_grid()
-            self._knows_delays = True
+        self._look_at_delays()
         steps = self._grid.steps(duration_ns)
         partial = self._grid.partial_delay(duration_ns)
         if partial and self._strict:
@@ -111,6 +110,7 @@ class Stepper:
             warnings.warn(
                 f"{partial}; the spikes depend on the steps then", PartialDelayWarning, stacklevel=2
             )
+        self._knows_delays = True
         self._prepare()
         self._nest.Run(steps * self._grid.resolution_ns / NS_PER_MS)
         self._steps += steps
@@ -152,6 +152,11 @@ class Stepper:
         if self._is_prepared:
             self._is_prepared = False
             self._nest.Cleanup()
+
+    def _look_at_delays(self) -> None:
+        # Once, and not at every step: asking NEST takes 0.1 ms.
+        if not self._knows_delays:
+            self._read_grid()
 
     def _read_grid(self) -> None:
         self._grid = StepGrid(

@@ -104,8 +104,9 @@ def test_time_goes_on_from_where_the_kernel_is():
 def test_the_shortest_delay_is_that_of_the_network():
     nest = reset_kernel(1)
     neurons = nest.Create("iaf_psc_alpha", 2)
-    nest.Connect(neurons[0], neurons[1], syn_spec={"delay": 1.5})
     stepper = Stepper()
+    nest.Connect(neurons[0], neurons[1], syn_spec={"delay": 1.5})
+    assert stepper.min_delay_ns == 1_500_000
     SpikeReader(neurons, stepper, delay_ms=2.0)
     with stepper:
         stepper.advance_ns(3_000_000)
