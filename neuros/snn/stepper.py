@@ -84,11 +84,11 @@ class Stepper:
 
     def advance_s(self, duration_s: float) -> None:
         """Simulate so many seconds, rounded to a nanosecond. Errors as of :meth:`advance_ns`."""
-        self.advance_ns(nanoseconds(duration_s))
+        self._advance(nanoseconds(duration_s))
 
     def advance_to_ns(self, time_ns: int) -> None:
         """Simulate until a point of simulated time. Errors as of :meth:`advance_ns`."""
-        self.advance_ns(time_ns - self.time_ns)
+        self._advance(time_ns - self.time_ns)
 
     def advance_ns(self, duration_ns: int) -> None:
         """Simulate so many nanoseconds.
@@ -98,6 +98,9 @@ class Stepper:
                 ``min_delay``; or the stepper is closed. Nothing has been simulated then.
             NodeError: somebody else has reset the kernel.
         """
+        self._advance(duration_ns)
+
+    def _advance(self, duration_ns: int) -> None:
         self._kernel.check()
         if self._is_closed:
             raise ValueError("the stepper is closed")
@@ -108,7 +111,7 @@ class Stepper:
             raise ValueError(partial)
         if partial:
             warnings.warn(
-                f"{partial}; the spikes depend on the steps then", PartialDelayWarning, stacklevel=2
+                f"{partial}; the spikes depend on the steps then", PartialDelayWarning, stacklevel=3
             )
         self._knows_delays = True
         self._prepare()

@@ -69,8 +69,9 @@ def test_steps_of_whole_delays_give_the_spikes_of_one_long_step(reference, steps
 
 
 def test_a_step_of_partial_delays_is_warned_of_since_it_changes_the_spikes(reference):
-    with pytest.warns(PartialDelayWarning, match=r"0\.5 ms is not a whole number of 1 ms"):
+    with pytest.warns(PartialDelayWarning, match=r"0\.5 ms is not a whole number of 1 ms") as told:
         assert fired(steps_ms=(0.5,) * 800) != reference
+    assert {warning.filename for warning in told} == {__file__}
 
 
 def test_a_strict_stepper_refuses_partial_delays_and_simulates_nothing():
