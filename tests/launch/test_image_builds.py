@@ -41,6 +41,13 @@ class TestBuildLog:
         assert log.tail == [*map(str, range(39, 50)), "it broke"]
         assert log.cause == "it broke"
 
+    def test_a_line_that_comes_in_pieces_is_one(self, tmp_path: Path) -> None:
+        log = BuildLog(tmp_path / "x.log", lambda _: None)
+        pieces = ({"stream": "Step 1\nE"}, {"stream": ": Unable to locate package a\nbye"})
+        assert log.follow([*pieces, {"error": "over"}]) is None
+        assert log.tail == ["Step 1", "E: Unable to locate package a", "bye", "over"]
+        assert "have no a: correct the name" in log.cause
+
     @pytest.mark.parametrize(
         ("said", "cause"),
         [
@@ -61,6 +68,8 @@ class TestBuildLog:
             ),
             ("Temporary failure in name resolution", "the package index cannot be reached"),
             ("SSLError(CERTIFICATE_VERIFY_FAILED)", "give your authority's with --ca-bundle"),
+            ("E: Unable to locate package ros-jazzy-rviz2", "have no ros-jazzy-rviz2: correct"),
+            ("E: Package 'rviz' has no installation candidate", "have no rviz: correct"),
             ("COPY failed: file not found in build context", "is not beside it"),
             ("E: Could not open lock file - open (13: Permission denied)", "put USER 0 above it"),
             ("/bin/sh: 1: python3: not found", "its base has no Python"),

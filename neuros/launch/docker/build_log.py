@@ -28,6 +28,11 @@ _CAUSES = (
         " their versions",
     ),
     (
+        r"E: Unable to locate package (?P<what>\S+)|E: Package '?(?P<also>[\w.+-]+)'? has no",
+        "the package sources of its base have no {what}: correct the name, or take another base"
+        " with --base-image",
+    ),
+    (
         r"pull access denied for (?P<what>[^\s,]+)|manifest for (?P<also>\S+) not found",
         "there is no image {what} to begin from: correct the FROM line, or name one that the engine"
         " has with --base-image",
@@ -67,6 +72,7 @@ class BuildLog:
     def __init__(self, file: Path, show: Callable[[str], object]) -> None:
         self._file, self._show = file, show
         self._lines: list[str] = []
+        self._begun = ""  # a line of which the rest is still to come
 
     def follow(self, stream: Iterable[Mapping[str, Any]]) -> str | None:
         """Read a build to its end; returns the id of the image, ``None`` if it failed."""
@@ -75,10 +81,12 @@ class BuildLog:
             for message in stream:
                 text = str(message.get("stream") or message.get("error") or "")
                 file.write(text)
-                self._take(text)
                 image = message.get("aux", {}).get("ID", image)
                 if "error" in message:
+                    self._take("\n" * bool(self._begun) + text + "\n")
                     return None
+                self._take(text)
+        self._take("\n")
         return image
 
     @property
@@ -97,7 +105,8 @@ class BuildLog:
         return self._lines[-1] if self._lines else "the engine does not say why"
 
     def _take(self, text: str) -> None:
-        for line in _COLOURS.sub("", text).splitlines():
+        *lines, self._begun = (self._begun + text).split("\n")
+        for line in _COLOURS.sub("", "\n".join(lines)).splitlines():
             if line.strip():
                 self._lines.append(line.rstrip())
                 if line.startswith("Step ") or re.match(r"\s*(Collecting|Downloading)", line):
