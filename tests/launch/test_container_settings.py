@@ -59,6 +59,12 @@ def test_by_default_it_may_nothing_and_sees_only_its_run() -> None:
     assert found["ipc_mode"] == "private"
 
 
+def test_with_a_rootless_engine_its_user_is_root_inside_and_has_no_more_rights() -> None:
+    found = settings(node_file(), user_for(node_file(), {}, is_rootless=True))
+    assert (found["user"], found["group_add"]) == ("0:0", [])
+    assert found["cap_drop"] == ["ALL"]
+
+
 def test_it_is_labelled_and_named() -> None:
     found = settings(node_file(), launcher_pid=77)
     assert found["name"] == "neuros-snn-01234567"

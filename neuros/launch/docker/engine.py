@@ -57,6 +57,11 @@ def connect(
     return engine
 
 
+def is_rootless(engine: DockerClient) -> bool:
+    """Whether the engine runs as an ordinary user, who is root in its containers."""
+    return "name=rootless" in (engine.info().get("SecurityOptions") or ())
+
+
 @contextmanager
 def engine_faults(doing: str) -> Iterator[None]:
     """Turn what the Docker SDK raises into ``EnvironmentFault``, which begins with ``doing``."""

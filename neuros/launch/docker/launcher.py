@@ -16,7 +16,7 @@ from docker import DockerClient
 from neuros.errors import EnvironmentFault
 from neuros.launch.dead_runs import hold
 from neuros.launch.docker.container import RunningContainer
-from neuros.launch.docker.engine import connect, engine_faults
+from neuros.launch.docker.engine import connect, engine_faults, is_rootless
 from neuros.launch.docker.images import Image, images_for
 from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
@@ -85,6 +85,7 @@ class DockerLauncher:
         self._on_started = on_started
         self._placement = placement
         self._environ = environ
+        self._is_rootless = False
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
@@ -99,6 +100,7 @@ class DockerLauncher:
         except OSError as error:
             raise EnvironmentFault(f"no shared memory for containers: {error}") from error
         with engine_faults("the engine's events cannot be listened to"):
+            self._is_rootless = is_rootless(self._engine)
             watch = ContainerWatch(self._engine, environment.get(RUN_ID, ""))
         watch.start()
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
@@ -139,7 +141,7 @@ class DockerLauncher:
         return container_settings(
             file,
             self._images[file.node.container],
-            user_for(file, self._environ),
+            user_for(file, self._environ, is_rootless=self._is_rootless),
             self._options,
             environment,
             cores=self._placement.get(file.node.name),
@@ -170,8 +172,10 @@ def engine_socket(engine: DockerClient) -> str:
     return str(path)
 
 
-def user_for(file: NodeFile, environ: Mapping[str, str]) -> User:
+def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:
     """The caller, as far as a node is let in to what belongs to the caller.
+
+    Whoever runs a rootless engine is called root in its containers, with the same few rights.
 
     Raises:
         EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
@@ -179,9 +183,9 @@ def user_for(file: NodeFile, environ: Mapping[str, str]) -> User:
     groups = {_group_of(file, device) for device in file.node.access.devices}
     key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
     return User(
-        os.getuid(),
-        os.getgid(),
-        tuple(sorted(groups.intersection(os.getgroups()))),
+        0 if is_rootless else os.getuid(),
+        0 if is_rootless else os.getgid(),
+        () if is_rootless else tuple(sorted(groups.intersection(os.getgroups()))),
         environ,
         key if file.node.access.display and key.is_file() else None,
         _dds_settings(environ.get(DDS_SETTINGS)),
