@@ -64,7 +64,7 @@ ROOMS = (
     Room(4, ("transport",)),
     Room(4, ("simulators",)),
     Room(4, ("observe",)),
-    Room(4, ("dashboard",)),
+    Room(4, ("dashboard", "views")),
     Room(4, ("snn",)),
     Room(5, ("runtime",)),
     Room(6, ("cli", "doctor", "replay")),
@@ -94,6 +94,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "observe.bag": {"rosbags", "numpy", "pandas"},
     "cli.bag": {"tabulate"},
     "dashboard": {"starlette", "uvicorn"},
+    "views.rerun_feed": {"rerun", "numpy"},
     "testing": {"pytest", "hypothesis"},
 }
 # The core is pure: no threads, no wall clock, no files.

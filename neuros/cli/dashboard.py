@@ -42,9 +42,12 @@ def add_dashboard(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     dashboard.set_defaults(command=_run_dashboard)
 
 
-def dashboard_of(options: argparse.Namespace) -> DashboardProcess | None:
-    """What the command line asks for, listening already. Raises ``UsageError``."""
-    if not options.dashboard and options.dashboard_port is None:
+def dashboard_of(options: argparse.Namespace, *, is_wanted: bool) -> DashboardProcess | None:
+    """What the command line asks for, listening already. Raises ``UsageError``.
+
+    ``is_wanted``: something else has to be shown there.
+    """
+    if not (options.dashboard or is_wanted) and options.dashboard_port is None:
         return None
     from neuros.launch.dashboard import DashboardProcess
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from neuros.cli.console import Console
-from neuros.cli.dashboard import dashboard_of, start_dashboard
 from neuros.cli.environments import make_environments
 from neuros.cli.observation import Observation, check_observation
 from neuros.cli.plan import Plan, make_plan
@@ -27,9 +26,9 @@ from neuros.cli.run_folder import (
     write_node_files,
     write_record,
 )
+from neuros.cli.views import Shown, Views
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.dashboard import DashboardProcess
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
 from neuros.launch.outcome import Outcome
@@ -59,10 +58,10 @@ def launch(options: argparse.Namespace) -> int:
             if options.dry_run:
                 return _dry_run(plan, domain, options.output, recording)
             check_observation(options)
-            dashboard = dashboard_of(options)
+            views = Views(options, plan)
             run_folder = make_run_folder(options.output, plan.project.name)
             files = write_node_files(plan, run_folder)
-            run = _Run(plan, files, domain, run_folder, signals, waker, recording, dashboard)
+            run = _Run(plan, files, domain, run_folder, signals, waker, recording, views)
             return run.execute(options)
 
 
@@ -78,10 +77,10 @@ class _Run:
         signals: list[int],
         waker: socket.socket,
         recording: RecordingPlan | None,
-        dashboard: DashboardProcess | None,
+        views: Views,
     ) -> None:
         self._plan = plan
-        self._dashboard = dashboard
+        self._views = views
         self._files = files
         self._domain = domain
         self._run_folder = run_folder
@@ -114,7 +113,8 @@ class _Run:
             recording = self._recording(guardian)
             supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
-            self._start_dashboard(guardian)
+            shown = Shown(self._run_id, self._run_folder, self._environment(), self._logs)
+            self._views.start(shown, guardian, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -125,8 +125,7 @@ class _Run:
             observed, faults = observation.finish()
             for fault in (*outcome.faults, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
-            if self._dashboard is not None:
-                self._dashboard.finish()
+            self._views.finish()
             guardian.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
@@ -154,20 +153,6 @@ class _Run:
         is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return outcome.exit_code
-
-    def _start_dashboard(self, guardian: Guardian) -> None:
-        if self._dashboard is None:
-            return
-        pid = start_dashboard(
-            self._dashboard,
-            self._plan,
-            self._run_id,
-            self._run_folder,
-            self._logs,
-            self._environment(),
-        )
-        guardian.watch(pid)
-        self._console.log("INFO", f"dashboard: {self._dashboard.url}")
 
     def _recording(self, guardian: Guardian) -> Recording | None:
         if self._recording_plan is None:

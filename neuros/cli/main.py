@@ -37,6 +37,7 @@ from neuros.cli.report import add_report
 from neuros.cli.reproduce import add_reproduce
 from neuros.cli.sessions import add_sessions
 from neuros.cli.verify import add_verify
+from neuros.cli.views import add_view, add_view_options
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -115,6 +116,7 @@ def parser() -> argparse.ArgumentParser:
     _add_node(commands)
     add_recorder(commands)
     add_dashboard(commands)
+    add_view(commands)
     return result
 
 
@@ -170,6 +172,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     add_observation(launch)
     add_dashboard_options(launch)
+    add_view_options(launch)
     add_recording_options(launch)
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
@@ -195,10 +198,11 @@ def _add_graph(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     _add_project(graph)
     graph.add_argument(
         "--format",
-        choices=("text", "mermaid"),
-        default="text",
-        help="for the terminal, or a Mermaid diagram for Markdown (default: text)",
+        choices=("text", "mermaid", "svg"),
+        help="for the terminal, a Mermaid diagram for Markdown, or a picture (default: text, unless"
+        " the name of the file ends in .mmd or .svg)",
     )
+    graph.add_argument("-o", "--output", metavar="FILE", help="write it there, not to the terminal")
     graph.set_defaults(command=_graph)
 
 
@@ -250,12 +254,9 @@ def _validate(options: argparse.Namespace) -> int:
 
 
 def _graph(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import load
-    from neuros.project.graph import graph_mermaid, graph_text
+    from neuros.cli.graph import write_graph
 
-    project = load(options)
-    print(graph_mermaid(project) if options.format == "mermaid" else graph_text(project))
-    return 0
+    return write_graph(options)
 
 
 def _node(options: argparse.Namespace) -> int:

@@ -21,6 +21,8 @@ def start_companion(
     log: Path,
     environment: Mapping[str, str],
     pass_fds: Sequence[int] = (),
+    *,
+    is_ours: bool = True,
 ) -> subprocess.Popen[bytes]:
     """Start a program in the run folder, in a session of its own, and less urgent than the nodes.
 
@@ -28,10 +30,12 @@ def start_companion(
         what: its name, for messages.
         log: where its standard error goes; input and output are pipes.
         environment: what is added to that of this process.
+        is_ours: whether it is a program of this Python; others do not get the libraries of ours.
 
     Raises:
         EnvironmentFault: if it cannot be started.
     """
+    whole = host_environment(os.environ, environment)
     try:
         with open(log, "ab") as file:
             process = subprocess.Popen(
@@ -40,7 +44,7 @@ def start_companion(
                 stdout=subprocess.PIPE,
                 stderr=file,
                 cwd=run,
-                env=with_libraries(host_environment(os.environ, environment)),
+                env=with_libraries(whole) if is_ours else whole,
                 start_new_session=True,
                 pass_fds=tuple(pass_fds),
             )

@@ -36,11 +36,8 @@ def graph_mermaid(project: Project) -> str:
     for node in project.nodes:
         lines.append(f'    {identity[node.name]}["{node.name}<br/>{_safe(node.container)}"]')
     for c in project.connections:
-        ports = c.source_output
-        if c.destination_input != c.source_output:
-            ports += f" → {c.destination_input}"
         lines.append(
-            f'    {identity[c.source_node]} {_arrow(c)}|"{ports}<br/>{guarantee(c)}"| '
+            f'    {identity[c.source_node]} {_arrow(c)}|"{port_names(c)}<br/>{guarantee(c)}"| '
             f"{identity[c.destination_node]}"
         )
     topics: dict[str, str] = {}
@@ -54,6 +51,12 @@ def graph_mermaid(project: Project) -> str:
             source, destination = ends if is_input else reversed(ends)
             lines.append(f'    {source} -.->|"{port.name}"| {destination}')
     return "\n".join(lines) + "\n"
+
+
+def port_names(connection: Connection) -> str:
+    """The output and the input, or their common name; one that has none is left out."""
+    names = dict.fromkeys((connection.source_output, connection.destination_input))
+    return " → ".join(name for name in names if name)
 
 
 def guarantee(connection: Connection) -> str:

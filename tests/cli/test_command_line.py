@@ -86,14 +86,6 @@ def test_help_documents_the_exit_codes(
         assert f"\n  {code:<4} " in text
 
 
-def test_what_does_not_work_yet_is_not_offered(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["launch", "--help"])
-    text = capsys.readouterr().out
-    for option in ("--node-graph", "--visualisations"):
-        assert option not in text
-
-
 # ------------------------------------------------------------------ usage: exit code 2
 
 

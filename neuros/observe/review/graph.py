@@ -6,11 +6,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from neuros.observe.review.layout import Place, lay_out
 from neuros.observe.review.run import Run
 from neuros.observe.review.spending import Spending, spending_of
 from neuros.observe.review.style import BLUE, GREY, RED, STATES, new_figure
-from neuros.project.graph import guarantee
+from neuros.project.graph import guarantee, port_names
+from neuros.project.layout import Place, lay_out
 
 _COLUMN_IN, _ROW_IN = 2.45, 1.12
 _NODE, _BOX = (1.75, 0.8), (2.05, 0.8)
@@ -91,9 +91,7 @@ def _draw_box(axes: Any, run: Run, name: str, place: Place, colour: str) -> None
     x, y = _at(place)
     _rectangle(axes, x, y, _BOX, "white", colour)
     connection, figures = run.ends[name], run.connections[name]
-    ports = connection.source_output
-    if connection.destination_input != ports:
-        ports += f" → {connection.destination_input}"
+    ports = port_names(connection)
     lines = [guarantee(connection), _counts(figures), _speed(figures)]
     axes.text(x, y + 0.25, _short(ports, 30), ha="center", va="center", fontsize=8, weight="bold")
     axes.text(

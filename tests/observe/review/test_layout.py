@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from test_bottleneck import wires
 
-from neuros.observe.review.layout import Layout, lay_out
+from neuros.project.layout import Layout, lay_out
 
 
 def places_are_apart(layout: Layout) -> bool:

@@ -1,0 +1,1 @@
+"""What is seen of a project in other people's viewers: RViz and Rerun."""
