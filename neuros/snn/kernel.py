@@ -92,10 +92,9 @@ def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> 
     Args:
         seed: 1 to 2**32 - 1; :func:`derive_seed` makes one.
         resolution_ms: NEST's time step, in milliseconds.
-        threads: 1 keeps a run comparable on every machine, and is as fast as more for a small
-            network. More want cores of the node's own: ``affinity`` in the node file and
-            ``threads=threads_of_node()``. Beyond the cores there are it is up to ten times slower,
-            which is warned of.
+        threads: 1 keeps a run comparable on every machine. More want cores of the node's own:
+            ``affinity`` in the node file and ``threads=threads_of_node()``. Beyond the cores there
+            are it is up to ten times slower, which is warned of.
 
     Raises:
         EnvironmentFault: NEST is not installed.
