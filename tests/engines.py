@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from docker import DockerClient
-from machines import Machine
+from machines import Machine, cannot_run, require_machines
 
-from containers import connected, wait_until
+from containers import connected, require_containers, wait_until
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.engine import connect
 
@@ -109,15 +109,26 @@ def own_engine(
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def require_engines(*images: str) -> None:
+    """Skip the test where it cannot have engines of its own with these images; in CI it has to."""
+    require_containers(*images)
+    require_machines("dockerd", "setpriv")
+    if not (_lender() / "overlay2").is_dir():
+        cannot_run("the engine does not keep its images as the storage driver overlay2 does")
+
+
+def _lender() -> Path:
+    """The data of the engine for tests."""
+    with connected() as engine:
+        return Path(engine.info()["DockerRootDir"])
+
+
 def _lend_images(folder: Path) -> None:
     """Let a daemon that has not yet run have the images of the engine for tests, in no time.
 
     ``docker save | docker load`` takes half a minute. Layers never change, so links to them do.
     """
-    with connected() as engine:
-        facts = engine.info()
-    lender = Path(facts["DockerRootDir"])
-    assert facts["Driver"] == "overlay2", f"no layers can be lent from {facts['Driver']}"
+    lender = _lender()
     shutil.copytree(lender / "image", folder / "image", symlinks=True)
     layers = folder / "overlay2"
     layers.mkdir(mode=0o710)

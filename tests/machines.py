@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
-from types import TracebackType
+from typing import NoReturn
 
 import pytest
 
@@ -63,17 +63,6 @@ class Machine:
         self._holder.stdout.close()
         self._holder.wait()
 
-    def __enter__(self) -> Machine:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 def run(*command: str) -> None:
     """Run a command, which must succeed."""
@@ -84,10 +73,14 @@ def run(*command: str) -> None:
 def require_machines(*tools: str) -> None:
     """Skip the test where it cannot have machines or these tools; in CI it has to."""
     missing = [tool for tool in ("unshare", "nsenter", *tools) if shutil.which(tool) is None]
-    reason = f"there is no {', '.join(missing)}" if missing else ""
     if os.geteuid() != 0:
-        reason = "machines within this one take root"
-    if reason and os.environ.get("CI"):
+        cannot_run("machines within this one take root")
+    if missing:
+        cannot_run(f"there is no {', '.join(missing)}")
+
+
+def cannot_run(reason: str) -> NoReturn:
+    """Skip the test; in CI, where it has to run, it fails."""
+    if os.environ.get("CI"):
         pytest.fail(reason)
-    if reason:
-        pytest.skip(reason)
+    pytest.skip(reason)

@@ -15,17 +15,16 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from endings import GONE_WITHIN_S, RUNS, dead_shared_memory
 from launching import BACKENDS, Finished, Running, launch, start
 
-from neuros.launch.shared_memory import _dead_groups
+from containers import wait_until
 
 MARK = "NEUROS_TEST_ENDING"
-GONE_WITHIN_S = 6.0
-SHARED_MEMORY = Path("/dev/shm")
 HEAD = """
 import ctypes, os, signal, sys, threading, time
 from neuros.hooks import (All, Optional, neuros_finalise, neuros_function, neuros_initialise,
@@ -36,13 +35,6 @@ def note(node, text):
 def save(node):
     note(node, "saved")
     node.get_logger().info("all is saved")
-"""
-RUNS = """
-@neuros_tick(seconds=0.05)
-def beat(node):
-    if not node.get_user_data():
-        node.set_user_data("beating")
-        node.get_logger().info("running")
 """
 ENDS = """
 @neuros_tick(seconds=0.1)
@@ -159,8 +151,7 @@ class Bench:
         for domain in re.findall(r"ROS domain (\d+) \(first free", "".join(self.outputs)):
             if _is_stale(Path(f"/tmp/neuros-domain-{domain}.lock")):
                 return f"the lock file of domain {domain}"
-        groups = _dead_groups(SHARED_MEMORY, self.began_s)
-        return " ".join(name for group in groups for name, _ in group.files)
+        return " ".join(dead_shared_memory(self.began_s))
 
 
 def _ports(names: Iterator[str]) -> list[dict[str, str]]:
@@ -182,15 +173,6 @@ def _is_stale(lock: Path) -> bool:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return True
     return False
-
-
-def _wait_until(condition: Callable[[], object], deadline_s: float) -> float:
-    """Wait; returns for how long. Fails at the deadline."""
-    start_s = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start_s < deadline_s, "deadline passed"
-        time.sleep(0.02)
-    return time.monotonic() - start_s
 
 
 @contextlib.contextmanager
@@ -554,7 +536,7 @@ def test_nobody_has_to_read_what_is_printed(bench: Bench) -> None:
         start_new_session=True,
     )
     try:
-        _wait_until(lambda: list(bench.folder.rglob("saved")), 10.0)
+        wait_until(lambda: list(bench.folder.rglob("saved")), 10.0)
         process.terminate()  # it would wait for the reader for ever, but not after that
         assert process.wait(5.0) == 0
     finally:
@@ -592,7 +574,7 @@ def test_when_the_launcher_is_killed_everything_ends(bench: Bench, moments: list
     running.signal(signal.SIGKILL)
     running.process.wait()
     bench.outputs.append(running.output)
-    _wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
+    wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
     if len(moments) == 2:
         assert bench.saved("a", "b"), "nodes that were up had their time"
 
@@ -606,7 +588,7 @@ def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
         running.signal(signal.SIGKILL)
         running.process.wait()
         bench.outputs.append(running.output)
-        _wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
+        wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
         assert bench.saved("b")
 
 

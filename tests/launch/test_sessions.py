@@ -13,19 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from endings import RUNS
 from launching import Running, start
 
 from neuros.launch.guardian import Guardian
 from neuros.launch.sessions import Session, guardian_environment, sessions, this_process
 
-PLUGIN = """
-from neuros.hooks import neuros_tick
-@neuros_tick(seconds=0.1)
-def beat(node):
-    if not node.get_user_data():
-        node.set_user_data("beating")
-        node.get_logger().info("running")
-"""
+PLUGIN = f"from neuros.hooks import neuros_tick\n{RUNS}"
 PROJECT = """
 {"nodes": [{"name": "a", "container": "neuros_python", "plugin": "plugin.py"},
            {"name": "b", "container": "neuros_python", "plugin": "plugin.py"}],

@@ -11,28 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from docker import DockerClient
+from endings import GONE_WITHIN_S, dead_shared_memory
 from launching import Finished, Running, start
 
 from containers import nothing_left, wait_until
 from neuros.launch.docker.settings import shared_memory
 from neuros.launch.run_processes import RUN_ID, RunProcesses
 from neuros.launch.sessions import Session, sessions
-from neuros.launch.shared_memory import _dead_groups
 
-GONE_WITHIN_S = 6.0
 HEAD = """
 import ctypes, json, os, pathlib, signal, socket, subprocess, sys, time
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise, neuros_tick
 @neuros_finalise()
 def save(node):
     (node.run_dir / "saved").touch()
-"""
-RUNS = """
-@neuros_tick(seconds=0.05)
-def beat(node):
-    if not node.get_user_data():
-        node.set_user_data("beating")
-        node.get_logger().info("running")
 """
 HOLDS_THE_GIL = """
 @neuros_initialise()
@@ -102,14 +94,13 @@ class ContainerBench:
 
     def left(self) -> list[str]:
         """What is left of runs: processes, containers, sockets, shared memory."""
-        groups = _dead_groups(Path("/dev/shm"), self.began_s)
         containers = self.engine.api.containers(all=True, filters={"label": "neuros.run"})
         return [
             *(f"{RUN_ID}={run}" for run in self.runs if RunProcesses(run).alive()),
             *(name for each in containers if self._is_mine(each) for name in each["Names"]),
             *map(str, self.folder.rglob("control.sock")),
             *(str(folder) for run in self.runs if (folder := shared_memory(run)).exists()),
-            *(name for group in groups for name, _ in group.files),
+            *dead_shared_memory(self.began_s),
         ]
 
     def _is_mine(self, container: dict[str, Any]) -> bool:

@@ -13,13 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from container_bench import (
-    GONE_WITHIN_S,
-    HOLDS_THE_GIL,
-    RUNS,
-    ContainerBench,
-    container_bench,
-)
+from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
+from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
 
 from containers import require_containers, wait_until

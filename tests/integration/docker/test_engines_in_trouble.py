@@ -5,23 +5,24 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
-from container_bench import RUNS, ContainerBench, container_bench
-from engines import OwnEngine, own_engine
-from machines import Machine, require_machines
+from container_bench import ContainerBench, container_bench
+from endings import RUNS
+from engines import OwnEngine, own_engine, require_engines
+from machines import Machine
 
-from containers import require_containers, wait_until
+from containers import wait_until
 from neuros.cli.main import main
 from neuros.launch.run_processes import RunProcesses
 
 
 @pytest.fixture(scope="module")
 def with_little_room() -> Iterator[OwnEngine]:
-    require_machines()
-    require_containers()
-    with Machine("engine") as machine, own_engine(machine, disk="100m") as engine:
+    require_engines()
+    with closing(Machine("engine")) as machine, own_engine(machine, disk="100m") as engine:
         yield engine
 
 
@@ -45,7 +46,7 @@ def test_when_the_engine_goes_away_the_run_ends_and_says_so(
     running = bench.start_and_wait("a", "b")
     run = bench.session(running).run
     engine.kill()
-    finished = running.finish(20.0)
+    finished = running.finish(30.0)
     assert finished.exit_code == 4
     reason = r"node '.' ended .*: the Docker engine went away .*: start it again"
     assert re.fullmatch(reason, finished.said("neuros")[-1])

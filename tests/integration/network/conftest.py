@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from engines import require_engines
 from two_machines import TwoMachines, two_machines
 
-from containers import IMAGES, require_containers
+from containers import IMAGES
 
 
 @pytest.fixture(scope="session")
@@ -18,7 +19,7 @@ def joined() -> Iterator[TwoMachines]:
 
 @pytest.fixture(scope="session")
 def with_engines(joined: TwoMachines) -> Iterator[TwoMachines]:
-    require_containers(*IMAGES)
+    require_engines(*IMAGES)
     with joined.engines():
         yield joined
 

@@ -1,0 +1,21 @@
+"""What tests of endings share: a node that runs until it is ended, and what may be left of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neuros.launch.shared_memory import _dead_groups
+
+GONE_WITHIN_S = 6.0
+RUNS = """
+@neuros_tick(seconds=0.05)
+def beat(node):
+    if not node.get_user_data():
+        node.set_user_data("beating")
+        node.get_logger().info("running")
+"""
+
+
+def dead_shared_memory(since_s: float) -> list[str]:
+    """Files that dead nodes have left since then (Unix time)."""
+    return [name for group in _dead_groups(Path("/dev/shm"), since_s) for name, _ in group.files]
