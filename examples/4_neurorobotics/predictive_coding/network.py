@@ -132,7 +132,9 @@ class PredictiveCodingNetwork:
         return self._causes(images, codes, 0.0, INFERENCE_STEPS)[-1]
 
     @tf.function
-    def _read_step(self, optimiser, causes, codes) -> None:
+    def _read_step(
+        self, optimiser: tf.keras.optimizers.Optimizer, causes: tf.Tensor, codes: tf.Tensor
+    ) -> None:
         with tf.GradientTape() as tape:
             error = tf.nn.l2_loss(codes - _predicted(causes, self._code))
         optimiser.apply_gradients([(tape.gradient(error, self._code), self._code)])
