@@ -98,8 +98,7 @@ class Views:
             arguments = [] if tool.program == "rqt_graph" else ["-d", self._write_rviz(run.folder)]
             running = tool.start(arguments, run.folder, run.environment)
             self._running.append(running)
-            if running.pid is not None:
-                guardian.watch(running.pid)
+            running.announce(guardian)
             log("INFO", f"{tool.program}: a window on this display")
         if self._dashboard is not None:
             self._running.append(self._dashboard)

@@ -114,9 +114,13 @@ class Guardian:
         """Have a file, socket or folder removed once all processes of the run are gone."""
         self._tell("remove", os.fspath(path.absolute()))
 
+    def watch_engine(self, engine_socket: str) -> None:
+        """Have the run's containers removed from that engine."""
+        self._tell("engine", engine_socket)
+
     def watch_containers(self, engine_socket: str, folder: Path) -> None:
         """Have the run's containers removed from that engine, and the folder that they share."""
-        self._tell("engine", engine_socket)
+        self.watch_engine(engine_socket)
         self.remove_later(folder)
 
     def finish(self, grace_s: float = 0.0) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from neuros.launch.companion import start_companion
 from neuros.launch.docker.tool import ToolContainer, find_tool_image
+from neuros.launch.guardian import Guardian
 
 _END_S = 2.0
 _MOST_WAIT_S = 5.0
@@ -46,7 +47,10 @@ class ToolProcess:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
-        self.pid = process.pid
+
+    def announce(self, guardian: Guardian) -> None:
+        """Have it ended if the launcher is killed."""
+        guardian.watch(self._process.pid)
 
     def finish(self) -> None:
         """End it with the run."""

@@ -2,77 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import psutil
-import requests
 from dashboard.browser import browser_page
-from launching import REPOSITORY, Running, start
-
-WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
-IMU = "world.imu -> brain.imu"
-TIMEOUT_S = 20
+from dashboard.visitor import IMU, WATCHED, Visitor, address, is_full
+from launching import Running, start
 
 
 def start_watched(tmp_path: Path, *arguments: str) -> Running:
     return start(WATCHED, "--dashboard", *arguments, cwd=tmp_path)
-
-
-def address(running: Running) -> str:
-    running.wait_for("dashboard: http://")
-    (found,) = re.findall(r"dashboard: (\S+)\n", running.output)
-    return str(found)
-
-
-class Visitor:
-    """Asks the server as no browser would."""
-
-    def __init__(self, url: str) -> None:
-        self._origin, _, self._token = url.partition("/?token=")
-        welcome = requests.get(url, allow_redirects=False, timeout=TIMEOUT_S)
-        assert welcome.status_code == 303
-        (self._cookie,) = welcome.cookies.keys()
-
-    def get(self, path: str, token: str | None = None, **headers: str) -> int:
-        return self._status("GET", path, token, headers)
-
-    def post(self, path: str, token: str | None = None, **headers: str) -> int:
-        return self._status("POST", path, token, headers)
-
-    def _status(self, method: str, path: str, token: str | None, headers: dict[str, str]) -> int:
-        cookies = {self._cookie: self._token if token is None else token}
-        url = self._origin + path
-        return requests.request(
-            method, url, headers=headers, cookies=cookies, timeout=TIMEOUT_S
-        ).status_code
-
-    @contextlib.contextmanager
-    def events(self) -> Iterator[Iterator[tuple[str, Any]]]:
-        """The events of a page, until its stream ends."""
-        with requests.get(
-            f"{self._origin}/events",
-            cookies={self._cookie: self._token},
-            stream=True,
-            timeout=TIMEOUT_S,
-        ) as answer:
-            assert answer.status_code == 200
-            yield _events(answer)
-
-
-def _events(answer: requests.Response) -> Iterator[tuple[str, Any]]:
-    name = ""
-    for line in answer.iter_lines(decode_unicode=True):
-        key, _, value = line.partition(": ")
-        if key == "event":
-            name = value
-        elif key == "data":
-            yield name, json.loads(value)
 
 
 def sent(page: Any, name: str = IMU) -> int:
@@ -178,11 +119,6 @@ def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -
 
         assert visitor.post("/do/stop", Origin=f"http://{netloc}") == 204
         assert running.finish().exit_code == 0
-
-
-def is_full(figures: Any) -> bool:
-    shown = figures["connections"].get(IMU, {})
-    return bool(shown.get("rate_hz") and shown.get("latency_ms") and figures["real_time_factor"])
 
 
 def test_a_page_is_told_of_every_node_of_one_process_and_of_the_end(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ from docker.errors import DockerException, ImageNotFound
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.engine import connect, engine_faults
+from neuros.launch.docker.launcher import engine_socket
+from neuros.launch.guardian import Guardian
 from neuros.launch.leftover_containers import RUN_LABEL
 from neuros.launch.run_processes import RUN_ID
 
@@ -45,8 +47,6 @@ class ToolContainer:
         EnvironmentFault: if it cannot be started.
     """
 
-    pid = None
-
     def __init__(
         self, program: str, arguments: Sequence[str], run: Path, environment: Mapping[str, str]
     ) -> None:
@@ -58,7 +58,10 @@ class ToolContainer:
                 detach=True,
                 auto_remove=True,
                 environment=_environment(environment, os.environ),
-                labels={RUN_LABEL: environment.get(RUN_ID, "")},
+                labels={
+                    RUN_LABEL: environment.get(RUN_ID, ""),
+                    "neuros.run_folder": str(run),
+                },
                 mounts=list(_mounts(run, os.environ)),
                 network_mode="host",
                 ipc_mode="host",
@@ -66,6 +69,10 @@ class ToolContainer:
                 cap_drop=["ALL"],
                 security_opt=["no-new-privileges"],
             )
+
+    def announce(self, guardian: Guardian) -> None:
+        """Have it removed if the launcher is killed."""
+        guardian.watch_engine(engine_socket(self._engine))
 
     def finish(self) -> None:
         """End it with the run."""

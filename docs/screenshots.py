@@ -1,0 +1,79 @@
+#!/usr/bin/env python3
+"""Makes the pictures of pages in the documentation, from real runs, in a headless Chromium.
+
+::
+
+    .venv/bin/python docs/screenshots.py
+
+It needs ``install.py --dev``, Chromium, and what the examples need. Look at what it has made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import sync_playwright
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures"
+WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
+
+
+@contextlib.contextmanager
+def dashboard_of(project: Path, *arguments: str) -> Iterator[str]:
+    """Run a project; yields the address of its dashboard."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "neuros.cli", "launch", str(project), "--dashboard"]
+        process = subprocess.Popen(
+            [*command, "--backend", "process", *arguments],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+        )
+        assert process.stdout is not None
+        with process.stdout as lines:
+            yield next(m[1] for line in lines if (m := re.search(r"dashboard: (\S+)", line)))
+            process.send_signal(signal.SIGINT)
+            for _ in lines:
+                pass
+        process.wait()
+
+
+def shoot_dashboard(page: Any) -> None:
+    """WhiskEye, with a connection selected and two fields plotted."""
+    with dashboard_of(WHISKEYE, "--set", "nodes.robot.environment.DURATION=1000") as url:
+        page.goto(url)
+        for connection, field in (
+            ("snn.estimate -> visualiser.estimate", "vector.z"),
+            ("robot.imu -> snn.imu", "angular_velocity.z"),
+        ):
+            page.click(f'#connections tr[data-name="{connection}"]')
+            page.click(f'#details tr[data-name="{field}"] button')
+        page.wait_for_function(
+            "() => [...document.querySelectorAll('.chart')].every((c) => c.dataset.points > 300)"
+        )
+        page.screenshot(path=FIGURES / "dashboard.png")
+
+
+def main() -> None:
+    """Make all pictures."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        page = browser.new_page(viewport={"width": 1300, "height": 1000})
+        shoot_dashboard(page)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Asks the server of a dashboard over plain HTTP, as no browser would."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import requests
+from launching import REPOSITORY, Running
+
+WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
+IMU = "world.imu -> brain.imu"
+TIMEOUT_S = 20
+
+
+def address(running: Running) -> str:
+    """What the launcher has printed."""
+    running.wait_for("dashboard: http://")
+    (found,) = re.findall(r"dashboard: (\S+)\n", running.output)
+    return str(found)
+
+
+class Visitor:
+    """Asks the server as no browser would."""
+
+    def __init__(self, url: str) -> None:
+        self._origin, _, self._token = url.partition("/?token=")
+        welcome = requests.get(url, allow_redirects=False, timeout=TIMEOUT_S)
+        assert welcome.status_code == 303
+        (self._cookie,) = welcome.cookies.keys()
+
+    def get(self, path: str, token: str | None = None, **headers: str) -> int:
+        return self._status("GET", path, token, headers)
+
+    def post(self, path: str, token: str | None = None, **headers: str) -> int:
+        return self._status("POST", path, token, headers)
+
+    def _status(self, method: str, path: str, token: str | None, headers: dict[str, str]) -> int:
+        cookies = {self._cookie: self._token if token is None else token}
+        url = self._origin + path
+        return requests.request(
+            method, url, headers=headers, cookies=cookies, timeout=TIMEOUT_S
+        ).status_code
+
+    @contextlib.contextmanager
+    def events(self) -> Iterator[Iterator[tuple[str, Any]]]:
+        """The events of a page, until its stream ends."""
+        with requests.get(
+            f"{self._origin}/events",
+            cookies={self._cookie: self._token},
+            stream=True,
+            timeout=TIMEOUT_S,
+        ) as answer:
+            assert answer.status_code == 200
+            yield _events(answer)
+
+
+def _events(answer: requests.Response) -> Iterator[tuple[str, Any]]:
+    name = ""
+    for line in answer.iter_lines(decode_unicode=True):
+        key, _, value = line.partition(": ")
+        if key == "event":
+            name = value
+        elif key == "data":
+            yield name, json.loads(value)
+
+
+def is_full(figures: Any) -> bool:
+    """Whether all that moves has been seen moving."""
+    shown = figures["connections"].get(IMU, {})
+    return bool(shown.get("rate_hz") and shown.get("latency_ms") and figures["real_time_factor"])
