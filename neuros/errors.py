@@ -4,6 +4,7 @@
 
     NeurosError
     ├── ProjectError        the project files are wrong        exit code 3
+    │   └── DescriptionError   ... a robot's description is
     ├── UsageError          the command line is wrong          exit code 2
     ├── EnvironmentFault    something is missing on this machine   exit code 4
     └── NodeError           a node failed                      exit code 1
@@ -43,11 +44,22 @@ class Problem:
 
 
 class ProjectError(NeurosError):
-    """All problems of a project at once."""
+    """All problems of a project at once; ``outcome`` is what came of it."""
+
+    outcome = "nothing was started"
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(set(problems)))
         super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class DescriptionError(ProjectError):
+    """All problems of a robot's description (SDF, URDF) at once.
+
+    Their pointers are paths of elements: ``model[arm]/link[hand]``.
+    """
+
+    outcome = "nothing was written"
 
 
 class UsageError(NeurosError):

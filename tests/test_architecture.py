@@ -59,6 +59,7 @@ ROOMS = (
     Room(1, ("project",)),
     Room(2, ("core",)),
     Room(3, ("ports", "control")),
+    Room(3, ("convert",)),
     Room(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
     Room(4, ("launch",)),
     Room(4, ("transport",)),
@@ -86,6 +87,8 @@ THIRD_PARTY: dict[str, set[str]] = {
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
     "snn.kernel": {"numpy", "nest"},
+    "convert": {"mujoco", "numpy"},
+    "convert.meshes": {"mujoco", "numpy", "trimesh"},
     "launch.docker": {"docker", "requests"},
     "launch.environments.requirements": {"packaging"},
     "cli.sessions": {"tabulate"},
@@ -95,6 +98,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.bag": {"tabulate"},
     "dashboard": {"starlette", "uvicorn"},
     "views.rerun_feed": {"rerun", "numpy"},
+    "cli.convert": {"tabulate"},
     "testing": {"pytest", "hypothesis"},
 }
 # The core is pure: no threads, no wall clock, no files.

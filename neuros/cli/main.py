@@ -27,6 +27,7 @@ from neuros import __version__
 from neuros.cli.bag import add_bag
 from neuros.cli.benchmark import add_benchmark
 from neuros.cli.containers import add_containers
+from neuros.cli.convert import add_convert
 from neuros.cli.dashboard import add_dashboard, add_dashboard_options
 from neuros.cli.doctor import add_doctor
 from neuros.cli.network import add_network
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str]) -> int:
     except ProjectError as error:
         _complain(str(error))
         count = len(error.problems)
-        _complain(f"{count} problem{'' if count == 1 else 's'}; nothing was started")
+        _complain(f"{count} problem{'' if count == 1 else 's'}; {error.outcome}")
         return EXIT_PROJECT
     except UsageError as error:
         _complain(f"neuros: {error}")
@@ -109,6 +110,7 @@ def parser() -> argparse.ArgumentParser:
     add_report(commands)
     add_bag(commands)
     add_replay(commands)
+    add_convert(commands)
     add_doctor(commands)
     add_containers(commands)
     add_benchmark(commands)

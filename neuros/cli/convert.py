@@ -1,0 +1,118 @@
+"""``neuros convert``: from SDF to MuJoCo's own format."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
+
+if TYPE_CHECKING:
+    from neuros.convert.report import NotTaken
+    from neuros.convert.sdf import Converted
+
+_EPILOG = """\
+exit codes:
+  0    done; what was not taken over is listed
+  2    wrong usage
+  3    the description is wrong: every problem is listed with its file and line
+  4    the file cannot be written, or MuJoCo is not installed
+"""
+
+
+def add_convert(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    convert = commands.add_parser(
+        "convert",
+        help="turn a robot or world in SDF into a MuJoCo model",
+        description="Turn a robot or a world in SDF (1.4 to 1.11) into a MuJoCo model (MJCF), and"
+        " list what has no counterpart there.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    convert.add_argument(
+        "file", metavar="FILE", help="an SDF file, or a folder with a model.config"
+    )
+    convert.add_argument(
+        "-o", "--output", metavar="FILE", help="what to write (default: the name with .xml)"
+    )
+    convert.add_argument(
+        "-I",
+        "--include",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="look for model:// and package:// in this folder (repeatable), before those in"
+        " SDF_PATH, GZ_SIM_RESOURCE_PATH, GAZEBO_MODEL_PATH and ROS_PACKAGE_PATH",
+    )
+    convert.add_argument(
+        "--force", action="store_true", help="overwrite a file that this command has not written"
+    )
+    convert.set_defaults(command=_convert)
+
+
+def _convert(options: argparse.Namespace) -> int:
+    converted, source, output = _converted(options)
+    try:
+        from neuros.convert.output import write_mjcf
+
+        files = write_mjcf(converted, source, output)
+    except OSError as error:
+        raise EnvironmentFault(f"{output}: cannot be written: {error.strerror}") from error
+    except ValueError as error:
+        text = " ".join(str(error).split())
+        text = f"MuJoCo does not read what it has written: {text}"
+        problem = Problem(str(source), 1, 1, "/", text)
+        raise DescriptionError([problem]) from error
+    if converted.not_taken:
+        print(_table(converted.not_taken), end="\n\n")
+    meshes = f", {len(files) - 1} meshes beside it" if len(files) > 1 else ""
+    print(f"{output}: bodies: {converted.bodies}, joints: {converted.joints}{meshes}")
+    if converted.not_taken:
+        count = sum(note.count for note in converted.not_taken)
+        text = f"warning: {count} things were not taken over, or not as they were: see the table"
+        print(text, file=sys.stderr)
+    return 0
+
+
+def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
+    try:
+        from neuros.convert.find import NotFound, finder
+        from neuros.convert.includes import model_file
+        from neuros.convert.output import is_ours
+        from neuros.convert.sdf import convert_sdf
+    except ImportError as error:
+        text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
+        raise EnvironmentFault(text) from error
+    named = Path(options.file)
+    if not named.exists():
+        raise UsageError(f"{named}: there is no such file")
+    try:
+        source = model_file(named)
+    except NotFound as error:
+        raise UsageError(str(error)) from None
+    output = Path(options.output) if options.output else source.with_suffix(".xml")
+    if output.is_dir():
+        raise UsageError(f"{output}: is a folder; name the file to write")
+    if output.exists() and not options.force and not is_ours(output):
+        raise UsageError(f"{output}: exists and is not from this command: name another, or --force")
+    folders = [Path(folder) for folder in options.include]
+    for folder in folders:
+        if not folder.is_dir():
+            raise UsageError(f"-I {folder}: there is no such folder")
+    return convert_sdf(source, finder(folders, os.environ)), source, output
+
+
+def _table(notes: Sequence[NotTaken]) -> str:
+    from tabulate import tabulate
+
+    rows = [
+        [note.place, note.path, f"{note.count} x" if note.count > 1 else "", note.why]
+        for note in notes
+    ]
+    headers = ["where", "what", "", "why it was not taken over, or how it is"]
+    return str(tabulate(rows, headers=headers, disable_numparse=True))

@@ -1,0 +1,90 @@
+"""Places and orientations: what SDF writes as x, y, z, roll, pitch, yaw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from neuros.convert.elements import Element
+from neuros.convert.numbers import numbers
+from neuros.convert.report import Report
+
+Vector = npt.NDArray[np.float64]
+
+
+def _no_turn() -> Vector:
+    return np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where something is, and how it is turned, seen from something else.
+
+    Attributes:
+        position: of its origin, shape (3,), metres.
+        rotation: its axes as columns, shape (3, 3).
+    """
+
+    position: Vector = field(default_factory=lambda: np.zeros(3))
+    rotation: Vector = field(default_factory=_no_turn)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """``other``, which is seen from here, seen from where this one is seen from."""
+        return Pose(self.rotation @ other.position + self.position, self.rotation @ other.rotation)
+
+    def inverse(self) -> Pose:
+        """What this one is seen from, seen from here."""
+        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+
+    @property
+    def quaternion(self) -> Vector:
+        """The rotation as w, x, y, z, shape (4,)."""
+        result = np.zeros(4)
+        mujoco.mju_mat2Quat(result, np.ascontiguousarray(self.rotation).ravel())
+        return result
+
+
+def from_rpy(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> Pose:
+    """A pose in metres and radians; turned about the fixed axes x, y and z, in this order."""
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll, pitch, yaw))
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return Pose(np.array([x, y, z], float), about_z @ about_y @ about_x)
+
+
+def from_quaternion(position: Sequence[float], wxyz: Sequence[float] | Vector) -> Pose:
+    """A pose in metres; the quaternion (w, x, y, z) need not have the length 1."""
+    matrix, quaternion = np.zeros(9), np.array(wxyz, float)
+    mujoco.mju_normalize4(quaternion)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return Pose(np.array(position, float), matrix.reshape(3, 3))
+
+
+def turning_z_to(direction: Vector) -> Vector:
+    """A quaternion (w, x, y, z) that turns the z axis to ``direction``, which need not be unit."""
+    result = np.zeros(4)
+    mujoco.mju_quatZ2Vec(result, direction / np.linalg.norm(direction))
+    return result
+
+
+def read_pose(owner: Element, report: Report) -> Pose:
+    """The pose that ``owner`` writes in its ``<pose>``, whatever that is relative to."""
+    element = owner.child("pose")
+    if element is None or not element.text:
+        return Pose()
+    if element.attributes.get("rotation_format", "euler_rpy") == "quat_xyzw":
+        x, y, z, qx, qy, qz, qw = numbers(element, 7, report, (0, 0, 0, 0, 0, 0, 1))
+        if not math.hypot(qx, qy, qz, qw):
+            report.problem(element, "the quaternion is zero")
+            return Pose()
+        return from_quaternion((x, y, z), (qw, qx, qy, qz))
+    x, y, z, *angles = numbers(element, 6, report, (0,) * 6)
+    if element.attributes.get("degrees", "false") in ("true", "1"):
+        angles = [math.radians(angle) for angle in angles]
+    return from_rpy(x, y, z, *angles)

@@ -1,0 +1,155 @@
+"""URDF for MuJoCo, which reads it itself; its meshes are found, and what it passes over is listed.
+
+MuJoCo joins links that cannot move against each other, and leaves visuals out; both are switched
+off, so that the names of all links are there, unless the ``<mujoco>`` element says otherwise.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from neuros.convert.elements import Element, parse
+from neuros.convert.find import Finder, NotFound
+from neuros.convert.joints import follow_joint
+from neuros.convert.meshes import fill, needs_conversion, triangles_of
+from neuros.convert.report import NotTaken, Report
+from neuros.errors import Problem
+
+_PASSED_OVER = {
+    "gazebo": "an extension for Gazebo",
+    "transmission": "declare drives in the node file: `joint` and `drive`",
+    "ros2_control": "declare drives in the node file: `joint` and `drive`",
+    "safety_controller": "MuJoCo has no such limits",
+    "calibration": "nothing to calibrate in a simulation",
+}
+_KEPT_NAMES = {"fusestatic": "false", "discardvisual": "false"}
+
+
+@dataclass(frozen=True)
+class Described:
+    """A robot as an ``MjSpec``, and what its description says in vain."""
+
+    spec: Any
+    not_taken: tuple[NotTaken, ...]
+
+
+def read_urdf(file: Path, finder: Finder) -> Described:
+    """Read a URDF file.
+
+    Raises:
+        DescriptionError: with every mesh that cannot be found, or what MuJoCo says of the rest.
+    """
+    report = Report()
+    root = parse(file)
+    if isinstance(root, Problem):
+        report.problems.append(root)
+        report.raise_any()
+    assert isinstance(root, Element)
+    if root.tag != "robot":
+        report.problem(root, f"a URDF file begins with <robot>, not with <{root.tag}>")
+    # ElementTree writes it again; the elements with places stand in the same order.
+    tree = ElementTree.parse(file)
+    converted = _resolve_meshes(tree, root, finder, report)
+    report.raise_any()
+    _keep_names(tree)
+    spec = _spec(tree, root, converted, report)
+    for element in _all(root):
+        if element.tag in _PASSED_OVER:
+            report.note(element, _PASSED_OVER[element.tag])
+        elif element.tag == "mimic" and element.parent is not None:
+            _mimic(spec, element, report)
+    return Described(spec, tuple(report.not_taken()))
+
+
+def _resolve_meshes(
+    tree: ElementTree.ElementTree[Any], root: Element, finder: Finder, report: Report
+) -> dict[str, Path]:
+    """Give every mesh an absolute path; those that MuJoCo does not read are returned."""
+    converted: dict[str, Path] = {}
+    folder = _mesh_folder(root)
+    for element, twin in zip(_all(root), tree.getroot().iter(), strict=True):
+        if element.tag != "mesh" or "filename" not in element.attributes:
+            continue
+        uri = element.attributes["filename"]
+        try:
+            try:
+                path = finder.find(uri, root.file.parent)
+            except NotFound:
+                path = finder.find(str(folder / Path(uri).name), root.file.parent)
+        except NotFound:
+            report.problem(
+                element, f"'{uri}' cannot be found", "packages are folders above the file"
+            )
+            continue
+        twin.set("filename", str(path))
+        if needs_conversion(path):
+            if triangles_of(path) is None:
+                report.problem(
+                    element, f"MuJoCo does not read {path.suffix}", "pip install 'neuros[meshes]'"
+                )
+            converted[str(path)] = path
+    return converted
+
+
+def _mesh_folder(root: Element) -> Path:
+    compiler = root.child("mujoco", "compiler")
+    return Path("" if compiler is None else compiler.attributes.get("meshdir", ""))
+
+
+def _keep_names(tree: ElementTree.ElementTree[Any]) -> None:
+    robot = tree.getroot()
+    block = robot.find("mujoco")
+    if block is None:
+        block = ElementTree.SubElement(robot, "mujoco")
+    compiler = block.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(block, "compiler")
+    for key, value in _KEPT_NAMES.items():
+        compiler.attrib.setdefault(key, value)
+    compiler.attrib.pop("meshdir", None)
+    compiler.set("strippath", "false")
+
+
+def _spec(
+    tree: ElementTree.ElementTree[Any], root: Element, converted: dict[str, Path], report: Report
+) -> Any:
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(tree.getroot(), "unicode"))
+        for mesh in spec.meshes:
+            triangles = triangles_of(converted[mesh.file]) if mesh.file in converted else None
+            if triangles is not None:
+                mesh.file = ""
+                fill(mesh, triangles)
+        spec.copy().compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = " ".join(str(error).removeprefix("Error: ").split())
+        report.problem(root, f"MuJoCo cannot compile it: {text}")
+        report.raise_any()
+        raise
+    return spec
+
+
+def _mimic(spec: Any, mimic: Element, report: Report) -> None:
+    """MuJoCo's reader passes over ``<mimic>``: the joint follows another one."""
+    joint, leader = mimic.parent, mimic.attributes.get("joint", "")
+    assert joint is not None
+    if spec.joint(joint.name) is None or spec.joint(leader) is None:
+        report.note(mimic, f"one of '{joint.name}' and '{leader}' does not move in MuJoCo")
+        return
+    offset, ratio = (
+        float(mimic.attributes.get(key, default))
+        for key, default in (("offset", 0.0), ("multiplier", 1.0))
+    )
+    follow_joint(spec, joint.name, leader, offset, ratio)
+
+
+def _all(element: Element) -> Iterator[Element]:
+    yield element
+    for child in element.children:
+        yield from _all(child)
