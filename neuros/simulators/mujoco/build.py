@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
-from neuros.errors import ModelError
+from neuros.convert.find import Finder, NotFound, finder
+from neuros.convert.sdf import convert_sdf
+from neuros.convert.urdf import read_urdf
+from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext
-from neuros.simulators.mujoco.declarations import SensorDeclaration
+from neuros.simulators.mujoco.declarations import (
+    CommandDeclaration,
+    Problems,
+    SensorDeclaration,
+    did_you_mean,
+)
+from neuros.simulators.mujoco.drives import add_drive
+
+_DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
+    ".urdf": read_urdf,
+    ".sdf": convert_sdf,
+    ".world": convert_sdf,
+}
 
 
 def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
     """An ``MjSpec`` of our own, and what to call it in messages.
 
-    ``model`` is the path of an MJCF or URDF file, MJCF as text, or an ``MjSpec``, which is copied.
+    ``model`` is the path of an MJCF, URDF or SDF file, MJCF as text, or an ``MjSpec``, which is
+    copied. What of a URDF or SDF file has no counterpart in MuJoCo is logged as a warning.
     """
     if isinstance(model, mujoco.MjSpec):
         return model.copy(), f"MjSpec '{model.modelname}'"
@@ -24,12 +41,68 @@ def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
         where = f"XML text in {node.description.plugin}"
         return _parsed(lambda: mujoco.MjSpec.from_string(model), where), where
     if isinstance(model, str | Path):
-        path = str(node.resolve_path(str(model)))
-        return _parsed(lambda: mujoco.MjSpec.from_file(path), path), path
+        path = _resolve(node, str(model))
+        return _from_file(node, path), str(path)
     raise ModelError(
         f"a model is the path of a file, MJCF as text, or a mujoco.MjSpec, "
         f"not a {type(model).__name__}"
     )
+
+
+def _resolve(node: NodeContext, model: str) -> Path:
+    """The file, also if it lies in a folder that Gazebo's variables name."""
+    try:
+        return node.resolve_path(model)
+    except ModelError:
+        if Path(model).suffix.lower() not in _DESCRIPTIONS:
+            raise
+        try:
+            return _finder(node).find(model, node.description.plugin.parent)
+        except NotFound:
+            pass
+        raise
+
+
+def _finder(node: NodeContext) -> Finder:
+    return finder((), {**os.environ, **node.description.environment})
+
+
+def _from_file(node: NodeContext, path: Path) -> Any:
+    kind = path.suffix.lower()
+    if kind == ".xml":
+        return _parsed(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
+    if kind == ".mjcf":  # MuJoCo goes by the name: it knows .xml only
+        spec = _parsed(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
+        spec.modelfiledir = str(path.parent)
+        return spec
+    if kind not in _DESCRIPTIONS:
+        known = ", ".join((".xml", ".mjcf", *_DESCRIPTIONS))
+        raise ModelError(f"{path}: a model is a file in MJCF, URDF or SDF ({known})")
+    try:
+        described = _DESCRIPTIONS[kind](path, _finder(node))
+    except DescriptionError as error:
+        raise ModelError(str(error)) from error
+    if described.not_taken:
+        count = sum(note.count for note in described.not_taken)
+        rows = "".join(f"\n  {note}" for note in described.not_taken)
+        node.get_logger().warning(
+            f"{path.name}: {count} things are not taken over, or not as they are:{rows}"
+        )
+    return described.spec
+
+
+def add_drives(spec: Any, commands: Iterable[CommandDeclaration], problems: Problems) -> None:
+    """Add the actuators that the node file declares for joints; problems are reported."""
+    joints = [joint.name for joint in spec.joints]
+    for command in commands:
+        if command.drive is None:
+            continue
+        for name in command.actuators:
+            if name not in joints:
+                hint = did_you_mean(name, joints)
+                problems.add(command.pointer, f"the model has no joint '{name}'{hint}")
+            elif fault := add_drive(spec, name, command.drive):
+                problems.add(command.pointer, fault)
 
 
 def compile_spec(spec: Any, where: str) -> Any:

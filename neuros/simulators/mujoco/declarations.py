@@ -13,6 +13,7 @@ from typing import Any
 
 from neuros.errors import ModelError
 from neuros.project.model import Node, Port
+from neuros.simulators.mujoco.drives import DRIVE_KEYS, Drive, read_drive
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ COMMAND_SIZES: Mapping[str, tuple[int, ...]] = {
 }
 """Message types of commands, and how many actuators each can drive (empty: any number)."""
 
+_NAMING = ("actuator", "actuators", "joint", "joints")
+
 DEFAULT_WIDTH, DEFAULT_HEIGHT = 640, 480
 
 
@@ -75,12 +78,16 @@ class SensorDeclaration:
 
 @dataclass(frozen=True)
 class CommandDeclaration:
-    """The actuators behind an input, in their order. ``pointer`` is the place of their names."""
+    """The actuators behind an input, in their order. ``pointer`` is the place of their names.
+
+    With a ``drive`` the names are those of joints, and each gets an actuator of its name.
+    """
 
     input: str
     type: str
     actuators: tuple[str, ...]
     pointer: str
+    drive: Drive | None = None
 
 
 class Problems:
@@ -183,16 +190,20 @@ def _elements(port: Port, kind: SensorKind, faults: _Faults) -> tuple[str, ...]:
 
 def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration | None:
     faults = _Faults(pointer, problems)
-    faults.unknown_keys(port.mujoco, ("actuator", "actuators"))
-    if ("actuator" in port.mujoco) == ("actuators" in port.mujoco):
-        faults.add("", "give either 'actuator', a name, or 'actuators', a list of names")
+    given = [key for key in _NAMING if key in port.mujoco]
+    if len(given) != 1:
+        faults.add("", f"give either {_either([repr(key) for key in _NAMING])}")
         return None
-    key = "actuator" if "actuator" in port.mujoco else "actuators"
+    (key,) = given
+    drives = key in ("joint", "joints")
+    faults.unknown_keys(port.mujoco, (*_NAMING, *(DRIVE_KEYS if drives else ())))
     value = port.mujoco[key]
-    names = (value,) if key == "actuator" else value
+    is_one = key in ("actuator", "joint")
+    names = (value,) if is_one else value
     if not _is_list_of_names(names):
-        faults.add(key, f"{value!r} is not a {'name' if key == 'actuator' else 'list of names'}")
+        faults.add(key, f"{value!r} is not a {'name' if is_one else 'list of names'}")
         return None
+    drive = read_drive(port.mujoco, faults.add) if drives else None
     if port.type not in COMMAND_SIZES:
         text = f"input '{port.name}' is a {port.type}; a command is {_either(tuple(COMMAND_SIZES))}"
         faults.add(key, text)
@@ -201,7 +212,7 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
         faults.add(key, f"a {port.type} drives {sizes} actuators, not {len(names)}")
     if faults.found:
         return None
-    return CommandDeclaration(port.name, port.type, tuple(names), f"{pointer}/{key}")
+    return CommandDeclaration(port.name, port.type, tuple(names), f"{pointer}/{key}", drive)
 
 
 class _Faults:

@@ -33,8 +33,8 @@ class MuJoCo:
 
     Args:
         node: the ``node`` of the hook.
-        model: path of an MJCF or URDF file (looked up as paths in node files are), MJCF as text,
-            or a ``mujoco.MjSpec`` (copied).
+        model: path of an MJCF, URDF or SDF file (looked up as paths in node files are), MJCF as
+            text, or a ``mujoco.MjSpec`` (copied).
         fine_rendering: cameras with shadows, reflections and multisampling, about 7 x slower.
         clock, wait: wall clock in seconds, and a sleep; for tests.
 

@@ -47,6 +47,7 @@ class World:
         try:
             self._spec, self.where = build.load_spec(node, model)
             build.prepare_rendering(self._spec, self._sensors, fine=fine)
+            build.add_drives(self._spec, self._commands, problems)
             self.model = build.compile_spec(self._spec, self.where)
         except ModelError as error:
             problems.add_text(str(error))
