@@ -7,6 +7,7 @@ from typing import Any
 
 from neuros.errors import Problem
 from neuros.project.draft import Draft
+from neuros.project.gazebo import container_in_place_of, is_for_gazebo
 from neuros.project.message_types import normalised, unknown_type
 from neuros.project.model import Connection, Node, Port
 from neuros.project.paths import PathError
@@ -38,6 +39,10 @@ class Builder:
         variables = element.member("environment")
         if variables is not None and isinstance(variables.value, dict):
             for name, member in variables.value.items():
+                if is_for_gazebo(name) and not self._roots.finds(
+                    member.value, member.source.folder
+                ):
+                    continue
                 value, is_path = self._variable(member)
                 environment[name] = value
                 if is_path:
@@ -45,7 +50,7 @@ class Builder:
         resources, access = _resources_and_access(element)
         return Node(
             name=element.string("name") or "",
-            container=element.string("container") or "",
+            container=container_in_place_of(element.string("container") or ""),
             plugin=self._file(element, "plugin") or Path(),
             script=self._file(element, "script"),
             inputs=self._ports(element, "inputs"),
@@ -87,7 +92,7 @@ class Builder:
         return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
 
     def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
-        container = (node.string("container") or "").partition(":")[0]
+        container = container_in_place_of(node.string("container") or "").partition(":")[0]
         must_be_here = container in STANDARD_CONTAINERS
         return tuple(
             self._port(port, must_be_here=must_be_here)

@@ -13,6 +13,7 @@ from typing import Literal
 from neuros.errors import Problem
 from neuros.project.budgets import budget_mistakes
 from neuros.project.draft import Draft
+from neuros.project.gazebo import remarks_on_gazebo
 from neuros.project.message_types import normalised
 from neuros.project.source import Element
 from neuros.project.suggest import did_you_mean
@@ -42,7 +43,7 @@ def mistakes(draft: Draft) -> list[Problem]:
 
 def remarks(draft: Draft) -> list[Problem]:
     """What is allowed, but may be a mistake. For a project without mistakes."""
-    return sorted([*_gazebo(draft), *_unconnected(draft)])
+    return sorted([*remarks_on_gazebo(draft), *_unconnected(draft)])
 
 
 def _duplicate_nodes(draft: Draft) -> Iterator[Problem]:
@@ -138,26 +139,6 @@ def _different_types(connection: Element, ends: list[Element]) -> Iterator[Probl
         yield connection.problem(
             f"the output sends {types[0]}, the input takes {types[1]}",
             f"{_where(source, 'type')} and {_where(destination, 'type').removeprefix('see ')}",
-        )
-
-
-def _gazebo(draft: Draft) -> Iterator[Problem]:
-    ports = [
-        port
-        for node in draft.nodes
-        for side in ("inputs", "outputs")
-        for port in node.items(side)
-        if port.member("gazebo_type") is not None
-    ]
-    if ports:
-        count = f"{len(ports)} ports have" if len(ports) > 1 else "1 port has"
-        yield (
-            ports[0]
-            .value["gazebo_type"]
-            .key_problem(
-                f"Gazebo itself is not supported: {count} a 'gazebo_type', which has no effect",
-                "MuJoCo stands in for it, see the key 'mujoco'",
-            )
         )
 
 

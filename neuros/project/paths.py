@@ -55,6 +55,16 @@ class Roots:
             )
         raise PathError(f"there is no file '{text}'", self._similar(text, here))
 
+    def finds(self, value: object, here: Path) -> bool:
+        """Whether a value of an environment variable is no path, or one that leads somewhere."""
+        if not isinstance(value, str) or value[:1] not in ("#", "@") or value[:2] in ("##", "@@"):
+            return True
+        try:
+            self.find(value, here, folder_allowed=True)
+        except PathError:
+            return False
+        return True
+
     def is_inside(self, path: Path) -> bool:
         """Whether a resolved path lies in one of the folders."""
         return path.is_relative_to(self.project) or path.is_relative_to(self.workspace)

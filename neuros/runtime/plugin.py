@@ -11,6 +11,11 @@ from pathlib import Path
 from neuros.errors import NeurosError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
 
+_GONE = {
+    "neuros.gazebo": "MuJoCo stands in for Gazebo, and reads its SDF files: use MuJoCo(node, path)"
+    " of neuros.simulators.mujoco in its place",
+}
+
 
 def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
     """Import a plugin under a name of its node's own, and return its hooks in order.
@@ -31,6 +36,8 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
     except NeurosError:
         raise
     except BaseException as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in _GONE:
+            raise PluginError(f"{path}: there is no {error.name}: {_GONE[error.name]}") from error
         raise PluginError(
             f"{path}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
         ) from error

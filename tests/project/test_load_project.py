@@ -92,16 +92,48 @@ def test_numbers_in_the_environment_are_taken_as_they_are_written(folder: Folder
     }  # fmt: skip
 
 
-def test_gazebo_gives_one_warning_for_the_whole_project(folder: Folder) -> None:
+def test_what_only_gazebo_understands_is_named_once_in_every_node(folder: Folder) -> None:
     port = {"type": STRING, "external_topic": "/x", "gazebo_type": "ignition.msgs.IMU"}
     ports = [{"name": name, **port} for name in "abc"]
     folder.file("project.json", {"nodes": [node(inputs=ports), node("m", outputs=ports)]})
     loaded = folder.load()
     assert [str(warning).partition(": ")[2] for warning in loaded.warnings] == [
-        "/nodes/0/inputs/0/gazebo_type: Gazebo itself is not supported: 6 ports have a "
-        "'gazebo_type', which has no effect (MuJoCo stands in for it, see the key 'mujoco')"
+        f"/nodes/{index}/{side}/0/gazebo_type: Gazebo itself is not supported: 3 ports have a "
+        "'gazebo_type', which has no effect: 'a', 'b', 'c'; their external topics are plain ROS "
+        "topics, without a bridge (MuJoCo stands in for it, see the key 'mujoco')"
+        for index, side in ((0, "inputs"), (1, "outputs"))
     ]
     assert loaded.project.node("n").input("a").gazebo_type == "ignition.msgs.IMU"
+
+
+def test_a_node_of_gazebos_container_runs_in_that_of_mujoco(folder: Folder) -> None:
+    folder.file("project.json", {"nodes": [node(container="neuros_gazebo")]})
+    loaded = folder.load()
+    assert loaded.project.node("n").container == "neuros_mujoco"
+    (warning,) = loaded.warnings
+    assert warning.pointer == "/nodes/0/container"
+    assert "runs in 'neuros_mujoco' instead of 'neuros_gazebo'" in warning.text
+
+
+def test_folders_that_only_gazebo_needs_may_be_missing(folder: Folder) -> None:
+    (folder.path / "models").mkdir()
+    environment = {
+        "GZ_SIM_RESOURCE_PATH": "#models",
+        "GAZEBO_MODEL_PATH": "#nowhere",
+        "GZ_SIM_SYSTEM_PLUGIN_PATH": "@install/plugin/lib",
+        "GZ_VERBOSE": 1,
+    }
+    folder.file("project.json", {"nodes": [node(environment=environment)]})
+    loaded = folder.load()
+    assert loaded.project.node("n").environment == {
+        "GZ_SIM_RESOURCE_PATH": str(folder.path / "models"),
+        "GZ_VERBOSE": "1",
+    }
+    assert sorted(warning.pointer.rpartition("/")[2] for warning in loaded.warnings) == [
+        "GAZEBO_MODEL_PATH",
+        "GZ_SIM_SYSTEM_PLUGIN_PATH",
+        "GZ_VERBOSE",
+    ]
 
 
 def test_unconnected_ports_are_warnings(folder: Folder) -> None:

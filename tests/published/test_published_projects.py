@@ -1,7 +1,8 @@
 """Projects in the style of the published NeuROS 1.0 run as they are.
 
-Message types with dots, numbers in the environment, no ``$schema``, ``gazebo_type`` on ports, the
-logger of the ROS node, and no way to end by themselves.
+Message types with dots, numbers in the environment, no ``$schema``, ``gazebo_type`` on ports,
+Gazebo's container, variables and SDF files, the logger of the ROS node, and no way to end by
+themselves.
 """
 
 from __future__ import annotations
@@ -62,3 +63,28 @@ def test_a_gazebo_type_gives_one_warning_and_no_more(backend: str, tmp_path: Pat
     switched = run.said("thermostat")
     assert switched[:2] == ["on", "off"]
     assert run.connection("room.temperature -> thermostat.temperature")["longest_discard"] <= 2
+
+
+def test_what_only_gazebo_understood_is_named_and_the_elevator_goes_all_the_same(
+    backend: str, tmp_path: Path
+) -> None:
+    run = run_until("elevator", "[control]: at level 1", backend, tmp_path)
+    assert run.said("control")[:3] == ["at level 2", "at level 0", "at level 1"]
+    for place, what in (
+        ("physics.json:3:19: /container", "runs in 'neuros_mujoco' instead of 'neuros_gazebo'"),
+        ("physics.json:8:22: /inputs/0/gazebo_type", "'_clock', '_state', '_command'"),
+        ("physics.json:21:56: /environment/GZ_PARTITION", "has no effect"),
+        ("elevator.sdf:8: world[shaft]/plugin[gz::sim::systems::Physics]", "Gazebo"),
+    ):
+        (line,) = (line for line in run.output.splitlines() if place in line)
+        assert what in line
+
+
+def test_a_world_and_a_robot_in_sdf_are_found_where_gazebo_found_them(
+    backend: str, tmp_path: Path
+) -> None:
+    run = run_until("whiskeye", " 3 s: turned 3.0, close", backend, tmp_path)
+    turned = [f"{second} s: turned {second}.0, close" for second in (1, 2, 3)]
+    assert run.said("visualiser")[:3] == turned
+    assert "/environment/GZ_SIM_SYSTEM_PLUGIN_PATH: " in run.output
+    assert "input 'odom_correction' of node 'brain' is not connected" in run.output
