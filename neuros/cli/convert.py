@@ -70,11 +70,13 @@ def _convert(options: argparse.Namespace) -> int:
         raise DescriptionError([problem]) from error
     if converted.not_taken:
         print(_table(converted.not_taken), end="\n\n")
-    meshes = f", {len(files) - 1} meshes beside it" if len(files) > 1 else ""
+    made = len(files) - 1
+    meshes = f", {made} mesh{'' if made == 1 else 'es'} beside it" if made else ""
     print(f"{output}: bodies: {converted.bodies}, joints: {converted.joints}{meshes}")
     if converted.not_taken:
         count = sum(note.count for note in converted.not_taken)
-        text = f"warning: {count} things were not taken over, or not as they were: see the table"
+        things = "1 thing was" if count == 1 else f"{count} things were"
+        text = f"warning: {things} not taken over, or not as in the file: see the table"
         print(text, file=sys.stderr)
     return 0
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from neuros.convert.axes import anchor, read_axis
 from neuros.convert.building import Building
-from neuros.convert.joints import anchor, read_axis
 from neuros.convert.poses import Vector
 from neuros.convert.tree import Joint
 

@@ -12,19 +12,22 @@ import mujoco
 
 from neuros.convert.building import Building, put
 from neuros.convert.controllers import add_actuators
+from neuros.convert.couplings import add_mimics
 from neuros.convert.elements import Element
 from neuros.convert.find import Finder
 from neuros.convert.includes import Includer
 from neuros.convert.inertia import is_computed, read_inertia, set_inertia
-from neuros.convert.joints import add_joints, add_mimics, is_known
+from neuros.convert.joints import add_joints, is_known
 from neuros.convert.loops import close_loop
 from neuros.convert.meshes import Meshes, Triangles
 from neuros.convert.numbers import is_true, word
 from neuros.convert.poses import Pose
 from neuros.convert.report import NotTaken, Report
-from neuros.convert.scopes import Link, Scope, place_all, read_scope
-from neuros.convert.sensors import add_frames, add_joint_sensors, add_link_sensors
+from neuros.convert.scope_reading import place_all, read_scope
+from neuros.convert.scopes import Link, Scope
+from neuros.convert.sensors import add_joint_sensors, add_link_sensors
 from neuros.convert.shapes import add_shapes, share_masks
+from neuros.convert.sites import add_frames
 from neuros.convert.tree import Branch, Joint, Tree, grow
 from neuros.convert.world import add_lights, read_world
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import mujoco
 
+from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.joints import follow_joint
 from neuros.convert.meshes import fill, needs_conversion, triangles_of
 from neuros.convert.report import NotTaken, Report
 from neuros.errors import Problem

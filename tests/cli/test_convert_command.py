@@ -44,7 +44,7 @@ def test_the_file_stands_beside_the_description_and_says_what_it_lacks(robot, ca
     said = capsys.readouterr()
     assert "robot/model.sdf:7  model[robot]/plugin[p]" in said.out
     assert "robot/model.xml: bodies: 1, joints: 1" in said.out
-    assert said.err.startswith("warning: 1 things were not taken over")
+    assert said.err.startswith("warning: 1 thing was not taken over")
     comment = (robot / "model.xml").read_text("utf-8").partition("-->")[0]
     assert "made by `neuros convert` from model.sdf" in comment
     assert "model[robot]/plugin[p]: code that runs inside Gazebo" in comment
@@ -64,7 +64,7 @@ def test_a_mesh_that_mujoco_does_not_read_is_written_beside_the_file(robot, caps
     assert main(["convert", "robot/model.sdf", "-o", "robot/new.xml"]) == 0
     assert (robot / "new_meshes/skin.obj").is_file()
     assert mujoco.MjModel.from_xml_path(str(robot / "new.xml")).nmesh == 1
-    assert "1 meshes beside it" in capsys.readouterr().out
+    assert "1 mesh beside it" in capsys.readouterr().out
 
 
 def test_models_are_looked_up_in_folders_that_are_named(robot, tmp_path, capsys) -> None:

@@ -45,6 +45,7 @@ def echo(plugin, text: str = "") -> PluginHarness:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("import neuros.gazebo", r"there is no neuros.gazebo: MuJoCo stands in for Gazebo"),
         ("import no_such_module", r"cannot be imported: ModuleNotFoundError.*no_such_module"),
         ("def f(:", r"cannot be imported: SyntaxError"),
         ("raise SystemExit(3)", r"cannot be imported: SystemExit: 3"),

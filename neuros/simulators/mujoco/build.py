@@ -85,8 +85,9 @@ def _from_file(node: NodeContext, path: Path) -> Any:
     if described.not_taken:
         count = sum(note.count for note in described.not_taken)
         rows = "".join(f"\n  {note}" for note in described.not_taken)
+        things = "1 thing is" if count == 1 else f"{count} things are"
         node.get_logger().warning(
-            f"{path.name}: {count} things are not taken over, or not as they are:{rows}"
+            f"{path.name}: {things} not taken over, or not as in the file:{rows}"
         )
     return described.spec
 
