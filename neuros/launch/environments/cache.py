@@ -16,28 +16,25 @@ start from reading the metadata of packages.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from neuros.caching import UNUSED_S, cache_root, locked
+
 KEY_LENGTH = 12
 _NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
-_UNUSED_S = 30 * 24 * 3600.0
 
 
 def cache_folder(environ: Mapping[str, str]) -> Path:
-    """Where environments are kept (XDG Base Directory Specification)."""
-    base = environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(base):
-        base = os.path.join(environ.get("HOME") or "/", ".cache")
-    return Path(base) / "neuros" / "environments"
+    """Where environments are kept."""
+    return cache_root(environ) / "environments"
 
 
 @dataclass(frozen=True)
@@ -97,47 +94,17 @@ class Entry:
                 file.unlink(missing_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    @contextlib.contextmanager
-    def locked(self, *, wait: bool = True) -> Iterator[bool]:
+    def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
         """Be the only one who makes or removes it. Raises ``OSError``.
 
-        Yields:
-            False if somebody else is, and ``wait`` is false.
+        The context is False if somebody else is, and ``wait`` is false.
         """
-        path = self._beside(".lock")
-        descriptor = _lock(path, wait)
-        try:
-            yield descriptor is not None
-        finally:
-            if descriptor is not None:
-                # While it is locked: whoever waits for it then sees that it is no longer the file.
-                path.unlink(missing_ok=True)
-                os.close(descriptor)
-
-
-def _lock(path: Path, wait: bool) -> int | None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        # Writable, without which network file systems give no exclusive lock.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            if os.path.samestat(os.fstat(descriptor), os.lstat(path)):
-                return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
-            return None
-        except FileNotFoundError:
-            pass  # its holder has just removed it
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
+        return locked(self._beside(".lock"), wait=wait)
 
 
 def sweep(cache: Path) -> None:
     """Remove what was interrupted, and what no run has used for a month."""
-    oldest_s = time.time() - _UNUSED_S
+    oldest_s = time.time() - UNUSED_S
     names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
     for name in sorted(names):
         entry = Entry(cache / name)
