@@ -26,9 +26,10 @@ class NeurosError(Exception):
 
 @dataclass(frozen=True, order=True)
 class Problem:
-    """One thing wrong in a project file.
+    """One thing wrong in a project file, or a file of a message package.
 
-    ``line`` and ``column`` count from 1; ``pointer`` is a JSON pointer (RFC 6901).
+    ``line`` and ``column`` count from 1; ``pointer`` is a JSON pointer (RFC 6901), empty where the
+    file is not JSON.
     """
 
     file: str
@@ -40,7 +41,8 @@ class Problem:
 
     def __str__(self) -> str:
         hint = f" ({self.hint})" if self.hint else ""
-        return f"{self.file}:{self.line}:{self.column}: {self.pointer}: {self.text}{hint}"
+        pointer = f"{self.pointer}: " if self.pointer else ""
+        return f"{self.file}:{self.line}:{self.column}: {pointer}{self.text}{hint}"
 
 
 class ProjectError(NeurosError):

@@ -68,10 +68,12 @@ ROOMS = (
     Room(4, ("dashboard", "views")),
     Room(4, ("snn",)),
     Room(5, ("runtime",)),
+    Room(4, ("messages",)),
     Room(6, ("cli", "doctor", "replay")),
     Room(6, ("bag",)),
     Room(6, ("testing",)),
     Room(1, ("installation",)),
+    Room(1, ("caching",)),
 )
 # The package itself holds public names; every room may ask it for the version.
 PUBLIC_NAMES = Room(2, ("",))
@@ -79,6 +81,9 @@ PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
 MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
+GENERATORS = {f"rosidl_generator_{name}" for name in ("c", "py", "type_description")}
+GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "introspection_c")}
+GENERATORS |= {"rosidl_adapter"}
 # What is not named here has none; a part of a room may have less than the room.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
@@ -91,6 +96,10 @@ THIRD_PARTY: dict[str, set[str]] = {
     "convert.meshes": {"mujoco", "numpy", "trimesh"},
     "launch.docker": {"docker", "requests"},
     "launch.environments.requirements": {"packaging"},
+    "messages.package": {"catkin_pkg"},
+    "messages.definition": {"rosidl_adapter"},
+    "messages.generation": GENERATORS,
+    "messages.compilation": {"numpy"},
     "cli.sessions": {"tabulate"},
     "replay.debugging": {"debugpy"},
     "observe": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},

@@ -11,12 +11,37 @@ import importlib
 import importlib.util
 import re
 import sys
+from collections.abc import Collection
 from pathlib import Path
+from typing import Protocol
 
 from neuros.project.suggest import did_you_mean
 
 _NOTATION = re.compile(r"([A-Za-z]\w*)(?:\.msg\.|/msg/)([A-Za-z]\w*)", re.ASCII)
 _IMPORTED = re.compile(r"^\s*from\s+\S+\s+import\s+(\w+)", re.MULTILINE)
+
+
+class MessagePackages(Protocol):
+    """Message packages that a project brings, or shares: they need not be built yet."""
+
+    def messages(self, package: str) -> Collection[str] | None:
+        """The names of its messages, ``None`` if there is no such package."""
+
+    def installed(self, package: str) -> Path | None:
+        """The folder that it is, or will be, built into, ``None`` if there is no such package."""
+
+
+class NoPackages:
+    """There are none (:class:`MessagePackages`)."""
+
+    def messages(self, package: str) -> None:
+        return None
+
+    def installed(self, package: str) -> None:
+        return None
+
+
+NO_PACKAGES = NoPackages()
 
 
 def normalised(text: str) -> str | None:
@@ -25,28 +50,39 @@ def normalised(text: str) -> str | None:
     return f"{match[1]}/msg/{match[2]}" if match else None
 
 
-def unknown_type(type_name: str, *, must_be_here: bool) -> tuple[str, str] | None:
+def unknown_type(
+    type_name: str, *, must_be_here: bool, packages: MessagePackages = NO_PACKAGES
+) -> tuple[str, str] | None:
     """What is wrong with a normalised type, and a hint; ``None`` if nothing is, or nobody knows.
 
     Args:
         must_be_here: whether it is wrong too if its package is not installed on this machine.
+        packages: those that are built for the project.
     """
     package, _, name = type_name.split("/")
+    own = packages.messages(package)
+    if own is not None:
+        return None if name in own else _no_message(type_name, own)
     folder = _message_folder(package)
     if folder is None:
         if not must_be_here:
             return None
         return (
             f"unknown message type '{type_name}': there is no message package '{package}' here",
-            did_you_mean(package, _installed_packages()),
+            _similar_package(package)
+            or f"a message of your own is workspace/{package}/msg/{name}.msg beside the project"
+            " file: docs/messages.md",
         )
     names = _IMPORTED.findall((folder / "__init__.py").read_text(encoding="utf-8"))
     if name in names or _really_has(package, name):
         return None
-    return (
-        f"unknown message type '{type_name}': '{package}' has no message '{name}'",
-        did_you_mean(name, names),
-    )
+    return _no_message(type_name, names)
+
+
+def _no_message(type_name: str, names: Collection[str]) -> tuple[str, str]:
+    package, _, name = type_name.split("/")
+    text = f"unknown message type '{type_name}': '{package}' has no message '{name}'"
+    return text, did_you_mean(name, names)
 
 
 def _message_folder(package: str) -> Path | None:
@@ -66,6 +102,13 @@ def _really_has(package: str, name: str) -> bool:
         return hasattr(importlib.import_module(f"{package}.msg"), name)
     except Exception:  # whatever a broken package raises: the message cannot be used
         return False
+
+
+def _similar_package(package: str) -> str:
+    """Whether another one is meant; nearly all end alike, which makes none of them similar."""
+    ending = "_msgs" if package.endswith("_msgs") else ""
+    names = {name.removesuffix(ending) for name in _installed_packages() if name.endswith(ending)}
+    return did_you_mean(package.removesuffix(ending), names).replace("'?", f"{ending}'?")
 
 
 def _installed_packages() -> set[str]:

@@ -1,0 +1,19 @@
+"""Message packages of the user's own, built without a ROS distribution.
+
+A ROS package in a ``workspace`` folder (``package.xml``, ``msg/*.msg``, ``srv/*.srv``,
+``action/*.action``) becomes a Python package with its C libraries. What colcon and CMake do in a
+ROS distribution is done here with rosidl's generators, which come with the wheels, and gcc:
+
+- :mod:`~neuros.messages.package` finds packages and reads their manifests;
+- :mod:`~neuros.messages.definition` checks message files, line by line;
+- :mod:`~neuros.messages.workspace` knows all packages that a project sees: order, keys, mistakes;
+- :mod:`~neuros.messages.installed` knows those that come with ROS;
+- :mod:`~neuros.messages.cache` knows what is built, and who builds what;
+- :mod:`~neuros.messages.building` builds, with the generators in
+  :mod:`~neuros.messages.generation` and the compiler in :mod:`~neuros.messages.compilation`.
+
+**One build for every Python.** Of what the generators write only the conversion from and to Python
+objects depends on Python. It is compiled against Python's stable ABI (``stable_abi.h``), and needs
+no newer glibc than the wheels of ROS 2 do: one build serves Python 3.10 to 3.14, on this machine
+and in containers. Nothing has to be compiled in an image, which mostly has no compiler.
+"""

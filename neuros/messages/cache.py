@@ -1,0 +1,98 @@
+"""The cache of built packages.
+
+::
+
+    ~/.cache/neuros/messages/         (or $XDG_CACHE_HOME/neuros/messages)
+        <package>-<key>/              a built package, whole from its first moment
+            python/<package>/         what Python imports
+            lib/                      its C libraries
+            share/<package>/          definitions, and type descriptions with their hashes
+            include/<package>/        headers, for packages that depend on it
+        <package>-<key>.lock          only while somebody builds it
+        <package>-<key>.log           what the generators and the compiler wrote, after a failure
+
+A package is built in a folder beside, which gets its name when it is whole. The libraries of one
+find those of another by the path between their folders: the cache can be anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from neuros.caching import UNUSED_S, cache_root, locked
+
+KEY_LENGTH = 12
+_NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
+
+
+def message_cache(environ: Mapping[str, str]) -> Path:
+    """Where built packages are kept."""
+    return cache_root(environ) / "messages"
+
+
+@dataclass(frozen=True)
+class Built:
+    """One package, built or not."""
+
+    package: str
+    folder: Path
+
+    @property
+    def python(self) -> Path:
+        """What has to be on Python's path."""
+        return self.folder / "python"
+
+    @property
+    def share(self) -> Path:
+        return self.folder / "share" / self.package
+
+    @property
+    def draft(self) -> Path:
+        """Where it is built."""
+        return self._beside(".draft")
+
+    @property
+    def log(self) -> Path:
+        return self._beside(".log")
+
+    @property
+    def is_there(self) -> bool:
+        return self.folder.is_dir()
+
+    def _beside(self, suffix: str) -> Path:
+        return self.folder.with_name(self.folder.name + suffix)
+
+    def note_use(self) -> None:
+        """Keep it from being removed as unused."""
+        with contextlib.suppress(OSError):
+            os.utime(self.folder)
+
+    def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
+        """Be the only one who builds or removes it. Raises ``OSError``."""
+        return locked(self._beside(".lock"), wait=wait)
+
+
+def sweep(cache: Path) -> None:
+    """Remove what was interrupted, and what no run has used for a month."""
+    oldest_s = time.time() - UNUSED_S
+    names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
+    for name in sorted(names):
+        built = Built(name[: -KEY_LENGTH - 1], cache / name)
+        with contextlib.suppress(OSError), built.locked(wait=False) as is_mine:
+            if is_mine:
+                shutil.rmtree(built.draft, ignore_errors=True)
+                _remove_if_older(built, oldest_s)
+
+
+def _remove_if_older(built: Built, oldest_s: float) -> None:
+    if built.is_there and built.folder.stat().st_mtime < oldest_s:
+        shutil.rmtree(built.folder, ignore_errors=True)
+    if built.log.exists() and built.log.stat().st_mtime < oldest_s:
+        built.log.unlink()

@@ -1,0 +1,132 @@
+"""ROS packages with messages: found in a workspace as colcon finds them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from neuros.errors import Problem
+
+MANIFEST = "package.xml"
+KINDS = ("msg", "srv", "action")
+"""The folders of interfaces, which are also the suffixes of the files in them."""
+
+_IGNORED = ("COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE")
+_NOT_SOURCES = {"build", "install", "log"}
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package with interfaces.
+
+    Attributes:
+        folder: the one with its ``package.xml``.
+        files: its interface files, relative to the folder: ``msg/Joints.msg``.
+        dependencies: the packages that it names for building.
+    """
+
+    name: str
+    folder: Path
+    files: tuple[Path, ...]
+    dependencies: frozenset[str]
+
+    @property
+    def messages(self) -> set[str]:
+        """The names of its messages."""
+        return {file.stem for file in self.files if file.suffix == ".msg"}
+
+    @property
+    def summary(self) -> str:
+        """``2 messages, 1 service``."""
+        words = {"msg": "message", "srv": "service", "action": "action"}
+        counts = {
+            word: sum(f.suffix == f".{kind}" for f in self.files) for kind, word in words.items()
+        }
+        return ", ".join(f"{n} {word}{'' if n == 1 else 's'}" for word, n in counts.items() if n)
+
+
+def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
+    """The packages with interfaces in a folder, and what is wrong with their manifests.
+
+    Folders with a ``COLCON_IGNORE`` are left out, as are hidden ones and what colcon makes.
+    """
+    packages: list[Package] = []
+    problems: list[Problem] = []
+    for folder in _package_folders(workspace):
+        files = _interface_files(folder)
+        if not files:
+            continue
+        try:
+            package = _read(folder, files)
+        except ManifestError as error:
+            problems.append(error.problem)
+            continue
+        twin = next((other for other in packages if other.name == package.name), None)
+        if twin:
+            text = f"found the package '{package.name}' twice, also in {twin.folder}"
+            problems.append(problem_at(folder / MANIFEST, text))
+        else:
+            packages.append(package)
+    return packages, problems
+
+
+def problem_at(file: Path, text: str, line: int = 1, column: int = 1, hint: str = "") -> Problem:
+    """A problem at a place in a file that is not JSON; the file as the user may have named it."""
+    try:
+        shown = file.relative_to(Path.cwd())
+    except ValueError:
+        shown = file
+    return Problem(str(shown), line, column, "", text, hint)
+
+
+class ManifestError(Exception):
+    """A ``package.xml`` that cannot be used."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        super().__init__(str(problem))
+
+
+def _package_folders(workspace: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(workspace):
+        if any(name in files for name in _IGNORED):
+            folders.clear()
+        elif MANIFEST in files:
+            folders.clear()  # packages do not nest
+            yield Path(place)
+        else:
+            folders[:] = sorted(
+                name for name in folders if name[0] != "." and name not in _NOT_SOURCES
+            )
+
+
+def _interface_files(folder: Path) -> tuple[Path, ...]:
+    return tuple(
+        file.relative_to(folder)
+        for kind in KINDS
+        for file in sorted((folder / kind).glob(f"*.{kind}"))
+    )
+
+
+def _read(folder: Path, files: tuple[Path, ...]) -> Package:
+    # Imported here: it takes 50 ms, and most projects have no message packages.
+    from catkin_pkg.package import InvalidPackage, parse_package_string
+
+    file = folder / MANIFEST
+    try:
+        manifest = parse_package_string(file.read_text("utf-8"), str(file), warnings=[])
+    except (InvalidPackage, OSError, UnicodeError, AssertionError, ValueError) as error:
+        lines = str(error).splitlines() or [""]
+        text = " ".join(
+            line.strip() for line in lines if not line.startswith("Error(s) in package")
+        )
+        raise ManifestError(problem_at(file, text, _line_of(error))) from error
+    depends = (*manifest.build_depends, *manifest.build_export_depends, *manifest.exec_depends)
+    return Package(manifest.name, folder, files, frozenset(each.name for each in depends))
+
+
+def _line_of(error: BaseException) -> int:
+    """The line that a mistake in XML is in; what is missing is in none."""
+    return int(getattr(error.__context__, "lineno", 1))

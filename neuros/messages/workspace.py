@@ -1,0 +1,149 @@
+"""All message packages that a project sees, in order, with their keys and what is wrong in them."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+from neuros.errors import Problem
+from neuros.messages.cache import KEY_LENGTH, Built, message_cache
+from neuros.messages.installed import Ros
+from neuros.messages.package import MANIFEST, Package, find_packages, problem_at
+
+_FORMAT = b"1"  # of what is built; another one builds everything anew
+_ABI = Path(__file__).with_name("stable_abi.h")
+GENERATORS = (
+    "rosidl_adapter",
+    "rosidl_generator_type_description",
+    "rosidl_generator_c",
+    "rosidl_typesupport_introspection_c",
+    "rosidl_typesupport_fastrtps_c",
+    "rosidl_typesupport_c",
+    "rosidl_generator_py",
+)
+"""What turns definitions into code, in this order."""
+
+
+class Workspaces:
+    """The packages with messages in some workspaces; of two with one name the first counts.
+
+    Nothing is read before something is asked.
+
+    Args:
+        own: the workspace of the project: all its packages are built.
+        shared: the workspace of NeuROS: those that somebody needs are built.
+        environ: says where built packages are kept.
+    """
+
+    def __init__(
+        self,
+        own: Path | None,
+        shared: Path | None,
+        environ: Mapping[str, str],
+        ros: Ros | None = None,
+    ) -> None:
+        self._folders = (own, shared)
+        self._cache = message_cache(environ)
+        self.ros = ros or Ros.here()
+
+    @cached_property
+    def _found(self) -> tuple[dict[str, Package], set[str], list[Problem]]:
+        packages: dict[str, Package] = {}
+        own: set[str] = set()
+        problems: list[Problem] = []
+        seen: set[Path] = set()
+        for folder in self._folders:
+            if folder is None or folder.resolve() in seen or not folder.is_dir():
+                continue
+            seen.add(folder.resolve())
+            found, wrong = find_packages(folder.resolve())
+            problems += wrong
+            for package in found:
+                packages.setdefault(package.name, package)
+            if folder == self._folders[0]:
+                own = set(packages)
+        return packages, own, problems
+
+    @property
+    def packages(self) -> dict[str, Package]:
+        """All of them, by name."""
+        return self._found[0]
+
+    @property
+    def own(self) -> set[str]:
+        """The names of those in the project's workspace."""
+        return self._found[1]
+
+    @property
+    def problems(self) -> list[Problem]:
+        """What is wrong with manifests."""
+        return self._found[2]
+
+    def messages(self, package: str) -> Collection[str] | None:
+        """The names of the messages of a package, ``None`` if it is not in a workspace."""
+        return self.packages[package].messages if package in self.packages else None
+
+    def installed(self, package: str) -> Path | None:
+        """The folder that a package is built into, ``None`` if it is not in a workspace."""
+        try:
+            return next((b.folder for b in self.builds([package]) if b.package == package), None)
+        except CycleError:
+            return None
+
+    def builds(self, names: Iterable[str]) -> list[Built]:
+        """Packages and all that they depend on, built or not, as :meth:`closure` orders them."""
+        packages = self.closure(names)
+        keys = self._keys(packages)
+        return [Built(p.name, self._cache / f"{p.name}-{keys[p.name]}") for p in packages]
+
+    def closure(self, names: Iterable[str]) -> list[Package]:
+        """Packages and all that they depend on, each after those that it needs.
+
+        Raises:
+            CycleError: if there is no such order.
+        """
+        graph: dict[str, set[str]] = {}
+        pending = [name for name in names if name in self.packages]
+        while pending:
+            name = pending.pop()
+            if name not in graph:
+                graph[name] = set(self.needs(name))
+                pending += graph[name]
+        sorter = TopologicalSorter({name: sorted(graph[name]) for name in sorted(graph)})
+        return [self.packages[name] for name in sorter.static_order()]
+
+    def needs(self, name: str) -> list[str]:
+        """The packages of the workspaces that one of them names."""
+        return sorted(self.packages[name].dependencies & set(self.packages) - {name})
+
+    def _keys(self, packages: Sequence[Package]) -> dict[str, str]:
+        """What each package is recognised by.
+
+        It changes with the content of the package, of those that it needs, and with the version
+        of the generators and of ROS's own packages; not with that of Python.
+        """
+        tools = b"".join(self.ros.manifest(name) for name in GENERATORS)
+        keys: dict[str, str] = {}
+        for package in packages:
+            digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
+            digest.update(platform.machine().encode())
+            for file in (Path(MANIFEST), *package.files):
+                content = (package.folder / file).read_bytes()
+                digest.update(f"{file.as_posix()}\0{len(content)}\0".encode() + content)
+            for name in sorted(package.dependencies):
+                there = keys[name].encode() if name in keys else self.ros.manifest(name)
+                digest.update(f"{name}\0{len(there)}\0".encode() + there)
+            keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
+        return keys
+
+
+def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
+    """What to say of packages that need each other."""
+    names: list[str] = error.args[1]
+    package = workspaces.packages[names[0]]
+    text = f"found packages that need each other: {' -> '.join(names)}"
+    return problem_at(package.folder / MANIFEST, text)
