@@ -1,4 +1,7 @@
-"""Makes the virtual environments of a run before it begins; can be interrupted at any time."""
+"""Makes what a run needs before it begins: virtual environments, and message packages.
+
+It can be interrupted at any time.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,15 @@ from neuros.installation.progress import Progress
 from neuros.launch.environments.pythons import Pythons
 from neuros.launch.guardian import Guardian
 from neuros.launch.run_processes import RUN_ID
+from neuros.launch.wheels import without_mark
+from neuros.messages.needed import Messages
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def make_environments(pythons: Pythons, signals: list[int]) -> int:
+def make_environments(
+    pythons: Pythons, signals: list[int], messages: Messages | None = None
+) -> int:
     """Make what is missing, and say so; returns 0, or the exit code of a signal that ended it.
 
     Args:
@@ -29,22 +36,36 @@ def make_environments(pythons: Pythons, signals: list[int]) -> int:
     for notice in pythons.notices:
         print(f"neuros: {notice}", file=sys.stderr)
     pythons.note_use()
-    if pythons.is_made:
+    if messages is not None:
+        messages.note_use()
+    if pythons.is_made and (messages is None or messages.is_made):
         return 0
     try:
         with _signals_interrupt(signals):
-            _make(pythons)
+            _make(pythons, messages)
     except KeyboardInterrupt:
         return 130 if signals[:1] == [signal.SIGINT] else 143
     return 0
 
 
-def _make(pythons: Pythons) -> None:
-    # pip, and what it starts, must not outlive a launcher that is killed.
+def build_messages(messages: Messages) -> int:
+    """Build message packages; returns 0, or the exit code of a signal that ended it.
+
+    Raises:
+        EnvironmentFault: with what failed.
+    """
+    return make_environments(Pythons({}), [], messages)
+
+
+def _make(pythons: Pythons, messages: Messages | None) -> None:
+    # pip, the compiler, and what they start must not outlive a launcher that is killed.
     run_id = os.urandom(8).hex()
     guardian = Guardian.start(run_id)
     try:
-        pythons.make(Progress(_Output()), {RUN_ID: run_id})
+        progress = Progress(_Output())
+        if messages is not None:
+            messages.make(progress, {**without_mark(os.environ), RUN_ID: run_id})
+        pythons.make(progress, {RUN_ID: run_id})
     finally:
         guardian.finish()
 

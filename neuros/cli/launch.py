@@ -31,6 +31,7 @@ from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock, choose_domain
 from neuros.launch.guardian import Guardian
+from neuros.launch.host_command import with_messages
 from neuros.launch.outcome import Outcome
 from neuros.launch.sessions import Session, guardian_environment, this_process
 from neuros.launch.sides import Sides
@@ -52,7 +53,9 @@ def launch(options: argparse.Namespace) -> int:
         plan = make_plan(options)
         recording = plan_of(options, plan, os.environ)
         is_known = plan.needs_known_domain or bool(recording and recording.wanted)
-        if not options.dry_run and (ended := make_environments(plan.pythons, signals)):
+        if not options.dry_run and (
+            ended := make_environments(plan.pythons, signals, plan.messages)
+        ):
             return ended
         with choose_domain(options.domain_id, os.environ, is_known) as domain:
             if options.dry_run:
@@ -113,7 +116,7 @@ class _Run:
             recording = self._recording(guardian)
             supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
-            shown = Shown(self._run_id, self._run_folder, self._environment(), self._logs)
+            shown = Shown(self._run_id, self._run_folder, self._beside(), self._logs)
             self._views.start(shown, guardian, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
@@ -158,8 +161,14 @@ class _Run:
         if self._recording_plan is None:
             return None
         return Recording(
-            self._recording_plan, self._run_id, self._run_folder, self._environment(), guardian
+            self._recording_plan, self._run_id, self._run_folder, self._beside(), guardian
         )
+
+    def _beside(self) -> dict[str, str]:
+        """What programs beside the nodes get, which know the same messages."""
+        path = {key: os.environ[key] for key in ("PYTHONPATH",) if key in os.environ}
+        messages = self._plan.messages
+        return with_messages({**path, **self._environment()}, messages.paths if messages else ())
 
     def _judge(self, record: dict[str, Any], outcome: Outcome) -> None:
         """Hold the run to its budgets."""
@@ -247,7 +256,8 @@ def _dry_run(
 ) -> int:
     folder = run_folder_path(output, plan.project.name, "<utc time>")
     print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
-    for line in (*plan.pythons.notices, *plan.pythons.describe()):
+    messages = plan.messages.describe() if plan.messages else ()
+    for line in (*plan.pythons.notices, *plan.pythons.describe(), *messages):
         print(line)
     for _, notice in plan.back_end.notices:
         print(notice)

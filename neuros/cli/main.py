@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from neuros import __version__
 from neuros.cli.bag import add_bag
 from neuros.cli.benchmark import add_benchmark
+from neuros.cli.build import add_build
 from neuros.cli.containers import add_containers
 from neuros.cli.convert import add_convert
 from neuros.cli.dashboard import add_dashboard, add_dashboard_options
@@ -105,6 +106,7 @@ def parser() -> argparse.ArgumentParser:
     _add_launch(commands)
     _add_validate(commands)
     _add_graph(commands)
+    add_build(commands)
     add_sessions(commands)
     add_verify(commands)
     add_report(commands)

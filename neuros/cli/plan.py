@@ -7,18 +7,19 @@ import os
 import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 from neuros.cli.back_end import BackEnd, choose_back_end
 from neuros.cli.network import THIS_MACHINE, Network, chosen_network
-from neuros.cli.projects import load
+from neuros.cli.projects import load_with_messages
 from neuros.cli.recording_options import is_recorded
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
 from neuros.launch.guardian import Guardian
 from neuros.launch.placement import Cores, place
+from neuros.messages.needed import Messages
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
@@ -49,6 +50,7 @@ class Plan:
     has_digests: bool = False
     is_recorded: bool = False
     network: Network = THIS_MACHINE
+    messages: Messages | None = None
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -76,7 +78,8 @@ class Plan:
     def node_files(self, folders: Folders) -> list[NodeFile]:
         """One ``node.json`` per node that is to be started."""
         files = split(self.project, lambda _: folders)
-        return [file for file in files if file.node.name in self.names]
+        paths = self.messages.paths if self.messages else ()
+        return [replace(f, messages=paths) for f in files if f.node.name in self.names]
 
     def placement(self, domain_id: int) -> Mapping[str, Cores]:
         """The cores of the nodes that are to be started, where that is not up to the kernel.
@@ -116,7 +119,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
     """
     duration = parse_duration(options.duration)
-    project = load(options)
+    project, messages = load_with_messages(options)
     network = chosen_network(options.network, options.peers)
     names = _chosen_names(project, options.node, options.backend)
     back_end = choose_back_end(options.backend, project, names)
@@ -135,6 +138,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
         has_digests=options.digests,
         is_recorded=is_recorded(options),
         network=network,
+        messages=messages,
     )
     if back_end.name == "in-process" and network.is_wide and plan.is_partial:
         raise UsageError(

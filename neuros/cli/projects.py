@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
-from neuros.errors import UsageError
+from neuros.errors import ProjectError, UsageError
+from neuros.messages.needed import Messages
+from neuros.messages.workspace import Workspaces
 from neuros.project.load import load_project
 from neuros.project.model import Project
 
@@ -29,12 +32,32 @@ def project_path(options: argparse.Namespace) -> Path:
 
 
 def load(options: argparse.Namespace) -> Project:
-    """Load the project; its warnings go to standard error.
+    """Load the project as :func:`load_with_messages` does."""
+    return load_with_messages(options)[0]
+
+
+def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
+    """Load the project and find its message packages; warnings go to standard error.
 
     Raises:
-        ProjectError: with all its problems.
+        ProjectError: with all its problems, and those of its message files.
     """
-    loaded = load_project(project_path(options), workspace=WORKSPACE, overrides=options.set)
+    path = project_path(options)
+    workspaces = workspaces_of(path)
+    try:
+        loaded = load_project(path, workspace=WORKSPACE, overrides=options.set, packages=workspaces)
+    except ProjectError as error:
+        problems = Messages(workspaces, workspaces.own).problems()
+        raise ProjectError([*error.problems, *problems]) from None
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return loaded.project
+    messages = Messages.of_nodes(loaded.project.nodes, workspaces)
+    if problems := messages.problems():
+        raise ProjectError(problems)
+    return loaded.project, messages
+
+
+def workspaces_of(project: Path) -> Workspaces:
+    """The workspaces that a project, a file or a folder, sees."""
+    folder = project if project.is_dir() else project.parent
+    return Workspaces(folder.resolve() / "workspace", WORKSPACE, os.environ)

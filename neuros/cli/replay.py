@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.errors import UsageError
@@ -98,9 +99,11 @@ def _replay(options: argparse.Namespace) -> int:
         )
     if not options.rate > 0 or options.delay < 0:
         raise UsageError("replay: --rate must be above 0, and --delay not below")
+    from neuros.cli.messages import find_messages_of
     from neuros.observe.bag.opened import open_bag
     from neuros.transport.playing import PlayedTopic, play
 
+    find_messages_of(Path(options.run))
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)

@@ -37,13 +37,16 @@ def replay_node(options: argparse.Namespace) -> int:
         UsageError: if the run, the node or the recording is not there.
         EnvironmentFault: if the node's Python cannot be made.
     """
+    from neuros.cli.messages import require_messages
     from neuros.cli.projects import WORKSPACE
+    from neuros.messages.cache import message_cache
     from neuros.observe.replayed import RecordedNode, recorded_node
     from neuros.replay.containers import as_on_this_machine, ran_in_container
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
     if ran_in_container(run):
-        file = as_on_this_machine(run, file, WORKSPACE)
+        file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
+    require_messages(file)
     if not file.node.plugin.is_file():
         raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
     RecordedNode(run, file)
@@ -182,6 +185,7 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
         host_environment,
         node_environment,
         start_environment,
+        with_messages,
     )
     from neuros.project.split import node_file_to_json
 
@@ -194,7 +198,9 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF",  # it has no neighbours
         "ROS_LOG_DIR": str(file.folders.run),
     }
-    environment = start_environment(command, [file], host_environment(os.environ, added))
+    environment = start_environment(
+        command, [file], with_messages(host_environment(os.environ, added), file.messages)
+    )
     arguments = host_arguments(command, [file])
     for stream in (sys.stdout, sys.stderr):
         stream.flush()

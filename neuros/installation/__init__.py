@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.installation.containers import build_containers
+from neuros.installation.containers import build_containers, build_messages
 from neuros.installation.environment import Environment, extras_of
 from neuros.installation.machine import Machine, system_install
 from neuros.installation.packages import explain_failure, pip_settings
@@ -39,6 +39,9 @@ def main(arguments: Sequence[str], root: str) -> int:
         if not (options.yes or environment.is_installed or _agrees(environment.folder)):
             return 130
         environment.install()
+        if code := build_messages(environment.python, folder):
+            progress.fail("install.py: NeuROS is installed, but not all message packages are built")
+            return code
         if not options.no_containers and (code := build_containers(environment.python, options)):
             progress.fail("install.py: NeuROS is installed, but not all images were built")
             return code

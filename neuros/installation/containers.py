@@ -1,4 +1,4 @@
-"""The images that nodes run in, built by the NeuROS that has just been installed."""
+"""Images that nodes run in, and message packages, built by the NeuROS that was just installed."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ def build_containers(python: Path, options: argparse.Namespace) -> int:
     """
     command = [str(python), "-m", "neuros.cli", *build_arguments(options)]
     return subprocess.call(command, env=clean_environment(os.environ))
+
+
+def build_messages(python: Path, root: Path) -> int:
+    """Build the message packages of NeuROS's workspace; returns an exit code.
+
+    A machine without a C compiler gets a line about it, and that is all.
+    """
+    command = [str(python), "-m", "neuros.cli", "build", "--if-compiler"]
+    return subprocess.call(command, cwd=root, env=clean_environment(os.environ))
 
 
 def build_arguments(options: argparse.Namespace) -> Sequence[str]:

@@ -64,6 +64,15 @@ def host_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[
     return {**DEFAULTS, **without_mark(base), **added}
 
 
+def with_messages(environment: Mapping[str, str], messages: Sequence[Path]) -> dict[str, str]:
+    """An environment in which Python finds built message packages, before all others."""
+    if not messages:
+        return dict(environment)
+    given = environment.get("PYTHONPATH", "")
+    paths = [*map(str, messages), *([given] if given else [])]
+    return {**environment, "PYTHONPATH": os.pathsep.join(paths)}
+
+
 def start_environment(
     command: Sequence[str], nodes: Sequence[NodeFile], environment: Mapping[str, str]
 ) -> dict[str, str]:

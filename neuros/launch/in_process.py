@@ -14,6 +14,7 @@ from neuros.launch.host_command import (
     host_command,
     host_environment,
     start_environment,
+    with_messages,
 )
 from neuros.launch.placement import Cores, on_cores, thread_limits
 from neuros.project.model import NodeFile
@@ -54,7 +55,11 @@ class InProcessLauncher:
             log=host_log(nodes),
             folder=nodes[0].folders.run,
             environment=start_environment(
-                self._command, nodes, host_environment(os.environ, {**limits, **environment})
+                self._command,
+                nodes,
+                with_messages(
+                    host_environment(os.environ, {**limits, **environment}), nodes[0].messages
+                ),
             ),
             cores=self._cores or None,
         )

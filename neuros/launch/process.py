@@ -16,6 +16,7 @@ from neuros.launch.host_command import (
     log_file,
     node_environment,
     start_environment,
+    with_messages,
 )
 from neuros.launch.placement import Cores, on_cores, thread_limits
 from neuros.project.model import NodeFile
@@ -69,7 +70,11 @@ class ProcessLauncher:
             host_arguments(command, [node]),
             log=log_file(node),
             folder=node.folders.run,
-            environment=start_environment(command, [node], host_environment(os.environ, added)),
+            environment=start_environment(
+                command,
+                [node],
+                with_messages(host_environment(os.environ, added), node.messages),
+            ),
             cores=cores,
         )
 

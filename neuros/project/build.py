@@ -103,7 +103,9 @@ class Builder:
     def _port(self, element: Element, *, must_be_here: bool) -> Port:
         written = element.string("type") or ""
         type_name = normalised(written)
-        unknown = type_name and unknown_type(type_name, must_be_here=must_be_here)
+        unknown = type_name and unknown_type(
+            type_name, must_be_here=must_be_here, packages=self._roots.packages
+        )
         if unknown:
             self.problems.append(element.value["type"].problem(*unknown))
         mujoco = element.member("mujoco")

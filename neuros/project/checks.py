@@ -152,7 +152,9 @@ def _unconnected(draft: Draft) -> Iterator[Problem]:
         for side in ("inputs", "outputs"):
             for port in node.items(side):
                 key = (side, node.string("name"), port.string("name"))
-                if key not in used and port.member("external_topic") is None:
+                # A sensor may be read by the plugin alone, for a message of the user's own.
+                is_sensor = side == "outputs" and port.member("mujoco") is not None
+                if not (key in used or is_sensor or port.member("external_topic")):
                     yield port.problem(
                         f"{side[:-1]} '{key[2]}' of node '{key[1]}' is not connected"
                     )

@@ -11,6 +11,7 @@ from neuros.project.budgets import budgets_of
 from neuros.project.build import Builder, connection
 from neuros.project.checks import mistakes, remarks
 from neuros.project.draft import Draft, read_draft
+from neuros.project.message_types import NO_PACKAGES, MessagePackages
 from neuros.project.model import Project
 from neuros.project.overrides import apply_override
 from neuros.project.paths import Roots
@@ -34,21 +35,23 @@ def load_project(
     workspace: Path,
     overrides: Sequence[str] = (),
     folder: Path | None = None,
+    packages: MessagePackages = NO_PACKAGES,
 ) -> Loaded:
     """Load and check a project.
 
     Args:
         path: the project file, or a folder that holds ``project.json``.
-        workspace: the folder that ``@path`` starts from.
+        workspace: the folder that ``@path`` starts from, after the project's own.
         overrides: the texts of ``--set``, applied in this order.
         folder: the project's folder, if it is not the one of the file: the expanded project of
             a run lies in the folder of the run.
+        packages: message packages of workspaces.
 
     Raises:
         ProjectError: with every problem there is.
     """
     file = _project_file(path)
-    roots = Roots((folder or file.parent).resolve(), workspace.resolve())
+    roots = Roots((folder or file.parent).resolve(), workspace.resolve(), packages)
     try:
         draft = read_draft(file, roots)
     except SourceError as error:

@@ -141,13 +141,17 @@ class Folders:
 class NodeFile:
     """The content of ``node.json``: a node and its own connections, nothing else.
 
-    ``index`` is the node's place in the project file, from 0.
+    Attributes:
+        index: the node's place in the project file, from 0.
+        messages: where Python finds the message packages of workspaces, a folder for each: it is
+            called ``python``, and lies in that of the built package.
     """
 
     node: Node
     connections: tuple[Connection, ...]
     folders: Folders
     index: int = 0
+    messages: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

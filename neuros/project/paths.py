@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from neuros.project.message_types import NO_PACKAGES, MessagePackages
 from neuros.project.suggest import did_you_mean
+
+_INSTALLED = re.compile(r"@/*install/(?P<package>\w+)/*(?P<path>.*)", re.DOTALL)
 
 
 class PathError(Exception):
@@ -19,15 +23,18 @@ class PathError(Exception):
 
 @dataclass(frozen=True)
 class Roots:
-    """The folders that paths of a project may point into, both resolved.
+    """The folders that paths of a project may point into, all resolved.
 
     A path is looked up from the folder of the file that names it, then from the project's folder;
-    ``@path`` from the workspace. A leading ``#`` is allowed everywhere and says the usual. Slashes
-    behind ``#`` and ``@`` have no meaning, as in ``#/model.xml``.
+    ``@path`` from the project's own workspace, then from that of NeuROS. ``@install/PACKAGE/path``
+    is in what was built of a message package, or will be. A leading
+    ``#`` is allowed everywhere and says the usual. Slashes behind ``#`` and ``@`` have no meaning,
+    as in ``#/model.xml``.
     """
 
     project: Path
     workspace: Path
+    packages: MessagePackages = NO_PACKAGES
 
     def find(self, text: str, here: Path, *, folder_allowed: bool = False) -> Path:
         """The resolved path; ``here`` is the folder of the file that names it.
@@ -36,6 +43,8 @@ class Roots:
         """
         if "\0" in text:
             raise PathError("a path cannot contain a NUL character")
+        if built := self._built(text):
+            return built
         outside: Path | None = None
         for candidate in self._candidates(text, here):
             path = _resolved(candidate)
@@ -65,13 +74,25 @@ class Roots:
             return False
         return True
 
+    def _built(self, text: str) -> Path | None:
+        """A path in the folder of a built package; whether it exists is known when it is built."""
+        match = _INSTALLED.fullmatch(text)
+        folder = self.packages.installed(match["package"]) if match else None
+        if match is None or folder is None:
+            return None
+        path = Path(os.path.normpath(folder / match["path"]))
+        if folder.exists() and not path.exists():
+            raise PathError(f"'{text}' is not in what was built: there is no {path}")
+        return path if path.is_relative_to(folder) else None
+
     def is_inside(self, path: Path) -> bool:
         """Whether a resolved path lies in one of the folders."""
         return path.is_relative_to(self.project) or path.is_relative_to(self.workspace)
 
     def _candidates(self, text: str, here: Path) -> list[Path]:
         if text.startswith("@"):
-            return [self.workspace / text[1:].lstrip("/")]
+            rest = text[1:].lstrip("/")
+            return [self.project / "workspace" / rest, self.workspace / rest]
         if text.startswith("#"):
             rest = text[1:].lstrip("/")
             absolute = [Path(text[1:])] if text.startswith("#/") else []

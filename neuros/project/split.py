@@ -85,6 +85,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
             "workspace": str(folders.workspace),
             "run": str(folders.run),
         },
+        "messages": [str(path) for path in node_file.messages],
         "index": node_file.index,
         "file": str(node.file),
         "pointer": node.pointer,
@@ -115,6 +116,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
         connections=tuple(Connection(**connection) for connection in content["connections"]),
         folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
         index=content["index"],
+        messages=tuple(map(Path, content.get("messages", ()))),
     )
 
 

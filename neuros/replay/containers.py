@@ -21,9 +21,14 @@ def ran_in_container(run: PastRun) -> bool:
     return run.record.get("backend") == "docker"
 
 
-def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path) -> NodeFile:
-    """The node with the paths of this machine; ``file`` is what it was told in its container."""
-    return outside(file, Folders(Path(run.record["file"]).parent, workspace, run.folder))
+def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path, messages: Path) -> NodeFile:
+    """The node with the paths of this machine; ``file`` is what it was told in its container.
+
+    Args:
+        messages: the folder with built message packages.
+    """
+    folders = Folders(Path(run.record["file"]).parent, workspace, run.folder)
+    return outside(file, folders, messages)
 
 
 def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:

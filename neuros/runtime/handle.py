@@ -99,14 +99,17 @@ class NodeHandle:
         """
         node, folders = self._file.node, self._file.folders
         if path.startswith("@"):
-            places = [folders.workspace / path[1:].lstrip("/")]
+            wanted = path[1:].lstrip("/")
+            workspaces = (folders.project / "workspace", folders.workspace)
+            places = [*(folder / wanted for folder in workspaces), *self._built(wanted)]
         else:
             wanted = path[1:].lstrip("/") if path.startswith("#") else path
             bases = dict.fromkeys((node.plugin.parent, node.file.parent, folders.project))
             places = [base / wanted for base in bases]
         for place in places:
             if place.exists():
-                roots = (folders.project, folders.workspace, folders.run)
+                built = (python.parent for python in self._file.messages)
+                roots = (folders.project, folders.workspace, folders.run, *built)
                 if not any(place.resolve().is_relative_to(root.resolve()) for root in roots):
                     raise ModelError(
                         f"'{path}' leaves the project's folder: files may be in the folder of the"
@@ -114,6 +117,13 @@ class NodeHandle:
                     )
                 return place
         raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
+
+    def _built(self, wanted: str) -> list[Path]:
+        """Where ``install/PACKAGE/path`` may be: in the folder of a built message package."""
+        install, _, inner = wanted.partition("/")
+        package, _, rest = inner.partition("/")
+        folders = [python.parent for python in self._file.messages if install == "install"]
+        return [f / rest for f in folders if f.name.rpartition("-")[0] == package]
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""

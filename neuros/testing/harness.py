@@ -17,6 +17,7 @@ import neuros
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.testing.bench import NodeBench
+from neuros.testing.packages import provide_messages, workspaces_of
 from neuros.testing.wiring import ports, with_neighbours, with_observer
 from neuros.transport.messages import decode, encode, message_class
 
@@ -138,7 +139,11 @@ class PluginHarness(NodeBench):
             ProjectError: with every problem of the project.
             KeyError: if it has no such node.
         """
-        loaded = load_project(Path(project), workspace=workspace, overrides=overrides).project
+        path = Path(project)
+        packages = workspaces_of(path if path.is_dir() else path.parent, workspace)
+        loaded = load_project(
+            path, workspace=workspace, overrides=overrides, packages=packages
+        ).project
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
@@ -164,7 +169,10 @@ class PluginHarness(NodeBench):
         with tempfile.TemporaryDirectory() as folder:
             project = Path(folder) / "project.json"
             project.write_text(json.dumps({"nodes": [file.name], "connections": []}))
-            loaded = load_project(project, workspace=workspace, folder=file.parent).project
+            packages = workspaces_of(file.parent, workspace)
+            loaded = load_project(
+                project, workspace=workspace, folder=file.parent, packages=packages
+            ).project
         node = _with_environment(loaded.nodes[0], environment)
         harness = cls.__new__(cls)
         wires = with_neighbours(node, connections)
@@ -180,7 +188,9 @@ class PluginHarness(NodeBench):
         run_folder: Path | None,
     ) -> None:
         folder = _temporary_folder_of(self) if run_folder is None else run_folder.resolve()
-        NodeBench.__init__(self, NodeFile(node, connections, Folders(project, workspace, folder)))
+        messages = provide_messages(node, workspaces_of(project, workspace))
+        folders = Folders(project, workspace, folder)
+        NodeBench.__init__(self, NodeFile(node, connections, folders, messages=messages))
 
     # ------------------------------------------------------------------ what goes in
 

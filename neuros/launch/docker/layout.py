@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from neuros.project.split import translated
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "workspace", run=ROOT / "run")
 """What a node may read and write, as it sees it."""
+
+MESSAGES = ROOT / "messages"
+"""The built message packages of the run, each in a folder that has the same name here."""
 
 LIBRARY = ROOT / "lib"
 """What ``PYTHONPATH`` names: NeuROS itself is in there, from the launcher's own installation."""
@@ -29,15 +33,25 @@ def inside(file: NodeFile) -> NodeFile:
     """The same node with all paths as it sees them in its container."""
     return replace(
         file,
-        node=translated(file.node, lambda path: path_inside(path, file.folders)),
+        node=translated(file.node, lambda path: _inside(path, file)),
         folders=FOLDERS,
+        messages=tuple(_inside(path, file) for path in file.messages),
     )
 
 
-def outside(file: NodeFile, folders: Folders) -> NodeFile:
-    """The inverse of :func:`inside`: the node with the paths of a machine with these folders."""
+def outside(file: NodeFile, folders: Folders, messages: Path = MESSAGES) -> NodeFile:
+    """The inverse of :func:`inside`: the node with the paths of a machine with these folders.
+
+    Args:
+        messages: the folder with built message packages.
+    """
+    there = [(getattr(FOLDERS, e.name), getattr(folders, e.name)) for e in fields(Folders)]
+    pairs = [*there, (MESSAGES, messages)]
     return replace(
-        file, node=translated(file.node, lambda path: _path_outside(path, folders)), folders=folders
+        file,
+        node=translated(file.node, lambda path: _moved(path, pairs)),
+        folders=folders,
+        messages=tuple(_moved(path, pairs) for path in file.messages),
     )
 
 
@@ -47,18 +61,17 @@ def as_here(text: str, folders: Folders) -> str:
     return _INSIDE.sub(lambda match: here[match[1]], text)
 
 
-def path_inside(path: Path, folders: Folders) -> Path:
+def _inside(path: Path, file: NodeFile) -> Path:
     """A path of this machine as a container sees it; what it does not see stays as it is."""
-    mounted = ((folders.project, FOLDERS.project), (folders.workspace, FOLDERS.workspace))
-    for here, there in sorted(mounted, key=lambda pair: -len(pair[0].parts)):
+    here = file.folders
+    mounted = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
+    mounted += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
+    return _moved(path, mounted)
+
+
+def _moved(path: Path, places: Sequence[tuple[Path, Path]]) -> Path:
+    """A path in one of the first folders as one in the second; the innermost counts."""
+    for here, there in sorted(places, key=lambda pair: -len(pair[0].parts)):
         if path.is_relative_to(here):
             return there / path.relative_to(here)
-    return path
-
-
-def _path_outside(path: Path, folders: Folders) -> Path:
-    for each in fields(Folders):
-        there: Path = getattr(FOLDERS, each.name)
-        if path.is_relative_to(there):
-            return Path(getattr(folders, each.name)) / path.relative_to(there)
     return path

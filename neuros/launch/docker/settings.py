@@ -22,6 +22,7 @@ from neuros.launch.host_command import (
     log_file,
     node_environment,
     node_folder,
+    with_messages,
 )
 from neuros.launch.leftover_containers import RUN_LABEL
 from neuros.launch.placement import THREAD_VARIABLES, Cores, thread_limits
@@ -164,7 +165,7 @@ def _environment(
         **(thread_limits([file.node]) if cores else {}),
         **node_environment(inside(file)),
         **added,
-        "PYTHONPATH": str(LIBRARY),
+        **with_messages({"PYTHONPATH": str(LIBRARY)}, inside(file).messages),
         "ROS_LOG_DIR": str(FOLDERS.run),
     }
     if user.dds_settings:
@@ -201,6 +202,10 @@ def _mounts(file: NodeFile, user: User, run_id: str) -> list[dict[str, Any]]:
     ]
     if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
         mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))
+    mounts += [
+        _mount(here.parent, there.parent)
+        for here, there in zip(file.messages, inside(file).messages, strict=True)
+    ]
     if user.dds_settings:
         mounts.append(_mount(user.dds_settings, DDS_FILE))
     if file.node.access.display and user.display:

@@ -33,6 +33,11 @@ class Definitions:
             )
         types = get_types_from_msg(path.read_text("utf-8"), type_name)
         for used in _types_of_fields(types[type_name][1]):
+            if used.endswith("/msg/wstring"):
+                raise EnvironmentFault(
+                    f"message type {type_name} cannot be recorded: it has a wstring, which the"
+                    " library that writes bags does not know; use string, which is UTF-8"
+                )
             if used != type_name:
                 self.add(used)
         self.store.register(types)
