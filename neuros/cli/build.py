@@ -47,7 +47,7 @@ def _build(options: argparse.Namespace) -> int:
             hint = did_you_mean(name, workspaces.packages) or "it needs a package.xml and msg/*.msg"
             raise UsageError(f"build: no workspace has a message package '{name}' ({hint})")
     messages = Messages(workspaces, options.packages or workspaces.packages)
-    if problems := messages.problems():
+    if problems := [*messages.problems(), *workspaces.problems]:
         raise ProjectError(problems)
     if options.if_compiler and not messages.is_made:
         try:

@@ -159,7 +159,7 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
-    from neuros.cli.projects import WORKSPACE
+    from neuros.cli.projects import WORKSPACE, workspaces_of
     from neuros.launch.containers import OWN_FOLDER
     from neuros.launch.docker.recipes import names_in
     from neuros.project.load import load_project
@@ -169,7 +169,7 @@ def _containers(name: str) -> list[tuple[str, Path | None]]:
         return [(name, None)]
     if path.is_dir() and path.name in names_in(path.parent):
         return [(path.name, path.parent.parent)]
-    project = load_project(path, workspace=WORKSPACE).project
+    project = load_project(path, workspace=WORKSPACE, packages=workspaces_of(path)).project
     return [(node.container, project.folder) for node in project.nodes]
 
 

@@ -25,9 +25,12 @@ class Messages:
     def __init__(self, workspaces: Workspaces, names: Iterable[str]) -> None:
         self._workspaces = workspaces
         self._steps: list[Step] = []
-        self._problems = list(workspaces.problems)
+        wanted = sorted(names)
+        self._problems = list(workspaces.problems if wanted else workspaces.own_problems)
+        if not wanted:
+            return
         try:
-            builds = workspaces.builds(sorted(names))
+            builds = workspaces.builds(wanted)
         except CycleError as error:
             self._problems.append(cycle_problem(workspaces, error))
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -31,7 +32,7 @@ GENERATORS = (
 class Workspaces:
     """The packages with messages in some workspaces; of two with one name the first counts.
 
-    Nothing is read before something is asked.
+    Nothing is read before something is asked, and the shared one last: most projects need none.
 
     Args:
         own: the workspace of the project: all its packages are built.
@@ -51,37 +52,33 @@ class Workspaces:
         self.ros = ros or Ros.here()
 
     @cached_property
-    def _found(self) -> tuple[dict[str, Package], set[str], list[Problem]]:
-        packages: dict[str, Package] = {}
-        own: set[str] = set()
-        problems: list[Problem] = []
-        seen: set[Path] = set()
-        for folder in self._folders:
-            if folder is None or folder.resolve() in seen or not folder.is_dir():
-                continue
-            seen.add(folder.resolve())
-            found, wrong = find_packages(folder.resolve())
-            problems += wrong
-            for package in found:
-                packages.setdefault(package.name, package)
-            if folder == self._folders[0]:
-                own = set(packages)
-        return packages, own, problems
+    def _own(self) -> _Found:
+        return _find(self._folders[0])
 
-    @property
+    @cached_property
+    def _shared(self) -> _Found:
+        own, shared = self._folders
+        return _find(None if own and shared and own.resolve() == shared.resolve() else shared)
+
+    @cached_property
     def packages(self) -> dict[str, Package]:
         """All of them, by name."""
-        return self._found[0]
+        return {**self._shared.packages, **self._own.packages}
 
     @property
     def own(self) -> set[str]:
         """The names of those in the project's workspace."""
-        return self._found[1]
+        return set(self._own.packages)
+
+    @property
+    def own_problems(self) -> list[Problem]:
+        """What is wrong with manifests in the project's workspace."""
+        return self._own.problems
 
     @property
     def problems(self) -> list[Problem]:
         """What is wrong with manifests."""
-        return self._found[2]
+        return [*self._own.problems, *self._shared.problems]
 
     def messages(self, package: str) -> Collection[str] | None:
         """The names of the messages of a package, ``None`` if it is not in a workspace."""
@@ -139,6 +136,19 @@ class Workspaces:
                 digest.update(f"{name}\0{len(there)}\0".encode() + there)
             keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
         return keys
+
+
+@dataclass(frozen=True)
+class _Found:
+    packages: dict[str, Package] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+
+def _find(folder: Path | None) -> _Found:
+    if folder is None or not folder.is_dir():
+        return _Found()
+    packages, problems = find_packages(folder.resolve())
+    return _Found({package.name: package for package in packages}, problems)
 
 
 def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:

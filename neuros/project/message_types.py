@@ -60,10 +60,10 @@ def unknown_type(
         packages: those that are built for the project.
     """
     package, _, name = type_name.split("/")
-    own = packages.messages(package)
+    folder = _message_folder(package)
+    own = packages.messages(package) if folder is None else None
     if own is not None:
         return None if name in own else _no_message(type_name, own)
-    folder = _message_folder(package)
     if folder is None:
         if not must_be_here:
             return None

@@ -58,6 +58,18 @@ for publisher in publishers:
     print(info.topic_type, info.topic_type_hash)
 """
 
+HARNESS = """
+import sys
+from neuros.testing import PluginHarness
+
+harness = PluginHarness.from_project(sys.argv[1], "brain")
+joints = harness.make_packet("joints")
+joints.names = ["neck"]
+harness.send("joints", joints)
+harness.run()
+print(harness.log[0].text)
+"""
+
 # A plain ROS program, which knows nothing of NeuROS.
 LISTENER = """
 import time
@@ -235,6 +247,32 @@ class TestRuns:
             angles = [list(message.angles) for _, message in topic.messages()]
         assert angles == [[0.0, 1.5], [0.5, 1.5], [1.0, 1.5]]
 
+    def test_a_replayed_node_finds_them(
+        self, custom_messages: CustomMessages, tmp_path: Path
+    ) -> None:
+        environment = {**os.environ, **custom_messages.environment}
+        run = launch(custom_messages.project, "-d", "90", "-r", cwd=tmp_path, **environment)
+        assert run.exit_code == 0, run.output
+        command = [sys.executable, "-m", "neuros.cli", "replay", str(run.run_folder), "-n", "brain"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "3 starts of hooks" in done.stdout
+
+    def test_a_plugin_under_test_finds_them(
+        self, custom_messages: CustomMessages, tmp_path: Path
+    ) -> None:
+        done = subprocess.run(
+            [sys.executable, "-c", HARNESS, str(custom_messages.project)],
+            env={**os.environ, **custom_messages.environment},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+        assert done.stdout.startswith("[] 1.0 ['neck'] on Python"), done.stderr
+
     def test_a_plain_ros_program_understands_them(
         self, custom_messages: CustomMessages, tmp_path: Path
     ) -> None:
@@ -273,7 +311,7 @@ class TestMistakes:
         assert run.exit_code == 3
         for part in ("A.msg:1:1: found the type 'flaot64'", "A.msg:2:7: found the name 'X'"):
             assert part in run.output
-        assert "'bad_msgs' has no message 'B' (did you mean 'A'?)" in run.output
+        assert "'bad_msgs' has no message 'B'" in run.output
         assert "there is no file 'n.py'" in run.output
         assert "Traceback" not in run.output
 
@@ -302,20 +340,18 @@ class TestMistakes:
         (row,) = done.stderr.splitlines()
         assert "message packages need a C and C++ compiler, and there is no gcc" in row
 
-    def test_a_compiler_that_fails_leaves_a_log_and_nothing_else(
-        self, custom_messages: CustomMessages, tmp_path: Path
-    ) -> None:
+    def test_a_compiler_that_fails_leaves_a_log_and_nothing_else(self, tmp_path: Path) -> None:
+        write_package(tmp_path / "workspace", "small_msgs", {"msg/A.msg": "int32 a\n"})
         for name in ("gcc", "g++"):
-            (tmp_path / name).write_text(
-                "#!/bin/sh\necho 'x.c:1:2: error: no more of this' >&2; exit 1\n"
-            )
+            text = "#!/bin/sh\necho 'x.c:1:2: error: no more of this' >&2; exit 1\n"
+            (tmp_path / name).write_text(text)
             (tmp_path / name).chmod(0o755)
         cache = tmp_path / "cache"
         broken = {"PATH": f"{tmp_path}:/bin:/usr/bin", "XDG_CACHE_HOME": str(cache)}
-        done = build("-p", str(custom_messages.project), "demo_more_msgs", **broken)
+        done = build("-p", str(tmp_path), "small_msgs", **broken)
 
         assert done.returncode == 4
-        assert "'demo_msgs' cannot be built: x.c:1:2: error: no more of this (log: " in done.stderr
+        assert "'small_msgs' cannot be built: x.c:1:2: error: no more of this (log: " in done.stderr
         (left,) = (cache / "neuros" / "messages").iterdir()
         assert left.suffix == ".log"
 

@@ -105,6 +105,15 @@ class TestOrder:
 
         assert sorted(each.package for each in built) == ["own_msgs", "used_msgs"]
 
+    def test_what_nobody_needs_is_not_even_read(self, bench: Bench) -> None:
+        folder = write_package(bench.shared, "other_msgs", POINT)
+        (folder / "package.xml").write_text("no manifest")
+        node = Node(
+            "n", "neuros_python", Path("plugin.py"), inputs=(Port("x", "std_msgs/msg/Bool"),)
+        )
+
+        assert Messages.of_nodes([node], bench.workspaces).problems() == []
+
     def test_packages_that_need_each_other_are_a_mistake(self, bench: Bench) -> None:
         write_package(bench.own, "a_msgs", POINT, ["b_msgs"])
         write_package(bench.own, "b_msgs", POINT, ["a_msgs"])
