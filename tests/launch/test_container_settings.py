@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,20 @@ def test_it_executes_the_python_of_its_image_and_writes_its_own_log() -> None:
         *("/opt/neuros/bin/python", "-m", "neuros.cli", "node", "/neuros/run/snn/node.json"),
     ]
     assert found["working_dir"] == "/neuros/run"
+
+
+def test_built_message_packages_are_found_and_cannot_be_changed() -> None:
+    built = Path("/home/me/.cache/neuros/messages/arm_msgs-0123456789ab")
+    description = str(built / "share/arm_msgs/msg/Joints.json")
+    file = replace(
+        node_file(environment={"HASH": description}, environment_paths=("HASH",)),
+        messages=(built / "python",),
+    )
+    found, there = settings(file), "/neuros/messages/arm_msgs-0123456789ab"
+    assert mounts(found)[there] == (str(built), True)
+    assert found["environment"]["PYTHONPATH"] == f"{there}/python:/neuros/lib"
+    assert found["environment"]["HASH"] == f"{there}/share/arm_msgs/msg/Joints.json"
+    assert outside(inside(file), HERE, built.parent) == file
 
 
 def test_what_a_node_was_told_is_translated_back() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,19 @@ class Folder:
 
     def load(self, name: str = "project.json", *overrides: str) -> Loaded:
         return load_project(self.path / name, workspace=self.workspace, overrides=overrides)
+
+
+@dataclass(frozen=True)
+class ArmPackage:
+    """A workspace with the package ``arm_msgs``, and where that is built."""
+
+    folder: Path
+
+    def messages(self, package: str) -> Collection[str] | None:
+        return {"Joints"} if package == "arm_msgs" else None
+
+    def installed(self, package: str) -> Path | None:
+        return self.folder if package == "arm_msgs" else None
 
 
 @pytest.fixture
@@ -193,6 +208,38 @@ class TestPaths:
         (folder.workspace / "shared.py").touch()
         folder.file("project.json", {"nodes": [node(plugin="@shared.py")]})
         assert folder.load().project.node("n").plugin == folder.workspace / "shared.py"
+
+    def test_the_project_s_own_workspace_comes_first(self, folder: Folder) -> None:
+        (folder.workspace / "shared.py").touch()
+        own = folder.file("workspace/shared.py", "")
+        folder.file("project.json", {"nodes": [node(plugin="@shared.py")]})
+        assert folder.load().project.node("n").plugin == own
+
+    def test_at_install_means_what_is_built_of_a_package(self, folder: Folder) -> None:
+        value = {"A": "@install/arm_msgs/share/Joints.json"}
+        folder.file("project.json", {"nodes": [node(environment=value)]})
+        built = folder.path.parent / "cache" / "arm_msgs-0123456789ab"
+
+        def found() -> str:
+            packages = ArmPackage(built)
+            path = folder.path / "project.json"
+            loaded = load_project(path, workspace=folder.workspace, packages=packages)
+            return loaded.project.node("n").environment["A"]
+
+        assert found() == str(built / "share/Joints.json"), "launching will build it"
+        built.mkdir(parents=True)
+        with pytest.raises(ProjectError, match=r"is not in what was built: there is no .*\.json"):
+            found()
+
+    def test_at_install_leads_nowhere_else(self, folder: Folder) -> None:
+        value = {"A": "@install/arm_msgs/../../secret"}
+        folder.file("project.json", {"nodes": [node(environment=value)]})
+        with pytest.raises(ProjectError, match="there is no file"):
+            load_project(
+                folder.path / "project.json",
+                workspace=folder.workspace,
+                packages=ArmPackage(folder.path.parent / "cache" / "arm_msgs"),
+            )
 
     def test_a_folder_may_be_a_value_but_no_plugin(self, folder: Folder) -> None:
         folder.file("data/x", "")
