@@ -340,6 +340,13 @@ class TestMistakes:
         (row,) = done.stderr.splitlines()
         assert "message packages need a C and C++ compiler, and there is no gcc" in row
 
+    def test_an_installation_goes_on_without_one(self, tmp_path: Path) -> None:
+        empty = {"PATH": "/nonexistent", "XDG_CACHE_HOME": str(tmp_path)}
+        done = build("--if-compiler", **empty)
+
+        assert done.returncode == 0
+        assert done.stdout.startswith("message packages are not built: message packages need a C")
+
     def test_a_compiler_that_fails_leaves_a_log_and_nothing_else(self, tmp_path: Path) -> None:
         write_package(tmp_path / "workspace", "small_msgs", {"msg/A.msg": "int32 a\n"})
         for name in ("gcc", "g++"):
