@@ -9,6 +9,7 @@
     ├── EnvironmentFault    something is missing on this machine   exit code 4
     └── NodeError           a node failed                      exit code 1
         ├── HookError       ... in a hook of its plugin
+        ├── CallbackError   ... in a callback that its plugin has registered with ROS
         ├── PluginError     ... while its plugin was loaded
         ├── ModelError      ... since its simulator cannot be set up as declared
         └── ProtocolError   ... since a neighbour broke the rules of a connection
@@ -87,6 +88,17 @@ class HookError(NodeError):
         super().__init__(
             ": ".join(part for part in (where, hook and f"hook '{hook}'", text) if part)
         )
+
+
+class CallbackError(NodeError):
+    """A callback failed that a plugin has registered with ROS.
+
+    ``where`` is ``file:line`` of the callback.
+    """
+
+    def __init__(self, text: str, *, callback: str, where: str) -> None:
+        self.callback, self.where = callback, where
+        super().__init__(f"{where}: callback '{callback}': {text}")
 
 
 class PluginError(NodeError):

@@ -162,11 +162,16 @@ class Middleware(Protocol):
     def ros_node(self, file: NodeFile) -> Any:
         """The real ``rclpy.node.Node`` of a node that has a transport."""
 
-    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
+    def mark_own_entities(
+        self,
+        file: NodeFile,
+        enter: Callable[[], None],
+        fail: Callable[[Any, BaseException], None],
+    ) -> None:
         """Remember what exists on a ROS node before its plugin gets hold of it.
 
-        Where nodes share a process, ``enter`` is called before each callback of subscriptions,
-        timers and services that the plugin creates there.
+        ``enter`` is called before each callback of subscriptions, timers, services, clients and
+        actions that the plugin creates there, ``fail`` with the callback and what it has raised.
         """
 
     def has_foreign_entities(self, file: NodeFile) -> bool:

@@ -139,6 +139,7 @@ class _Run:
                 "backend": self._plan.backend,
                 **self._plan.back_end.record(),
                 "domain_id": self._domain.id,
+                "namespace": self._plan.project.names.namespace,
                 "started": started,
                 **observed,
             }
@@ -219,6 +220,7 @@ class _Run:
             str(self._run_folder),
             started,
             this_process(),
+            self._plan.project.names.namespace,
         )
 
     def _supervisor(self, guardian: Guardian) -> Supervisor:

@@ -238,6 +238,20 @@ def _add_project(command: argparse.ArgumentParser) -> None:
         " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE (JSON if it parses; always text"
         " in environment; nothing removes the key)",
     )
+    command.add_argument(
+        "--namespace",
+        metavar="NS",
+        help="where nodes, connections and relative topics are on the ROS graph, as in /left, so"
+        " that two copies of a project share a domain (default: the project's)",
+    )
+    command.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="FROM:=TO",
+        help="another name for an external topic, or for a topic or service of a plugin, as in ROS"
+        " (repeatable); NODE:FROM:=TO for one node alone",
+    )
 
 
 def _launch(options: argparse.Namespace) -> int:

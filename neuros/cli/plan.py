@@ -73,7 +73,8 @@ class Plan:
         nodes = self.project.nodes
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         has_external_topics = any(port.external_topic is not None for port in ports)
-        return self.is_partial or self.network.is_wide or has_external_topics
+        is_named = bool(self.project.names.namespace)  # who wants one is among others
+        return self.is_partial or self.network.is_wide or has_external_topics or is_named
 
     def node_files(self, folders: Folders) -> list[NodeFile]:
         """One ``node.json`` per node that is to be started."""

@@ -45,7 +45,14 @@ def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
     path = project_path(options)
     workspaces = workspaces_of(path)
     try:
-        loaded = load_project(path, workspace=WORKSPACE, overrides=options.set, packages=workspaces)
+        loaded = load_project(
+            path,
+            workspace=WORKSPACE,
+            overrides=options.set,
+            packages=workspaces,
+            namespace=options.namespace,
+            remap=options.remap,
+        )
     except ProjectError as error:
         problems = Messages(workspaces, workspaces.own).problems()
         raise ProjectError([*error.problems, *problems]) from None

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neuros.errors import NeurosError
 from neuros.launch.recording import END
@@ -19,6 +20,9 @@ from neuros.observe.recording.listened import ListenedSpool
 from neuros.observe.recording.plan import BAG_NAME, RecordingPlan, Topic, load_plan
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.repair import counts_of, repair, the_only_recorder
+
+if TYPE_CHECKING:
+    from neuros.transport.listening import FoundTopic
 
 _POLL_S = 0.1
 # The launcher was killed: its guardian kills what is left of the run after 4.5 s.
@@ -88,6 +92,12 @@ def _is_told_to_end(wait_s: float, recorder: Recorder) -> bool:
     return True
 
 
+def _in_bag(topic: FoundTopic) -> Topic:
+    return Topic(
+        topic.name, topic.type, topic.is_reliable, topic.depth, is_latched=topic.is_latched
+    )
+
+
 @contextlib.contextmanager
 def _listening(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object]
@@ -96,7 +106,7 @@ def _listening(
     if not plan.listen:
         yield list
         return
-    from neuros.transport.listening import FoundTopic, Listener
+    from neuros.transport.listening import Listener
 
     spool = ListenedSpool(run)
     unheard = list(plan.wanted)
@@ -104,7 +114,7 @@ def _listening(
     def found(topic: FoundTopic) -> Callable[[int, bytes], None]:
         if topic.name in unheard:
             unheard.remove(topic.name)
-        number = spool.add(Topic(topic.name, topic.type, topic.is_reliable, topic.depth))
+        number = spool.add(_in_bag(topic))
         return lambda wall_ns, data: spool.keep(number, wall_ns, data)
 
     def refused(name: str, reason: str) -> None:

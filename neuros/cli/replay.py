@@ -114,7 +114,7 @@ def _replay(options: argparse.Namespace) -> int:
             for packet in topic.raw()
         )
         count = play(
-            {t.name: PlayedTopic(t.type, t.is_reliable, t.depth) for t in chosen},
+            {t.name: PlayedTopic(t.type, t.is_reliable, t.depth, t.is_latched) for t in chosen},
             packets,
             rate=options.rate,
             delay_s=options.delay,

@@ -56,8 +56,10 @@ def _ps(_: argparse.Namespace) -> int:
 def _rows(session: Session) -> list[list[str]]:
     since = datetime.fromtimestamp(session.since).strftime("%Y-%m-%d %H:%M:%S")
     head = [session.run[:_SHOWN], session.project]
+    prefix = f"{session.namespace}/" if session.namespace else ""
     return [
-        [*head, node, session.backend, since, state] for node, state in session.states().items()
+        [*head, prefix + node, session.backend, since, state]
+        for node, state in session.states().items()
     ]
 
 

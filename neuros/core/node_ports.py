@@ -10,9 +10,7 @@ from neuros.core.inputs import Inlet, InputSlot
 from neuros.errors import HookError
 from neuros.hooks import HookSpec, InputSpec
 from neuros.project.model import Connection, Node
-
-EXTERNAL_DEPTH = 10
-"""Packets that the mailbox of an external topic holds: ``depth`` of ROS's default QoS profile."""
+from neuros.project.qos import DEPTH
 
 
 class NodePorts:
@@ -37,9 +35,8 @@ class NodePorts:
         }
         for port in node.inputs:
             if port.external_topic is not None:
-                self.inlets[port.name] = Inlet(
-                    port.name, port.external_topic, port.name, EXTERNAL_DEPTH
-                )
+                depth = DEPTH if port.qos is None else port.qos.depth or DEPTH
+                self.inlets[port.name] = Inlet(port.name, port.external_topic, port.name, depth)
         self.outlets = {c: Outlet(c) for c in connections if c.source_node == node.name}
         for connection, outlet in self.outlets.items():
             outlet.is_registered = connection.destination_node == node.name

@@ -27,6 +27,7 @@ class Session:
     Attributes:
         run: its id.
         folder: the run folder.
+        namespace: of its nodes on the ROS graph, empty or as in ``/left``.
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
@@ -39,6 +40,7 @@ class Session:
     folder: str
     since: float
     launcher: tuple[int, int]
+    namespace: str = ""
 
     @property
     def is_led(self) -> bool:

@@ -122,7 +122,7 @@ class RecordedNode:
             str(c)
             for c in self._file.connections
             if c.destination_node == self._name != c.source_node
-        ] + [_topic(port.external_topic) for port in self._file.node.inputs if port.external_topic]
+        ] + [self._topic(port.name) for port in self._file.node.inputs if port.external_topic]
         missing = [name for name in wanted if name not in recorded]
         if missing:
             raise UsageError(
@@ -148,13 +148,18 @@ class RecordedNode:
 
     def _heard(self, name: str) -> _Arrivals:
         """Only the first node that listens to an external topic records what arrives."""
-        topic = _topic(self._file.node.input(name).external_topic)
+        topic = self._topic(name)
         if not self._keeps(Way.HEARD, name):
             raise UsageError(
                 f"replay: another node has recorded {topic}, and it cannot be told which of its"
                 f" packets have reached '{self._name}'"
             )
         return _Arrivals(self._packets(topic))
+
+    def _topic(self, name: str) -> str:
+        """The external topic of an input."""
+        topic = self._file.node.input(name).external_topic or ""
+        return self._file.names.resolve(topic, self._name)
 
     def _keeps(self, way: Way, name: str) -> bool:
         streams = self.plan.streams.get(self._name, ())
@@ -181,7 +186,3 @@ class _Arrivals:
 
 def _journal_of(run_folder: Path, name: str) -> Path:
     return run_folder / name / FOLDER / "journal"
-
-
-def _topic(external_topic: str | None) -> str:
-    return "/" + (external_topic or "").lstrip("/")

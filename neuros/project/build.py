@@ -9,8 +9,10 @@ from neuros.errors import Problem
 from neuros.project.draft import Draft
 from neuros.project.gazebo import container_in_place_of, is_for_gazebo
 from neuros.project.message_types import normalised, unknown_type
-from neuros.project.model import Connection, Node, Port
+from neuros.project.model import Connection, Node, Port, Value
+from neuros.project.parameters import parameters_of
 from neuros.project.paths import PathError
+from neuros.project.qos import Qos, qos_of
 from neuros.project.resources import Access, Resources, access_of, resources_of
 from neuros.project.source import Element
 
@@ -62,6 +64,7 @@ class Builder:
             affinity=_affinity(element),
             resources=resources,
             access=access,
+            parameters=_parameters(element),
         )
 
     def _file(self, element: Element, key: str) -> Path | None:
@@ -95,12 +98,12 @@ class Builder:
         container = container_in_place_of(node.string("container") or "").partition(":")[0]
         must_be_here = container in STANDARD_CONTAINERS
         return tuple(
-            self._port(port, must_be_here=must_be_here)
+            self._port(port, side, must_be_here=must_be_here)
             for port in node.items(side)
             if isinstance(port.value, dict)
         )
 
-    def _port(self, element: Element, *, must_be_here: bool) -> Port:
+    def _port(self, element: Element, side: str, *, must_be_here: bool) -> Port:
         written = element.string("type") or ""
         type_name = normalised(written)
         unknown = type_name and unknown_type(
@@ -115,8 +118,29 @@ class Builder:
             type=type_name or written,
             external_topic=element.string("external_topic"),
             gazebo_type=element.string("gazebo_type"),
+            qos=_qos(element, is_input=side == "inputs"),
             **keys,
         )
+
+
+def _qos(port: Element, *, is_input: bool) -> Qos | None:
+    """The QoS of a port; the schema has reported what is wrong with it."""
+    member = port.member("qos")
+    if member is None:
+        return None
+    try:
+        return qos_of(member.plain, is_input=is_input)
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _parameters(node: Element) -> dict[str, Value]:
+    """The ROS parameters of a node; what is wrong with them has been reported."""
+    member = node.member("parameters")
+    try:
+        return {} if member is None else parameters_of(member.plain)
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        return {}
 
 
 def _affinity(node: Element) -> tuple[int, ...]:
@@ -133,7 +157,7 @@ def _resources_and_access(node: Element) -> tuple[Resources, Access]:
         return Resources(), Access()
 
 
-def connection(element: Element, index: int) -> Connection:
+def connection(element: Element, index: int, namespace: str) -> Connection:
     """The connection that a valid object describes."""
     values = element.plain
     limit = values.get("discard_limit")
@@ -145,4 +169,5 @@ def connection(element: Element, index: int) -> Connection:
         discard_limit=None if limit is None else int(limit),
         queue_size=int(values.get("queue_size", 1)),
         index=index,
+        namespace=namespace,
     )

@@ -43,7 +43,7 @@ def graph_mermaid(project: Project) -> str:
     topics: dict[str, str] = {}
     for node in project.nodes:
         for port, is_input in _external(node):
-            topic = str(port.external_topic)
+            topic = project.names.resolve(str(port.external_topic), node.name)
             if topic not in topics:
                 topics[topic] = f"t{len(topics)}"
                 lines.append(f'    {topics[topic]}(["{_safe(topic)}"])')
@@ -81,7 +81,8 @@ def _node_lines(project: Project, node: Node) -> Iterator[str]:
 
 def _ends(project: Project, node: Node, port: Port, *, is_input: bool) -> Iterator[str]:
     if port.external_topic is not None:
-        yield f"      {'<-' if is_input else '->'} topic {port.external_topic}"
+        topic = project.names.resolve(port.external_topic, node.name)
+        yield f"      {'<-' if is_input else '->'} topic {topic}"
         return
     if is_input:
         sources = [c for c in project.connections if _to(c) == (node.name, port.name)]

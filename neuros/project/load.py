@@ -13,8 +13,10 @@ from neuros.project.checks import mistakes, remarks
 from neuros.project.draft import Draft, read_draft
 from neuros.project.message_types import NO_PACKAGES, MessagePackages
 from neuros.project.model import Project
+from neuros.project.outside import names_of
 from neuros.project.overrides import apply_override
 from neuros.project.paths import Roots
+from neuros.project.renaming import apply_namespace, apply_remaps
 from neuros.project.scanner import SourceError, display_name
 from neuros.project.suggest import did_you_mean
 
@@ -36,6 +38,8 @@ def load_project(
     overrides: Sequence[str] = (),
     folder: Path | None = None,
     packages: MessagePackages = NO_PACKAGES,
+    namespace: str | None = None,
+    remap: Sequence[str] = (),
 ) -> Loaded:
     """Load and check a project.
 
@@ -46,6 +50,8 @@ def load_project(
         folder: the project's folder, if it is not the one of the file: the expanded project of
             a run lies in the folder of the run.
         packages: message packages of workspaces.
+        namespace: the text of ``--namespace``, in the place of the project's own.
+        remap: the texts of ``--remap``; they go before the project's own rules.
 
     Raises:
         ProjectError: with every problem there is.
@@ -58,7 +64,11 @@ def load_project(
         raise ProjectError([error.problem]) from None
     for text in overrides:
         draft.problems += apply_override(draft, text)
+    if namespace is not None:
+        apply_namespace(draft, namespace)
+    draft.problems += apply_remaps(draft, remap)
     builder = Builder(draft)
+    names = names_of(draft)
     nodes = tuple(builder.node(element) for element in draft.nodes)
     problems = [*draft.problems, *_judgements(draft), *builder.problems]
     if problems:
@@ -66,10 +76,13 @@ def load_project(
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
-        connections=tuple(connection(c, index) for index, c in enumerate(draft.connections)),
+        connections=tuple(
+            connection(c, index, names.namespace) for index, c in enumerate(draft.connections)
+        ),
         file=roots.project / file.name,
         description=draft.root.string("description") or "",
         budgets=budgets_of(draft),
+        names=names,
     )
     return Loaded(project, tuple(remarks(draft)))
 

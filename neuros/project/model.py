@@ -10,11 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
+from neuros.project.names import INTERNAL, Names
+from neuros.project.qos import Qos
 from neuros.project.resources import Access, Resources
 
+Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, ...]"
+"""What a ROS parameter holds here."""
+
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
+_NO_NAMES = Names()
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,9 @@ class Port:
     Attributes:
         name: unique among the inputs, or among the outputs, of its node.
         type: message type in ROS notation, ``"std_msgs/msg/String"``.
-        external_topic: the plain ROS topic that it is bound to, or ``None``.
+        external_topic: the plain ROS topic that it is bound to, as written, or ``None``;
+            :meth:`Names.resolve` tells its full name.
+        qos: what is offered or asked for there, or ``None`` where the file does not say.
         mujoco: the sensor or actuator behind it as the node file declares it, empty if none.
         gazebo_type: kept from published project files; it has no effect.
     """
@@ -34,6 +42,7 @@ class Port:
     external_topic: str | None = None
     mujoco: Mapping[str, Any] = field(default_factory=lambda: _NOTHING, hash=False)
     gazebo_type: str | None = None
+    qos: Qos | None = None
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,7 @@ class Node:
         affinity: numbers of the cores that it is to run on, from 0; empty if it does not matter.
         resources: what it may use at most.
         access: what its container is let in to.
+        parameters: values of ROS parameters, by full name.
     """
 
     name: str
@@ -64,6 +74,7 @@ class Node:
     affinity: tuple[int, ...] = ()
     resources: Resources = field(default_factory=Resources)
     access: Access = field(default_factory=Access)
+    parameters: Mapping[str, Value] = field(default_factory=lambda: _NOTHING, hash=False)
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -89,6 +100,7 @@ class Connection:
         discard_limit: packets that may be lost in a row; ``None`` is BEST_EFFORT.
         queue_size: unread packets that the receiver holds, K.
         index: its place in the project file, from 0; the order of the packets of an ``All`` input.
+        namespace: that of the project, empty or as in ``/left``.
     """
 
     source_node: str
@@ -98,6 +110,7 @@ class Connection:
     discard_limit: int | None = None
     queue_size: int = 1
     index: int = 0
+    namespace: str = ""
 
     @property
     def is_reliable(self) -> bool:
@@ -113,7 +126,7 @@ class Connection:
     def topic(self) -> str:
         """The topic that ``/data``, ``/ack`` and ``/reg`` are appended to."""
         return (
-            f"/neuros/{self.source_node}/{self.source_output}"
+            f"{self.namespace}{INTERNAL}{self.source_node}/{self.source_output}"
             f"/{self.destination_node}/{self.destination_input}"
         )
 
@@ -145,6 +158,7 @@ class NodeFile:
         index: the node's place in the project file, from 0.
         messages: where Python finds the message packages of workspaces, a folder for each: it is
             called ``python``, and lies in that of the built package.
+        names: the project's.
     """
 
     node: Node
@@ -152,6 +166,7 @@ class NodeFile:
     folders: Folders
     index: int = 0
     messages: tuple[Path, ...] = ()
+    names: Names = _NO_NAMES
 
 
 @dataclass(frozen=True)
@@ -179,6 +194,7 @@ class Project:
     file: Path
     description: str = ""
     budgets: Budgets = Budgets()
+    names: Names = _NO_NAMES
 
     @property
     def folder(self) -> Path:

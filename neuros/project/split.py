@@ -13,6 +13,10 @@ from typing import Any
 
 from neuros.project.budgets import budgets_to_json
 from neuros.project.model import Budgets, Connection, Folders, Node, NodeFile, Port, Project
+from neuros.project.names import Names
+from neuros.project.outside import names_from, names_to_json
+from neuros.project.parameters import parameters_of, parameters_to_json
+from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
 
 _NO_BUDGETS = Budgets()
@@ -45,6 +49,7 @@ def split(
             ),
             folders=folders_for(node),
             index=index,
+            names=project.names,
         )
         for index, node in enumerate(project.nodes)
     )
@@ -68,6 +73,7 @@ def merge(
         file=file,
         description=description,
         budgets=budgets,
+        names=parts[0].names if parts else Names(),
     )
 
 
@@ -90,6 +96,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "file": str(node.file),
         "pointer": node.pointer,
         "environment_paths": list(node.environment_paths),
+        **names_to_json(node_file.names),
     }
 
 
@@ -97,14 +104,15 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
     """The inverse of :func:`node_file_to_json`; raises ``KeyError`` for anything else."""
     node = content["node"]
     script = node.get("script")
+    names = names_from(content.get("namespace", ""), content.get("remap", {}))
     return NodeFile(
         node=Node(
             name=node["name"],
             container=node["container"],
             plugin=Path(node["plugin"]),
             script=None if script is None else Path(script),
-            inputs=tuple(Port(**port) for port in node.get("inputs", ())),
-            outputs=tuple(Port(**port) for port in node.get("outputs", ())),
+            inputs=tuple(_port(port, is_input=True) for port in node.get("inputs", ())),
+            outputs=tuple(_port(port, is_input=False) for port in node.get("outputs", ())),
             environment=dict(node.get("environment", {})),
             file=Path(content["file"]),
             pointer=content["pointer"],
@@ -112,11 +120,16 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             affinity=tuple(node.get("affinity", ())),
             resources=resources_of(node),
             access=access_of(node),
+            parameters=parameters_of(node.get("parameters", {})),
         ),
-        connections=tuple(Connection(**connection) for connection in content["connections"]),
+        connections=tuple(
+            Connection(**connection, namespace=names.namespace)
+            for connection in content["connections"]
+        ),
         folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
         index=content["index"],
         messages=tuple(map(Path, content.get("messages", ()))),
+        names=names,
     )
 
 
@@ -130,6 +143,7 @@ def project_to_json(project: Project) -> dict[str, Any]:
         {**_node_keys(node), "environment": _environment(node)} for node in project.nodes
     ]
     content["connections"] = [_connection_keys(c) for c in project.connections]
+    content |= names_to_json(project.names)
     if budgets := budgets_to_json(project.budgets):
         content["budgets"] = budgets
     return content
@@ -159,15 +173,24 @@ def _node_keys(node: Node) -> dict[str, Any]:
     if node.affinity:
         keys["affinity"] = list(node.affinity)
     keys |= keys_of(node.resources, node.access)
+    if node.parameters:
+        keys["parameters"] = parameters_to_json(node.parameters)
     keys["inputs"] = [_port_keys(port) for port in node.inputs]
     keys["outputs"] = [_port_keys(port) for port in node.outputs]
     return keys
+
+
+def _port(keys: Mapping[str, Any], *, is_input: bool) -> Port:
+    port = Port(**{key: value for key, value in keys.items() if key != "qos"})
+    return replace(port, qos=qos_of(keys["qos"], is_input=is_input)) if "qos" in keys else port
 
 
 def _port_keys(port: Port) -> dict[str, Any]:
     keys: dict[str, Any] = {"name": port.name, "type": port.type}
     if port.external_topic is not None:
         keys["external_topic"] = port.external_topic
+    if port.qos is not None:
+        keys["qos"] = qos_to_json(port.qos)
     if port.mujoco:
         keys["mujoco"] = dict(port.mujoco)
     if port.gazebo_type is not None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from neuros.errors import NeurosError, NodeError, PluginError
 from neuros.ports import Logger
+from neuros.runtime.callbacks import callback_error
 from neuros.runtime.plugin import describe, plugin_traceback
 
 
@@ -28,6 +30,10 @@ class Failures:
     def report(self, error: BaseException) -> None:
         """End the project with an error."""
         self._fail(self._name, error if isinstance(error, NeurosError) else as_node_error(error))
+
+    def report_callback(self, callback: Any, error: BaseException) -> None:
+        """End the project with the error of a callback that the plugin has registered with ROS."""
+        self.report(error if isinstance(error, NeurosError) else callback_error(error, callback))
 
     def guard(self, event: Callable[[], None]) -> None:
         """Handle an event; what NeuROS says of it ends the project."""

@@ -142,7 +142,7 @@ class NodeRuntime:
         """
         self._enter()
         self._transport.open(self)
-        self._middleware.mark_own_entities(self.file, self._enter)
+        self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
         node = self.file.node
         self.specs = load_plugin(node.plugin, self.name)
         types = {port.name: self._middleware.message_class(port.type) for port in node.outputs}

@@ -14,13 +14,13 @@ from typing import Any
 from neuros.control import Lines, connect
 from neuros.core.engine import Engine
 from neuros.core.journal import JournalledEngine
-from neuros.errors import NeurosError, NodeError
+from neuros.errors import NeurosError
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
+from neuros.runtime.callbacks import callback_error
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.failures import as_node_error
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.plugin import describe, plugin_traceback
 from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
 
@@ -249,7 +249,7 @@ class NodeProcess:
         self.ask_to_stop()
 
     def _fail_outside_hooks(self, error: BaseException) -> None:
-        """A callback that a plugin registered with ROS has failed, or NeuROS itself."""
+        """A task of ROS that a plugin has started has failed, or NeuROS itself."""
         if not self._nodes:
             known = error if isinstance(error, NeurosError) else as_node_error(error)
             self._fail(self._files[0].node.name, known)
@@ -258,8 +258,7 @@ class NodeProcess:
         suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
         node = next((node for node in suspects if node.is_on_stage), (suspects or self._nodes)[0])
         if not isinstance(error, NeurosError):
-            text = plugin_traceback(error, node.file.node.plugin)
-            error = NodeError(f"failed outside its hooks: {describe(error)}\n{text}")
+            error = callback_error(error)
         self._fail(node.name, error)
 
 

@@ -144,7 +144,12 @@ class Workbench:
         """A stand-in."""
         return self._ros_nodes[file.node.name]
 
-    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
+    def mark_own_entities(
+        self,
+        file: NodeFile,
+        enter: Callable[[], None],
+        fail: Callable[[Any, BaseException], None],
+    ) -> None:
         """There are none."""
 
     def has_foreign_entities(self, file: NodeFile) -> bool:

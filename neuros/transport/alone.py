@@ -21,7 +21,7 @@ from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet
 from neuros.transport.making import make_packet
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
+from neuros.transport.plain_node import plain_node
 
 Event = Callable[[], None]
 
@@ -94,7 +94,7 @@ class Alone:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._ros_node = PlainNode(file.node.name, self._context)
+        self._ros_node = plain_node(file, self._context)
 
     def transport(self, file: NodeFile) -> _Nowhere:
         """One that carries nothing."""
@@ -104,7 +104,9 @@ class Alone:
         """The ROS node."""
         return self._ros_node
 
-    def mark_own_entities(self, file: NodeFile, enter: Event) -> None:
+    def mark_own_entities(
+        self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
+    ) -> None:
         """Nothing of it is served."""
 
     def has_foreign_entities(self, file: NodeFile) -> bool:

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import rclpy.task
 from rclpy.context import Context
@@ -29,6 +29,8 @@ EXECUTOR_VARIABLE = "NEUROS_EXECUTOR"
 """``events`` or ``wait_set``; unset, the first that works."""
 
 _FLOOD_S = 0.01
+
+OnFailure: TypeAlias = Callable[[BaseException], None]
 
 
 class Waker(Protocol):
@@ -76,8 +78,33 @@ class Turn:
         """The callback raises none."""
 
 
-def make_executor(context: Context) -> Executor:
+class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
+    """A task of rclpy that fails without the executor, which would end the process by SIGSEGV."""
+
+    on_failure: OnFailure
+    _is_hidden = False
+
+    def __call__(self) -> None:
+        super().__call__()
+        error = self._exception
+        if error is not None:
+            self._is_hidden = True
+            self.on_failure(error)
+
+    def exception(self) -> BaseException | None:
+        """What the task has raised; nothing for the executor, which asks first."""
+        if self._is_hidden:
+            self._is_hidden = False
+            return None
+        found: BaseException | None = super().exception()
+        return found
+
+
+def make_executor(context: Context, on_failure: OnFailure) -> Executor:
     """The executor that was asked for, or the best that works; a fallback is logged.
+
+    Args:
+        on_failure: is given what a task has raised.
 
     Raises:
         EnvironmentFault: if the environment variable names none.
@@ -90,7 +117,7 @@ def make_executor(context: Context) -> Executor:
     if wanted == "wait_set":
         return WaitSetExecutor(context)
     try:
-        return _events_executor(context)
+        return _events_executor(context, on_failure)
     except (ImportError, AttributeError, TypeError, RuntimeError) as error:
         get_logger("neuros").warning(
             f"rclpy's EventsExecutor cannot be used here ({error}): falling back to a wait set,"
@@ -99,10 +126,10 @@ def make_executor(context: Context) -> Executor:
         return WaitSetExecutor(context)
 
 
-def _events_executor(context: Context) -> Executor:
+def _events_executor(context: Context, on_failure: OnFailure) -> Executor:
     from rclpy.experimental.events_executor import EventsExecutor  # may have gone
 
-    with _turns_for_tasks():
+    with _own_tasks(on_failure):
         executor = EventsExecutor(context=context)
     for name in ("add_node", "create_task", "spin_until_future_complete", "shutdown"):
         getattr(executor, name)
@@ -111,15 +138,19 @@ def _events_executor(context: Context) -> Executor:
 
 
 @contextmanager
-def _turns_for_tasks() -> Iterator[None]:
-    """Let an executor that is made now take a :class:`Turn` for a task.
+def _own_tasks(on_failure: OnFailure) -> Iterator[None]:
+    """Let an executor that is made now take a :class:`Turn` for a task, and guard all others.
 
     It looks up the class of tasks once, when it is made, and there is no other way to tell it.
     """
     task = rclpy.task.Task
 
     def make_task(handler: Any, *arguments: Any, **keywords: Any) -> Any:
-        return handler if type(handler) is Turn else task(handler, *arguments, **keywords)
+        if type(handler) is Turn:
+            return handler
+        made = GuardedTask(handler, *arguments, **keywords)
+        made.on_failure = on_failure
+        return made
 
     rclpy.task.Task = make_task
     try:

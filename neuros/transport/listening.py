@@ -35,6 +35,7 @@ class FoundTopic:
     type: str
     is_reliable: bool
     depth: int
+    is_latched: bool = False
 
 
 class Listener:
@@ -109,7 +110,9 @@ class Listener:
         if is_latched:
             qos.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
         take = self._on_found(
-            FoundTopic(name, type_name, is_reliable, max(q.depth for q in offered) or 10)
+            FoundTopic(
+                name, type_name, is_reliable, max(q.depth for q in offered) or 10, is_latched
+            )
         )
         node.create_subscription(
             kind, name, loop.guarded(lambda data: take(time.time_ns(), data)), qos, raw=True

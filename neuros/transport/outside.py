@@ -6,7 +6,6 @@ External topics go through DDS as always; a data topic is published while somebo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from rclpy.node import Node as RosNode
@@ -14,8 +13,10 @@ from rclpy.publisher import Publisher
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.external import ExternalTopics
+from neuros.transport.making import make_packet
 from neuros.transport.messages import message_class
-from neuros.transport.ros import RosTransport, data_qos
+from neuros.transport.ros import data_qos
 from neuros.transport.ros_loop import RosLoop
 
 _LOOK_S = 0.25
@@ -25,7 +26,7 @@ class RosOutside:
     """External topics and listeners of one node whose connections stay within the process."""
 
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
-        self._external = RosTransport(replace(file, connections=()), ros_node, loop)
+        self._external = ExternalTopics(file, ros_node, loop)
         self._file = file
         self._ros_node = ros_node
         self._loop = loop
@@ -43,7 +44,7 @@ class RosOutside:
                     data_qos(connection),
                 )
         if self._publishers:
-            self._ros_node.create_timer(_LOOK_S, lambda: self._loop.guard(self._look))
+            self._loop.every(self._ros_node, _LOOK_S, self._look)
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
         """Publish a packet for those who listen."""
@@ -54,11 +55,11 @@ class RosOutside:
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
-        self._external.send_external(port, packet)
+        self._external.send(port, packet)
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""
-        return self._external.make_packet(type_name)
+        return make_packet(type_name)
 
     def close(self) -> None:
         """Publish and receive nothing any more."""

@@ -7,29 +7,100 @@ the first packet.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
+
+from neuros.project.model import NodeFile, Value
+from neuros.project.names import Names
+
+_NO_NAMES = Names()
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
+_OF_ROS = "use_sim_time"  # rclpy declares it itself
 
 
 class PlainNode(Node):  # type: ignore[misc]
-    """Offers its parameters to others as soon as a plugin has declared one."""
+    """Offers its parameters to others as soon as there is one besides those of ROS.
 
-    def __init__(self, name: str, context: Context) -> None:
+    Args:
+        names: namespace and remapping rules, which hold for all that is created on it.
+        parameters: declared from the start. A plugin may declare them once more, with a description
+            for instance, and gets the value that is given here.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        context: Context,
+        names: Names = _NO_NAMES,
+        parameters: Mapping[str, Value] = _NOTHING,
+    ) -> None:
         self._is_complete = False
+        self._wrap: Callable[[Any], Any] | None = None
+        self._declared_for_project = {*parameters} - {_OF_ROS}
+        self._parameter_service: ParameterService | None = None
         super().__init__(
             name,
             context=context,
+            namespace=names.namespace,
+            cli_args=names.ros_arguments,
             start_parameter_services=False,
+            parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
+            automatically_declare_parameters_from_overrides=True,
         )
         self._is_complete = True
-        self._parameter_service: ParameterService | None = None
+        if parameters:
+            self._parameter_service = ParameterService(self)
 
-    def declare_parameters(self, *arguments: Any, **keywords: Any) -> Any:
+    def declare_parameters(
+        self, namespace: str, parameters: Sequence[Any], *arguments: Any, **keywords: Any
+    ) -> Any:
         """As in rclpy, which comes here for a single one, too."""
-        declared = super().declare_parameters(*arguments, **keywords)
+        if self._is_complete:
+            for name, *_ in parameters:
+                full = f"{namespace}.{name}" if namespace else name
+                if full in self._declared_for_project:
+                    self._declared_for_project.remove(full)
+                    self.undeclare_parameter(full)
+        declared = super().declare_parameters(namespace, parameters, *arguments, **keywords)
         if self._is_complete and self._parameter_service is None:
             self._parameter_service = ParameterService(self)
         return declared
+
+    @property
+    def executor(self) -> Any:
+        """What serves the node; tasks that a plugin has it run are parts of the node, too."""
+        found = super().executor
+        return found if found is None or self._wrap is None else _Tasks(found, self._wrap)
+
+    @executor.setter
+    def executor(self, executor: Any) -> None:
+        Node.executor.fset(self, executor)
+
+    def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
+        """Wrap whatever is to run as a task from now on."""
+        self._wrap = wrap
+
+
+class _Tasks:
+    """An executor that wraps the tasks it is given."""
+
+    def __init__(self, executor: Any, wrap: Callable[[Any], Any]) -> None:
+        self._executor = executor
+        self._wrap = wrap
+
+    def create_task(self, callback: Any, *arguments: Any, **keywords: Any) -> Any:
+        return self._executor.create_task(self._wrap(callback), *arguments, **keywords)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._executor, name)
+
+
+def plain_node(file: NodeFile, context: Context) -> PlainNode:
+    """The ROS node of a node of a project."""
+    return PlainNode(file.node.name, context, file.names, file.node.parameters)

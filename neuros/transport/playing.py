@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import rclpy
 from rclpy.duration import Duration
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
@@ -28,6 +28,7 @@ class PlayedTopic:
     type: str
     is_reliable: bool
     depth: int
+    is_latched: bool = False
 
 
 def play(
@@ -81,4 +82,7 @@ def _qos(topic: PlayedTopic) -> QoSProfile:
     profile = QoSProfile(depth=max(topic.depth, _DEPTH))
     if not topic.is_reliable:
         profile.reliability = QoSReliabilityPolicy.BEST_EFFORT
+    if topic.is_latched:
+        profile.durability = QoSDurabilityPolicy.TRANSIENT_LOCAL
+        profile.depth = topic.depth  # what who comes later gets
     return profile

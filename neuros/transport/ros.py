@@ -13,23 +13,21 @@ from functools import partial
 from typing import Any
 
 from rclpy.node import Node as RosNode
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_msgs.msg import UInt64
 
-from neuros.core.node_ports import EXTERNAL_DEPTH
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import Decoder, Encoder, message_carrier
 from neuros.transport.digests import Digest, digest_for, make_digests
+from neuros.transport.external import ExternalTopics
 from neuros.transport.large_carriers import LargeCarriers
 from neuros.transport.large_packets import is_parcel
 from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.silent_topics import warn_of_silence
 
 _ANNOUNCE_S = 0.02
 
@@ -57,7 +55,7 @@ class RosTransport:
         self._loop = loop
         self._ways: dict[Connection, _Way] = {}
         self._acknowledgements: dict[Connection, Callable[[bytes], None]] = {}
-        self._external: dict[str, Publisher] = {}
+        self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self._registrations: list[Registration] = []
         self._large = LargeCarriers(file, ros_node.get_logger().warning)
@@ -73,11 +71,9 @@ class RosTransport:
                 self._open_sender(connection, inbox)
             else:
                 self._open_receiver(connection, inbox)
-        self._open_external(inbox)
+        self._external.open(inbox)
         if self._registrations:
-            self._timer = self._ros_node.create_timer(
-                _ANNOUNCE_S, lambda: self._loop.guard(self._look_for_others)
-            )
+            self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
 
     def note_result(self, box: Sequence[Any]) -> None:
         """Nothing to do: what is sent leaves as bytes."""
@@ -106,7 +102,7 @@ class RosTransport:
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
         if self._is_open:
-            self._external[port.name].publish(packet)
+            self._external.send(port, packet)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Publish the position that every taker has reached."""
@@ -126,6 +122,7 @@ class RosTransport:
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
+        self._external.close()
         self._large.close()
 
     def _open_sender(self, connection: Connection, inbox: Inbox) -> None:
@@ -202,33 +199,6 @@ class RosTransport:
         way.carrier = self._large.encoder(connection, note, way.count_readers) or way.carrier
         inbox.on_registered(connection)
 
-    def _open_external(self, inbox: Inbox) -> None:
-        for port in self._node.outputs:
-            if port.external_topic is not None:
-                self._external[port.name] = self._ros_node.create_publisher(
-                    message_class(port.type), port.external_topic, EXTERNAL_DEPTH
-                )
-        heard = {
-            port: self._open_external_input(port, inbox)
-            for port in self._node.inputs
-            if port.external_topic is not None
-        }
-        if heard:
-            warn_of_silence(self._ros_node, heard, self._loop.guard)
-
-    def _open_external_input(self, port: Port, inbox: Inbox) -> Subscription:
-        # A best-effort reader matches reliable and best-effort writers.
-        qos = QoSProfile(depth=EXTERNAL_DEPTH, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        return self._subscribe(
-            message_class(port.type),
-            str(port.external_topic),
-            qos,
-            _delivering(
-                message_carrier(message_class(port.type)), partial(inbox.on_external_packet, port)
-            ),
-            is_raw=True,
-        )
-
     def _subscribe(
         self,
         kind: type,
@@ -274,11 +244,6 @@ def _decoding(
             deliver(packet)
 
     return receive
-
-
-def _delivering(carrier: Decoder, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
-    decode = carrier.decode
-    return lambda data: deliver(decode(data))
 
 
 def _call(function: Callable[[Connection], None], connection: Connection) -> Callable[[], None]:

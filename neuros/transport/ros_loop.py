@@ -18,10 +18,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node as RosNode
+from rclpy.timer import Timer
 
-from neuros.transport.executors import Turn, make_executor
+from neuros.transport.executors import Turn, WaitSetExecutor, make_executor
 
 Event = Callable[[], None]
 
@@ -52,7 +54,7 @@ class RosLoop:
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
-        self._executor = make_executor(context)
+        self._executor = make_executor(context, on_failure)
         self._on_failure = on_failure
         self._waker = _Waker()
         self._events: deque[tuple[Event, bool]] = deque()
@@ -62,6 +64,11 @@ class RosLoop:
         self._planned_ns: int | None = None
         self._is_stopping = False
 
+    @property
+    def is_limited(self) -> bool:
+        """Whether guard conditions, and coroutines as callbacks of services, are not served."""
+        return not isinstance(self._executor, WaitSetExecutor)
+
     def add_node(self, node: RosNode) -> None:
         """Serve what exists, and what will be created, on a ROS node."""
         self._executor.add_node(node)
@@ -69,6 +76,11 @@ class RosLoop:
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
         """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
         self._timers.append((next_due_ns, on_due))
+
+    def every(self, node: RosNode, seconds: float, event: Event) -> Timer:
+        """Handle ``event`` again and again, by a timer of ROS that no simulated time stops."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        return node.create_timer(seconds, lambda: self.guard(event), clock=steady)
 
     @property
     def has_waiting_events(self) -> bool:
@@ -168,7 +180,8 @@ class RosLoop:
                 self._on_failure(error)
             if time.monotonic_ns() > end_ns:
                 break
-        if events and not self._has_posted_turn:
+        # Turns that do nothing any more would keep the executor from ending.
+        if events and not self._has_posted_turn and not self._is_stopping:
             self._post_turn()
         if self._timers:
             self._check_timers()

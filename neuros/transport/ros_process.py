@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,6 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
+from neuros.transport.callbacks import Fail, PluginCallbacks
 from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
@@ -21,7 +20,7 @@ from neuros.transport.digests import digest_of
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
-from neuros.transport.plain_node import PlainNode
+from neuros.transport.plain_node import PlainNode, plain_node
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
@@ -30,8 +29,6 @@ _LINGER_S = 0.05
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
 # up the 5 s that they have, some of them blocked inside DDS; up to 17 take a fraction of a second.
 _CROWD = 16
-# What takes a callback, and at which place of its arguments.
-_CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service", 2))
 
 
 class RosProcess:
@@ -56,12 +53,13 @@ class RosProcess:
         debug: bool = False,
     ) -> None:
         self.has_leftovers = False
+        self._files = files
         os.environ.update(dds_environment(os.environ))
         self._context = rclpy.Context()
         # rcl would write each record to a second log file, which costs as much as a packet.
         arguments = ["--ros-args", "--disable-external-lib-logs"]
         for file in files if debug else ():
-            arguments += ["--log-level", f"{file.node.name}:=debug"]
+            arguments += ["--log-level", f"{_logger_name(file)}:=debug"]
         rclpy.init(
             args=arguments,
             context=self._context,
@@ -71,8 +69,9 @@ class RosProcess:
         self._has_digests = digests
         self._is_recorded = record
         self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
-        self._ros_nodes: dict[str, RosNode] = {}
+        self._ros_nodes: dict[str, PlainNode] = {}
         self._own_entities: dict[str, set[int]] = {}
+        self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
 
     @property
@@ -82,7 +81,7 @@ class RosProcess:
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
-        ros_node = PlainNode(file.node.name, self._context)
+        ros_node = plain_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
         transport: Transport
@@ -101,20 +100,16 @@ class RosProcess:
         self._transports.append(transport)
         return transport
 
-    def ros_node(self, file: NodeFile) -> RosNode:
+    def ros_node(self, file: NodeFile) -> PlainNode:
         """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
-    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None]) -> None:
-        """Remember what exists on a ROS node before its plugin gets hold of it.
-
-        In memory, ``enter`` is called before each callback of what the plugin creates there.
-        """
+    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None], fail: Fail) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it."""
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = _entities(ros_node)
-        if self._hub is not None:
-            for name, place in _CREATORS:
-                setattr(ros_node, name, _creating(getattr(ros_node, name), place, enter))
+        callbacks = PluginCallbacks(ros_node, enter, fail, is_limited=self._loop.is_limited)
+        self._callbacks.append(callbacks)
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has created something on its ROS node that may call back."""
@@ -128,7 +123,8 @@ class RosProcess:
         heard: Callable[[str, str | None], None],
     ) -> SideVoice:
         """Speak for nodes of this process, and listen to nodes that another launcher starts."""
-        return SideVoice(names, elsewhere, self._context, heard)
+        namespace = self._files[0].names.namespace
+        return SideVoice(names, elsewhere, self._context, heard, namespace)
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""
@@ -149,6 +145,8 @@ class RosProcess:
         Others in that crowd notice after 20 s that a process has gone, as with one that was
         killed; the shared memory of DDS is left to the guardian.
         """
+        for callbacks in self._callbacks:
+            callbacks.close()
         for transport in self._transports:
             transport.close()
         self._loop.run_for(_LINGER_S)
@@ -167,31 +165,9 @@ class RosProcess:
         return False
 
 
-def _creating(create: Callable[..., Any], place: int, enter: Callable[[], None]) -> Any:
-    """``create`` with ``enter`` called before its callback."""
-
-    @functools.wraps(create)
-    def creating(*arguments: Any, **keywords: Any) -> Any:
-        if len(arguments) > place:
-            callback = _entering(arguments[place], enter)
-            arguments = (*arguments[:place], callback, *arguments[place + 1 :])
-        elif "callback" in keywords:
-            keywords["callback"] = _entering(keywords["callback"], enter)
-        return create(*arguments, **keywords)
-
-    return creating
-
-
-def _entering(callback: Any, enter: Callable[[], None]) -> Any:
-    if not callable(callback) or inspect.iscoroutinefunction(callback):
-        return callback
-
-    @functools.wraps(callback)  # rclpy asks for its signature
-    def entering(*arguments: Any) -> Any:
-        enter()
-        return callback(*arguments)
-
-    return entering
+def _logger_name(file: NodeFile) -> str:
+    """As rcl makes it from namespace and name."""
+    return f"{file.names.namespace}/{file.node.name}"[1:].replace("/", ".")
 
 
 def _entities(ros_node: RosNode) -> set[int]:

@@ -1,10 +1,10 @@
 """How a project that is started in parts is held together: what its sides say to each other.
 
 A *side* is what one launcher has started. Its nodes say what their launcher has them say, each on a
-topic of its own, ``/neuros/<node>/side``: a latched ``std_msgs/msg/String``, so that the last word
-also reaches who comes later. That a node goes on living is told by DDS itself (liveliness, OMG DDS
-1.4, 2.2.3.11), from threads that need no Python: a plugin that holds its global lock for seconds
-does not pass for dead.
+topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
+``std_msgs/msg/String``, so that the last word also reaches who comes later. That a node goes
+on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no
+Python: a plugin that holds its global lock for seconds does not pass for dead.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from rclpy.qos import (
 )
 from std_msgs.msg import String
 
+from neuros.project.names import INTERNAL
+
 LEASE_S = 3.0
 """A node elsewhere that has given no sign of life for this long is gone."""
 
@@ -44,6 +46,7 @@ class SideVoice:
         elsewhere: nodes that other launchers start.
         heard: called from the thread with a node elsewhere and its word, or ``None`` when it is
             gone.
+        namespace: that of the project.
     """
 
     def __init__(
@@ -52,22 +55,24 @@ class SideVoice:
         elsewhere: Sequence[str],
         context: Context,
         heard: Callable[[str, str | None], None],
+        namespace: str = "",
     ) -> None:
         self._heard = heard
         self._ros_node = RosNode(
             f"_{names[0]}_side",  # a hidden one: tools do not list it unless they are asked to
             context=context,
+            namespace=namespace,
             enable_rosout=False,
             start_parameter_services=False,
         )
         self._publishers = [
-            self._ros_node.create_publisher(String, _topic(name), _qos(_OFFERED_S))
+            self._ros_node.create_publisher(String, _topic(namespace, name), _qos(_OFFERED_S))
             for name in names
         ]
         for name in elsewhere:
             self._ros_node.create_subscription(
                 String,
-                _topic(name),
+                _topic(namespace, name),
                 partial(self._hear, name),
                 _qos(LEASE_S),
                 event_callbacks=SubscriptionEventCallbacks(
@@ -104,8 +109,8 @@ class SideVoice:
             self._heard(name, None)
 
 
-def _topic(name: str) -> str:
-    return f"/neuros/{name}/side"
+def _topic(namespace: str, name: str) -> str:
+    return f"{namespace}{INTERNAL}{name}/side"
 
 
 def _qos(lease_s: float) -> QoSProfile:

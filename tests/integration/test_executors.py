@@ -188,7 +188,7 @@ def test_without_the_events_executor_a_wait_set_takes_its_place(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, EVENTS, None)  # as if it had been removed
-    executor = make_executor(context)
+    executor = make_executor(context, print)
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
     assert capfd.readouterr().err.count("falling back to a wait set") == 1
@@ -198,7 +198,7 @@ def test_with_an_events_executor_that_has_changed_too(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"{EVENTS}.EventsExecutor", lambda *, context: object())
-    executor = make_executor(context)
+    executor = make_executor(context, print)
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
 
@@ -206,7 +206,7 @@ def test_with_an_events_executor_that_has_changed_too(
 def test_a_turn_stands_in_the_queue_itself_and_no_task_for_it(context: rclpy.Context) -> None:
     """What a loop-back costs depends on that; it goes on working where rclpy changes."""
     turn = Turn(lambda: None)
-    executor = make_executor(context)
+    executor = make_executor(context, print)
     assert executor.create_task(turn) is turn
     assert isinstance(executor.create_task(lambda: None), rclpy.task.Task)
     executor.shutdown(0)
@@ -217,7 +217,7 @@ def test_an_unknown_executor_is_refused(
 ) -> None:
     monkeypatch.setenv(EXECUTOR_VARIABLE, "fast")
     with pytest.raises(EnvironmentFault, match="'events' or 'wait_set'"):
-        make_executor(context)
+        make_executor(context, print)
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])
@@ -229,3 +229,23 @@ def test_a_project_runs_on_a_wait_set(
     assert run.exit_code == 0, run.output
     for connection in run.record["connections"]:
         assert connection["sent"] == connection["received"] > 0, connection
+
+
+def test_a_task_that_fails_is_an_error_and_does_not_end_the_process(
+    loop: Loop, context: rclpy.Context
+) -> None:
+    node = RosNode("node", context=context)
+    loop.loop.add_node(node)
+
+    def fail() -> None:
+        raise ValueError("in a task")
+
+    async def fail_later() -> None:
+        fail()
+
+    loop.loop.post(lambda: node.executor.create_task(fail))
+    loop.loop.post(lambda: node.executor.create_task(fail_later))
+    loop.loop.post(lambda: loop.loop.post_loop_back(loop.loop.stop))
+    with pytest.raises(ValueError, match="in a task"):
+        loop.run()
+    node.destroy_node()

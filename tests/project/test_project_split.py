@@ -14,6 +14,8 @@ from jsonschema import Draft202012Validator
 
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, Port, Project
+from neuros.project.names import Names
+from neuros.project.qos import Qos
 from neuros.project.resources import Access, Resources
 from neuros.project.split import (
     merge,
@@ -40,6 +42,20 @@ ACCESSES = st.builds(
     gpus=st.sampled_from([(), ("all",), ("0", "1")]),
     display=st.booleans(),
 )
+QOS = st.none() | st.builds(
+    Qos,
+    reliability=st.sampled_from(["reliable", "best_effort"]),
+    durability=st.sampled_from(["volatile", "transient_local"]),
+    depth=st.integers(1, 1000),
+)
+PROJECT_NAMES = st.builds(
+    Names,
+    namespace=st.sampled_from(["", "/left", "/lab/left"]),
+    remap=st.lists(st.tuples(NAMES, NAMES), max_size=3, unique_by=lambda rule: rule[0]).map(tuple),
+)
+PARAMETERS = st.dictionaries(
+    NAMES, st.booleans() | st.integers(-9, 9) | TEXTS | st.just((1.0, 2.5)), max_size=2
+)
 SENSOR = {"sensor": "imu", "element": "imu", "rate": 50}
 
 
@@ -54,7 +70,8 @@ def ports(draw: st.DrawFn, side: str) -> tuple[Port, ...]:
         Port(
             name,
             draw(TYPES),
-            external_topic=draw(st.sampled_from([None, None, "/topic"])),
+            external_topic=(topic := draw(st.sampled_from([None, None, "/topic", "~/topic"]))),
+            qos=draw(QOS) if topic else None,
             mujoco=draw(st.sampled_from([{}, SENSOR])) if side == "outputs" else {},
             gazebo_type=draw(st.sampled_from([None, "ignition.msgs.IMU"])),
         )
@@ -84,6 +101,7 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             affinity=tuple(draw(st.lists(st.integers(0, 9), max_size=2, unique=True))),
             resources=draw(RESOURCES),
             access=draw(ACCESSES),
+            parameters=draw(PARAMETERS),
         )
         nodes.append(node)
     pairs = [
@@ -91,6 +109,7 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
         for a in nodes for o in a.outputs for b in nodes for i in b.inputs
         if o.type == i.type and o.external_topic is None and i.external_topic is None
     ]  # fmt: skip
+    project_names = draw(PROJECT_NAMES)
     chosen = draw(st.lists(st.sampled_from(pairs), unique=True, max_size=5)) if pairs else []
     connections = tuple(
         Connection(
@@ -98,11 +117,19 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             discard_limit=draw(st.none() | st.integers(0, 3)),
             queue_size=draw(st.integers(1, 3)),
             index=index,
+            namespace=project_names.namespace,
         )
         for index, ends in enumerate(chosen)
     )
     description = draw(TEXTS)
-    return Project(root.name, tuple(nodes), connections, root / "project.json", description)
+    return Project(
+        root.name,
+        tuple(nodes),
+        connections,
+        root / "project.json",
+        description,
+        names=project_names,
+    )
 
 
 @settings(max_examples=100)

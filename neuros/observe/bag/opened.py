@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from rosbags.interfaces import Connection, QosReliability
+from rosbags.interfaces import Connection, QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -42,7 +42,7 @@ class RecordedTopic:
         name: the topic.
         type: its message type in ROS notation.
         connection: ``a.out -> b.in``, or ``None`` for a topic that belongs to none.
-        is_reliable, depth: of the quality of service that was offered.
+        is_reliable, depth, is_latched: of the quality of service that was offered.
         count: how many packets there are.
     """
 
@@ -54,6 +54,9 @@ class RecordedTopic:
         self.count = recorded.msgcount
         profiles = getattr(recorded.ext, "offered_qos_profiles", None) or []
         self.is_reliable = all(p.reliability is QosReliability.RELIABLE for p in profiles)
+        self.is_latched = bool(profiles) and all(
+            p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles
+        )
         self.depth = max((p.depth for p in profiles), default=0) or 10
 
     def raw(self) -> list[RawPacket]:

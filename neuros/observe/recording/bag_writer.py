@@ -231,11 +231,12 @@ class BagWriter(Writer):
 
 def _qos(topic: Topic) -> Qos:
     """What the sender of a topic offers."""
+    latched = QosDurability.TRANSIENT_LOCAL
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=topic.depth,
         reliability=QosReliability.RELIABLE if topic.is_reliable else QosReliability.BEST_EFFORT,
-        durability=QosDurability.VOLATILE,
+        durability=latched if topic.is_latched else QosDurability.VOLATILE,
         deadline=_FOREVER,
         lifespan=_FOREVER,
         liveliness=QosLiveliness.AUTOMATIC,

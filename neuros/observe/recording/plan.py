@@ -25,7 +25,7 @@ class Topic:
     Attributes:
         name: as on the ROS graph.
         type: in ROS notation.
-        is_reliable, depth: of the quality of service that its sender offers.
+        is_reliable, depth, is_latched: of the quality of service that its sender offers.
         connection: ``a.out -> b.in``, or ``None`` for an external topic.
     """
 
@@ -34,6 +34,7 @@ class Topic:
     is_reliable: bool = True
     depth: int = 10
     connection: str | None = None
+    is_latched: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from neuros.errors import UsageError
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
 from neuros.ports import Way
 from neuros.project.model import Connection, Node, Project
+from neuros.project.names import INTERNAL, Names
+from neuros.project.qos import ASKED, DEPTH, OFFERED
 
 CLOCK = "/clock"
 
@@ -86,12 +88,12 @@ def _places(project: Project, names: Collection[str]) -> Iterator[_Place]:
     nodes = [node for node in project.nodes if node.name in names]
     sent: set[str] = set()
     for node in nodes:
-        for place in _external(node, is_output=True):
+        for place in _external(project.names, node, is_output=True):
             sent.add(place.topic.name)
             yield place
     heard: set[str] = set()
     for node in nodes:
-        for place in _external(node, is_output=False):
+        for place in _external(project.names, node, is_output=False):
             if place.topic.name not in sent | heard:
                 heard.add(place.topic.name)
                 yield place
@@ -117,12 +119,19 @@ def _connection_place(
         yield _Place(destination, Way.RECEIVED, str(connection), topic)
 
 
-def _external(node: Node, *, is_output: bool) -> Iterator[_Place]:
+def _external(names: Names, node: Node, *, is_output: bool) -> Iterator[_Place]:
     for port in node.outputs if is_output else node.inputs:
         if port.external_topic is not None:
-            name = "/" + port.external_topic.lstrip("/")
+            qos = port.qos or (OFFERED if is_output else ASKED)
+            topic = Topic(
+                names.resolve(port.external_topic, node.name),
+                port.type,
+                qos.reliability != "best_effort" if is_output else qos.reliability == "reliable",
+                qos.depth or DEPTH,
+                is_latched=qos.is_latched,
+            )
             way = Way.SENT if is_output else Way.HEARD
-            yield _Place(node.name, way, port.name, Topic(name, port.type, is_reliable=is_output))
+            yield _Place(node.name, way, port.name, topic)
 
 
 def _streams(places: Sequence[_Place], topics: Sequence[Topic]) -> dict[str, tuple[Stream, ...]]:
@@ -158,6 +167,7 @@ def _asked_of_ros(request: Request, known: Collection[str], project: Project) ->
         UsageError: for what can be neither on the graph nor in the project.
     """
     found = []
+    internal = project.names.namespace + INTERNAL
     labels = {str(connection): f"{connection.topic}/data" for connection in project.connections}
     for text in request.topics:
         in_project = any(
@@ -165,7 +175,7 @@ def _asked_of_ros(request: Request, known: Collection[str], project: Project) ->
         ) or any(fnmatchcase(name, text) for name in known)
         if in_project:
             continue
-        if not text.startswith("/") or text.startswith("/neuros/") or set(text) & set("*?["):
+        if not text.startswith("/") or text.startswith(internal) or set(text) & set("*?["):
             raise _unknown("--topic", text, project)
         found.append(text)
     return tuple(dict.fromkeys(found))
@@ -175,8 +185,9 @@ def _check_excluded(request: Request, project: Project) -> None:
     """Raise ``UsageError`` for what leaves nothing out, nor could on the ROS graph."""
     everywhere = _places(project, [node.name for node in project.nodes])
     topics = [place.topic for place in everywhere]
+    internal = project.names.namespace + INTERNAL
     for text in request.exclude:
-        is_of_ros = text.startswith("/") and not text.startswith("/neuros/")
+        is_of_ros = text.startswith("/") and not text.startswith(internal)
         if not is_of_ros and not any(is_named(t.name, t.connection, [text]) for t in topics):
             raise _unknown("--exclude", text, project)
 

@@ -1,0 +1,58 @@
+"""Names on the ROS graph: the namespace of a project, and its remapping rules.
+
+As in ROS 2 (design.ros2.org, "Topic and Service name mapping to DDS" and "Remapping Names"): a
+relative name begins in the namespace, ``~`` stands for the node, an absolute name is left alone.
+A rule replaces a name if both are the same in full; the first rule that fits counts, once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MOST_CHARACTERS = 247
+"""Of a topic's full name: DDS has 255, and ROS puts up to 8 in front (``rmw/validate_full...``)."""
+
+INTERNAL = "/neuros/"
+"""Where, within the namespace, the topics of connections are."""
+
+
+@dataclass(frozen=True)
+class Names:
+    """What a project is called on the ROS graph.
+
+    Attributes:
+        namespace: empty, or as in ``/left`` or ``/lab/left``.
+        remap: rules ``(from, to)``; ``node:from`` holds for one node alone.
+    """
+
+    namespace: str = ""
+    remap: tuple[tuple[str, str], ...] = ()
+
+    def full(self, name: str, node: str) -> str:
+        """The full name behind ``name`` on a node, before rules."""
+        if name.startswith("/"):
+            return name
+        if name.startswith("~/"):
+            return f"{self.namespace}/{node}{name[1:]}"
+        return f"{self.namespace}/{name}"
+
+    def resolve(self, name: str, node: str) -> str:
+        """The full name that ``name`` has in the end."""
+        full = self.full(name, node)
+        for rule, new in self.remap:
+            only, _, old = rule.rpartition(":")
+            if only in ("", node) and self.full(old, node) == full:
+                return self.full(new, node)
+        return full
+
+    @property
+    def ros_arguments(self) -> list[str]:
+        """The rules as ROS's own command line has them."""
+        rules = [part for old, new in self.remap for part in ("-r", f"{old}:={new}")]
+        return ["--ros-args", *rules] if rules else []
+
+
+def normalised_namespace(written: str) -> str:
+    """``/left`` for ``left`` and ``/left``; empty for ``/``, where everybody is."""
+    stripped = written.strip("/")
+    return f"/{stripped}" if stripped else ""
