@@ -83,8 +83,10 @@ def _displays(project: Project) -> Iterator[dict[str, Any]]:
             yield _display(DISPLAYS[port.type], name, f"{connection.topic}/data")
     for node in project.nodes:
         for port in (*node.inputs, *node.outputs):
-            topic = port.external_topic
-            if topic is not None and port.type in DISPLAYS and topic not in seen:
+            if port.external_topic is None or port.type not in DISPLAYS:
+                continue
+            topic = project.names.resolve(port.external_topic, node.name)
+            if topic not in seen:
                 seen.add(topic)
                 yield _display(DISPLAYS[port.type], topic, topic)
 
