@@ -1,0 +1,98 @@
+"""Plain rclpy programs, in processes of their own, and a node that has to do with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from launching import BACKENDS, Running, start
+
+from containers import require_containers
+from neuros.launch.domain import choose_domain
+from neuros.launch.wheels import with_libraries
+
+PROJECT = Path(__file__).parent / "outside_ros"
+LIMIT_S = 60.0
+MATCHED = ("fast heard: 1", "sure heard: 1", "latched heard: 1")
+UNMATCHED = (
+    "input 'strict': on /strict /program offers best_effort, and this input asks for reliable",
+    "output 'loose': on /loose /program asks for reliable, and this output offers best_effort",
+)
+
+
+@contextmanager
+def program(name: str, domain_id: int) -> Iterator[subprocess.Popen[str]]:
+    """One of the programs beside the project; ended at the end."""
+    environment = with_libraries(
+        {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+    )
+    with subprocess.Popen(
+        [sys.executable, "-u", str(PROJECT / name)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    "back_end", [*BACKENDS, pytest.param("docker", marks=pytest.mark.acceptance)]
+)
+def test_a_node_among_plain_ros_programs(back_end: str, tmp_path: Path) -> None:
+    if back_end == "docker":
+        require_containers()
+    with choose_domain(None, {}, False) as domain, program("program.py", domain.id) as there:
+        assert there.stdout is not None
+        assert there.stdout.readline() == "here\n"
+        arguments = ("--backend", back_end, "-d", str(domain.id))
+        with start(PROJECT, *arguments, cwd=tmp_path) as running:
+            for text in (*MATCHED, *UNMATCHED):
+                running.wait_for(text, LIMIT_S)
+            with program("late.py", domain.id) as late:
+                answer, _ = late.communicate(timeout=LIMIT_S)
+            check_what_the_late_one_found(json.loads(answer))
+            check_the_end(running)
+        there.send_signal(signal.SIGINT)
+        assert "heard" not in there.stdout.read(), "a best-effort output, by a reliable reader"
+
+
+def check_what_the_late_one_found(found: dict[str, Any]) -> None:
+    counts = found.pop("counts")
+    assert found == {
+        "states": ["ready with 1.5"],
+        "greeting": "hello",
+        "gain.p": 1.5,
+        "limits": [1, 2],
+        "described": 5,
+        "late": 3,
+        "set": [True, False],
+    }
+    # A hook that runs without pause and ROS's callbacks take turns, and never run at once.
+    assert counts.pop("at_once") == 0
+    assert all(count > 0 for count in counts.values()), counts
+    assert counts["timer"] > 20
+    assert counts["rounds"] > 20
+    assert counts["set"] == 2
+
+
+def check_the_end(running: Running) -> None:
+    running.signal(signal.SIGINT)
+    finished = running.finish()
+    assert finished.exit_code == 130, finished.output
+    assert "strict heard" not in finished.output
+    assert finished.output.count("asks for reliable") == 2, "each is said once"
