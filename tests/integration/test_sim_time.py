@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from containers import require_containers
 from launching import start
 
+from containers import require_containers
 from neuros.launch.domain import choose_domain
 from neuros.launch.wheels import with_libraries
 

@@ -1,0 +1,210 @@
+"""What a plugin registers with ROS: a failure is reported once, with its callback."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Int32
+from std_srvs.srv import Trigger
+
+from neuros.errors import NodeError
+from neuros.launch.domain import choose_domain
+from neuros.runtime.callbacks import callback_error
+from neuros.transport.callbacks import PluginCallbacks
+from neuros.transport.executors import EXECUTOR_VARIABLE
+from neuros.transport.messages import message_class
+from neuros.transport.plain_node import PlainNode
+from neuros.transport.ros_loop import RosLoop
+
+LIMIT_S = 20.0
+
+
+class Plugin:
+    """A ROS node in the hands of a plugin, served by a loop.
+
+    Attributes:
+        failures: callbacks and what they have raised.
+        entered: how often the node was entered.
+    """
+
+    def __init__(self, context: rclpy.Context) -> None:
+        self.failures: list[tuple[Any, BaseException]] = []
+        self.outside: list[BaseException] = []
+        self.entered = 0
+        self.loop = RosLoop(context, self._fail_outside)
+        self.ros = PlainNode("plugin", context)
+        self.loop.add_node(self.ros)
+        self.callbacks = PluginCallbacks(
+            self.ros, self._enter, self._fail, is_limited=self.loop.is_limited
+        )
+
+    def run(self) -> None:
+        """Until a callback has failed, or :meth:`stop`."""
+        limit = threading.Timer(LIMIT_S, self.loop.stop)
+        limit.start()
+        self.loop.run()
+        is_in_time = limit.is_alive()
+        limit.cancel()
+        assert is_in_time, "nothing has happened"
+
+    def stop(self, *_: Any) -> None:
+        self.loop.stop()
+
+    def _enter(self) -> None:
+        self.entered += 1
+
+    def _fail(self, callback: Any, error: BaseException) -> None:
+        self.failures.append((callback, error))
+        self.loop.stop()
+
+    def _fail_outside(self, error: BaseException) -> None:
+        self.outside.append(error)
+        self.loop.stop()
+
+    def ask_itself(self, then: Callable[[Any], None]) -> None:
+        """Call the service ``ask`` as soon as it is there."""
+        client = self.ros.create_client(Trigger, "ask")
+
+        def ask() -> None:
+            if client.service_is_ready():
+                timer.cancel()
+                then(client.call_async(Trigger.Request()))
+
+        timer = self.ros.create_timer(0.01, ask)
+
+
+@pytest.fixture(params=["events", "wait_set"])
+def plugin(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plugin]:
+    monkeypatch.setenv(EXECUTOR_VARIABLE, request.param)
+    message_class("std_msgs/msg/Int32")  # ROS's first conversion of a type imports what warns
+    with choose_domain(None, {}, False) as domain:
+        context = rclpy.Context()
+        rclpy.init(
+            context=context, domain_id=domain.id, signal_handler_options=SignalHandlerOptions.NO
+        )
+        made = Plugin(context)
+        yield made
+        made.callbacks.close()
+        made.loop.close()
+        made.ros.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def fail(*_: Any) -> None:
+    raise ValueError("on purpose")
+
+
+async def fail_later(*_: Any) -> None:
+    fail()
+
+
+def by_timer(plugin: Plugin) -> None:
+    plugin.ros.create_timer(0.001, fail)
+
+
+def by_coroutine(plugin: Plugin) -> None:
+    plugin.ros.create_timer(0.001, fail_later)
+
+
+def by_subscription(plugin: Plugin) -> None:
+    publisher = plugin.ros.create_publisher(Int32, "topic", 10)
+    plugin.ros.create_subscription(Int32, "topic", fail, 10)
+    plugin.ros.create_timer(0.01, lambda: publisher.publish(Int32()))
+
+
+def by_service(plugin: Plugin) -> None:
+    plugin.ros.create_service(Trigger, "ask", fail)
+    plugin.ask_itself(lambda future: None)
+
+
+def by_future(plugin: Plugin) -> None:
+    plugin.ros.create_service(Trigger, "ask", lambda request, response: response)
+    plugin.ask_itself(lambda future: future.add_done_callback(fail))
+
+
+def by_task(plugin: Plugin) -> None:
+    plugin.ros.executor.create_task(fail)
+
+
+@pytest.mark.parametrize(
+    "break_down", [by_timer, by_coroutine, by_subscription, by_service, by_future, by_task]
+)
+def test_a_failure_is_reported_once_with_its_callback(
+    break_down: Callable[[Plugin], None], plugin: Plugin
+) -> None:
+    break_down(plugin)
+    plugin.run()
+    plugin.loop.run_for(0.02)
+    ((callback, error),) = plugin.failures
+    assert not plugin.outside
+    assert plugin.entered >= 1
+    known = callback_error(error, callback)
+    name = "fail_later" if break_down is by_coroutine else "fail"
+    assert str(known).endswith(f": callback '{name}': ValueError: on purpose")
+    assert str(known).startswith(f"{__file__}:")
+
+
+def test_what_fails_answers_no_request(plugin: Plugin) -> None:
+    answers: list[object] = []
+    plugin.ros.create_service(Trigger, "ask", fail)
+    plugin.ask_itself(lambda future: future.add_done_callback(answers.append))
+    plugin.run()
+    plugin.loop.run_for(0.1)
+    assert not answers
+
+
+def test_a_coroutine_is_entered_again_after_it_has_waited(plugin: Plugin) -> None:
+    plugin.ros.create_service(Trigger, "ask", lambda request, response: response)
+    client = plugin.ros.create_client(Trigger, "ask")
+    entered: list[int] = []
+
+    async def ask() -> None:
+        if client.service_is_ready() and not entered:
+            entered.append(plugin.entered)
+            await client.call_async(Trigger.Request())
+            entered.append(plugin.entered)
+            plugin.stop()
+
+    # Where the executor knows groups, no other callback of the same one runs before this has ended.
+    plugin.ros.create_timer(0.01, ask, callback_group=ReentrantCallbackGroup())
+    plugin.run()
+    assert entered[1] > entered[0]
+
+
+def test_what_the_executor_does_not_serve_is_refused_where_it_is_made(plugin: Plugin) -> None:
+    if not plugin.loop.is_limited:
+        plugin.ros.create_guard_condition(plugin.stop).trigger()
+        plugin.run()
+        return
+    with pytest.raises(NodeError, match="does not serve guard conditions; NEUROS_EXECUTOR"):
+        plugin.ros.create_guard_condition(fail)
+    with pytest.raises(NodeError, match="does not serve a coroutine as its callback"):
+        plugin.ros.create_service(Trigger, "ask", fail_later)
+
+
+def test_nothing_is_called_when_the_node_has_ended(plugin: Plugin) -> None:
+    plugin.ros.create_timer(0.001, fail)
+    plugin.callbacks.close()
+    plugin.loop.run_for(0.05)
+    assert not plugin.failures
+
+
+def test_parameters_of_the_project_can_be_declared_again_with_their_value() -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = PlainNode("node", context, parameters={"gain.p": 1.5, "list": (1, 2)})
+    assert node.get_parameter("gain.p").value == 1.5
+    assert node.declare_parameter("gain.p", 0.0).value == 1.5
+    assert [p.value for p in node.declare_parameters("gain", [("i", 0.5)])] == [0.5]
+    with pytest.raises(rclpy.exceptions.ParameterAlreadyDeclaredException):
+        node.declare_parameter("gain.p", 0.0)
+    assert node.get_parameter("list").type_ == Parameter.Type.INTEGER_ARRAY
+    node.destroy_node()
+    rclpy.shutdown(context=context)
