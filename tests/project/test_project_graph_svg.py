@@ -12,7 +12,8 @@ from neuros.project.graph_svg import graph_svg
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Node, Port, Project
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES, WORKSPACE = ROOT / "examples", ROOT / "workspace"
 TEXT = "std_msgs/msg/String"
 SVG = "{http://www.w3.org/2000/svg}"
 PROJECT = Project(
@@ -56,7 +57,7 @@ def test_the_title_is_the_project_s_whatever_letters_it_has() -> None:
     "file", sorted(EXAMPLES.rglob("project.json")), ids=lambda f: f.parent.name
 )
 def test_nothing_of_an_example_is_outside_of_its_picture_or_over_something_else(file: Path) -> None:
-    root = ElementTree.fromstring(graph_svg(load_project(file)))
+    root = ElementTree.fromstring(graph_svg(load_project(file, workspace=WORKSPACE).project))
     width, height = float(root.attrib["width"]), float(root.attrib["height"])
     boxes = [
         tuple(float(box.attrib[key]) for key in ("x", "y", "width", "height"))
