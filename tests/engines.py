@@ -59,6 +59,7 @@ class OwnEngine:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
+                start_new_session=True,
             )
         wait_until(self._answers, _SOON_S)
 

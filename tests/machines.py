@@ -36,6 +36,7 @@ class Machine:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl+C ends the tests, and they end it
         )
         assert self._holder.stdout is not None
         if (said := self._holder.stdout.readline()) != b"ready\n":

@@ -130,7 +130,10 @@ def pulled(engine: DockerClient, name: str, *, newest: bool) -> Any:
     try:
         return engine.images.pull(name, None if ":" in name.rpartition("/")[2] else "latest")
     except APIError as error:
+        remedy = "docker load it, or name one that the engine has with --base-image"
+        with contextlib.suppress(APIError):
+            engine.images.get(name)
+            remedy = "the one that the engine has is taken without --pull"
         raise EnvironmentFault(
-            f"image '{name}' cannot be pulled ({error.explanation or error}): docker load it, or"
-            " name one that the engine has with --base-image"
+            f"image '{name}' cannot be pulled ({error.explanation or error}): {remedy}"
         ) from error

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
+import socket
+import subprocess
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -14,8 +18,11 @@ from typing import Any
 import pytest
 from docker.errors import APIError
 
+from containers import wait_until
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault
+from neuros.launch.docker.build_steps import pulled
+from neuros.launch.docker.context import context_of
 from neuros.launch.docker.engine import connect
 from neuros.launch.docker.images import image_for
 
@@ -300,3 +307,74 @@ class TestImagesOfUsers:
     ) -> None:
         with pytest.raises(EnvironmentFault, match=f"run ./install.py --containers {bare}"):
             image_for(bare, bench.folder, engine)
+
+
+@pytest.mark.acceptance
+class TestRegistries:
+    """With Debian's docker-registry, whose service need not run."""
+
+    @pytest.fixture
+    def registry(self, tmp_path: Path) -> Iterator[str]:
+        """The address of a registry; it ends with the test."""
+        if shutil.which("docker-registry") is None:
+            pytest.skip("there is no docker-registry: apt-get install docker-registry")
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"127.0.0.1:{free.getsockname()[1]}"
+        settings = {
+            "version": "0.1",
+            "storage": {"filesystem": {"rootdirectory": str(tmp_path / "registry")}},
+            "http": {"addr": address},
+        }
+        (tmp_path / "registry.yml").write_text(json.dumps(settings))  # which is YAML, too
+        command = ["docker-registry", "serve", str(tmp_path / "registry.yml")]
+        nowhere = subprocess.DEVNULL
+        with subprocess.Popen(command, stdout=nowhere, stderr=nowhere) as process:
+            wait_until(lambda: _answers(address))
+            yield address
+            process.terminate()
+
+    @pytest.fixture
+    def images(self, registry: str, engine: Any) -> Iterator[tuple[str, str, str]]:
+        """A name, and the ids of its two versions: one here, a newer one in the registry."""
+        name = f"{registry}/probe:1"
+        ids = []
+        for version in ("first", "second"):
+            archive = context_of(None, f"FROM scratch\nCOPY Dockerfile /{version}\n")
+            image, _ = engine.images.build(fileobj=archive, custom_context=True, tag=name)
+            ids.append(image.id)
+            assert "error" not in engine.images.push(name)
+        engine.images.get(ids[0]).tag(name)
+        yield name, ids[0], ids[1]
+        for image in (name, *ids):
+            with suppress(APIError):
+                engine.images.remove(image)
+
+    def test_only_pull_asks_for_the_newest_version(
+        self, images: tuple[str, str, str], engine: Any
+    ) -> None:
+        name, here, newest = images
+        assert pulled(engine, name, newest=False).id == here
+        assert pulled(engine, name, newest=True).id == newest
+        engine.images.remove(name)
+        assert pulled(engine, name, newest=False).id == newest
+
+    def test_one_that_no_registry_has_is_named_with_the_way_out(
+        self, registry: str, images: tuple[str, str, str], engine: Any
+    ) -> None:
+        name = f"{registry}/nothing:1"
+        with pytest.raises(EnvironmentFault, match=f"image '{name}' .*: docker load it, or name"):
+            pulled(engine, name, newest=False)
+        engine.images.get(images[1]).tag(name)
+        with pytest.raises(EnvironmentFault, match="the engine has is taken without --pull"):
+            pulled(engine, name, newest=True)
+        engine.images.remove(name)
+
+
+def _answers(address: str) -> bool:
+    host, _, port = address.partition(":")
+    try:
+        socket.create_connection((host, int(port))).close()
+    except OSError:
+        return False
+    return True
