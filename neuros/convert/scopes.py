@@ -94,7 +94,7 @@ class Scope:
                 return self.place(head, asking) @ self.models[head].place(rest, asking)
             self.report.problem(asking, f"there is no model '{head}' for '{name}'")
             return Pose()
-        if head in _OWN:
+        if head in _OWN and (head != "world" or self.is_world):
             return Pose()
         if head not in self.frames:
             self._unknown(name, asking)

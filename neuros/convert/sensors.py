@@ -110,8 +110,9 @@ def _add_force_torque(building: Building, branch: Branch, element: Element) -> N
         place = Pose(place.position, np.eye(3) if end is None else end.pose.rotation)
     elif frame != "sensor":
         report.problem(settings or element, f"'{frame}' is none of child, parent and sensor")
-    # MuJoCo measures what the body of the site, here the one that hangs, does to its parent.
-    if (direction == "parent_to_child") != branch.is_turned:
+    # MuJoCo measures the force on the body that hangs; SDF, unless told otherwise, what the child
+    # does to the parent.
+    if (direction == "parent_to_child") == branch.is_turned:
         report.remark(element, "with the opposite sign in MuJoCo")
     wanted = f"{joint.name}/{element.name}"
     site = add_site(building, link, element, place, wanted=wanted)

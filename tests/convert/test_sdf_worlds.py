@@ -96,9 +96,13 @@ def test_a_lidar_has_a_ray_for_every_sample(folder: Folder) -> None:
 def test_a_force_torque_sensor_feels_the_weight_below_its_joint(folder: Folder) -> None:
     sensor = '<sensor name="felt" type="force_torque"/>'
     text = link("base") + link("hand", mass=2) + joint("fixed", "world", "base", name="w")
-    model = folder.model(text + joint("fixed", "base", "hand", more=sensor))
-    force = positions(model).sensor("joint/felt/force").data
-    np.testing.assert_allclose(np.abs(force), [0, 0, 2 * 9.81], atol=1e-9)
+    text += joint("fixed", "base", "hand", more=sensor)
+    force = positions(folder.model(text)).sensor("joint/felt/force").data
+    np.testing.assert_allclose(force, [0, 0, 2 * 9.81], atol=1e-9)
+    assert "with the opposite sign in MuJoCo" in folder.notes(text).values()
+    upwards = "<force_torque><measure_direction>parent_to_child</measure_direction></force_torque>"
+    same = text.replace(sensor, f'<sensor name="felt" type="force_torque">{upwards}</sensor>')
+    assert not folder.notes(same)
 
 
 def test_lights_shine_where_they_shone(folder: Folder) -> None:
