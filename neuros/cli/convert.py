@@ -1,4 +1,4 @@
-"""``neuros convert``: from SDF to MuJoCo's own format."""
+"""``neuros convert``: from SDF or URDF to MuJoCo's own format."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
 
 if TYPE_CHECKING:
+    from neuros.convert.converted import Converted
     from neuros.convert.report import NotTaken
-    from neuros.convert.sdf import Converted
 
 _EPILOG = """\
 exit codes:
@@ -28,14 +28,14 @@ def add_convert(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     """Add the command to the grammar."""
     convert = commands.add_parser(
         "convert",
-        help="turn a robot or world in SDF into a MuJoCo model",
-        description="Turn a robot or a world in SDF (1.4 to 1.11) into a MuJoCo model (MJCF), and"
-        " list what has no counterpart there.",
+        help="turn a robot or world in SDF, or a robot in URDF, into a MuJoCo model",
+        description="Turn a robot or a world in SDF (1.4 to 1.11), or a robot in URDF, into a"
+        " MuJoCo model (MJCF), and list what has no counterpart there.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     convert.add_argument(
-        "file", metavar="FILE", help="an SDF file, or a folder with a model.config"
+        "file", metavar="FILE", help="an SDF or URDF file, or a folder with a model.config"
     )
     convert.add_argument(
         "-o", "--output", metavar="FILE", help="what to write (default: the name with .xml)"
@@ -87,6 +87,7 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
         from neuros.convert.includes import model_file
         from neuros.convert.output import is_ours
         from neuros.convert.sdf import convert_sdf
+        from neuros.convert.urdf import read_urdf
     except ImportError as error:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
         raise EnvironmentFault(text) from error
@@ -106,7 +107,8 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     for folder in folders:
         if not folder.is_dir():
             raise UsageError(f"-I {folder}: there is no such folder")
-    return convert_sdf(source, finder(folders, os.environ)), source, output
+    convert = read_urdf if source.suffix.lower() == ".urdf" else convert_sdf
+    return convert(source, finder(folders, os.environ)), source, output
 
 
 def _table(notes: Sequence[NotTaken]) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import mujoco
 
+from neuros.convert.converted import Converted
 from neuros.convert.meshes import Triangles
-from neuros.convert.sdf import Converted
 
 MARK = "made by `neuros convert`"
 """Stands in the first line of every file that is written here, and may be overwritten."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +10,7 @@ import mujoco
 
 from neuros.convert.building import Building, put
 from neuros.convert.controllers import add_actuators
+from neuros.convert.converted import Converted
 from neuros.convert.couplings import add_mimics
 from neuros.convert.elements import Element
 from neuros.convert.find import Finder
@@ -19,10 +18,10 @@ from neuros.convert.includes import Includer
 from neuros.convert.inertia import is_computed, read_inertia, set_inertia
 from neuros.convert.joints import add_joints, is_known
 from neuros.convert.loops import close_loop
-from neuros.convert.meshes import Meshes, Triangles
+from neuros.convert.meshes import Meshes
 from neuros.convert.numbers import is_true, word
 from neuros.convert.poses import Pose
-from neuros.convert.report import NotTaken, Report
+from neuros.convert.report import Report
 from neuros.convert.scope_reading import place_all, read_scope
 from neuros.convert.scopes import Link, Scope
 from neuros.convert.sensors import add_joint_sensors, add_link_sensors
@@ -30,24 +29,6 @@ from neuros.convert.shapes import add_shapes, share_masks
 from neuros.convert.sites import add_frames
 from neuros.convert.tree import Branch, Joint, Tree, grow
 from neuros.convert.world import add_lights, read_world
-
-
-@dataclass(frozen=True)
-class Converted:
-    """A description as MuJoCo has it.
-
-    Attributes:
-        spec: the ``MjSpec``; its meshes have absolute paths.
-        not_taken: what of the description it does not have.
-        made_meshes: triangles of those meshes that MuJoCo cannot read itself, by their names.
-        bodies, joints: how many there are.
-    """
-
-    spec: Any
-    not_taken: Sequence[NotTaken]
-    made_meshes: dict[str, Triangles]
-    bodies: int
-    joints: int
 
 
 def convert_sdf(file: Path, finder: Finder) -> Converted:

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
+from neuros.convert.converted import Converted
 from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.meshes import fill, needs_conversion, triangles_of
-from neuros.convert.report import NotTaken, Report
+from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of
+from neuros.convert.report import Report
 from neuros.errors import Problem
 
 _PASSED_OVER = {
@@ -31,15 +31,7 @@ _PASSED_OVER = {
 _KEPT_NAMES = {"fusestatic": "false", "discardvisual": "false"}
 
 
-@dataclass(frozen=True)
-class Described:
-    """A robot as an ``MjSpec``, and what its description says in vain."""
-
-    spec: Any
-    not_taken: tuple[NotTaken, ...]
-
-
-def read_urdf(file: Path, finder: Finder) -> Described:
+def read_urdf(file: Path, finder: Finder) -> Converted:
     """Read a URDF file.
 
     Raises:
@@ -58,13 +50,14 @@ def read_urdf(file: Path, finder: Finder) -> Described:
     converted = _resolve_meshes(tree, root, finder, report)
     report.raise_any()
     _keep_names(tree)
-    spec = _spec(tree, root, converted, report)
+    spec, made = _spec(tree, root, converted, report)
     for element in _all(root):
         if element.tag in _PASSED_OVER:
             report.note(element, _PASSED_OVER[element.tag])
         elif element.tag == "mimic" and element.parent is not None:
             _mimic(spec, element, report)
-    return Described(spec, tuple(report.not_taken()))
+    model = spec.copy().compile()
+    return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
 
 
 def _resolve_meshes(
@@ -118,7 +111,8 @@ def _keep_names(tree: ElementTree.ElementTree[Any]) -> None:
 
 def _spec(
     tree: ElementTree.ElementTree[Any], root: Element, converted: dict[str, Path], report: Report
-) -> Any:
+) -> tuple[Any, dict[str, Triangles]]:
+    made: dict[str, Triangles] = {}
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(tree.getroot(), "unicode"))
         for mesh in spec.meshes:
@@ -126,13 +120,14 @@ def _spec(
             if triangles is not None:
                 mesh.file = ""
                 fill(mesh, triangles)
+                made[mesh.name] = triangles
         spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         text = " ".join(str(error).removeprefix("Error: ").split())
         report.problem(root, f"MuJoCo cannot compile it: {text}")
         report.raise_any()
         raise
-    return spec
+    return spec, made
 
 
 def _mimic(spec: Any, mimic: Element, report: Report) -> None:

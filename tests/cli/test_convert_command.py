@@ -67,6 +67,24 @@ def test_a_mesh_that_mujoco_does_not_read_is_written_beside_the_file(robot, caps
     assert "1 mesh beside it" in capsys.readouterr().out
 
 
+def test_a_robot_in_urdf_is_converted_with_its_meshes(robot, capsys) -> None:
+    import trimesh
+
+    box = trimesh.creation.box(extents=(1, 1, 1))
+    (robot / "box.dae").write_bytes(box.export(file_type="dae"))
+    shapes = "".join(
+        f'<visual><geometry><mesh filename="package://robot/{name}"/></geometry></visual>'
+        for name in ("skin.obj", "box.dae")
+    )
+    moments = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    links = f'<link name="a"><inertial><mass value="1"/>{moments}</inertial>{shapes}</link>'
+    (robot / "arm.urdf").write_text(f'<robot name="arm">{links}<gazebo/></robot>', "utf-8")
+    assert main(["convert", "robot/arm.urdf"]) == 0
+    model = mujoco.MjModel.from_xml_path(str(robot / "arm.xml"))
+    assert (model.nbody, model.nmesh) == (2, 2)
+    assert "robot/arm.xml: bodies: 1, joints: 0, 1 mesh beside it" in capsys.readouterr().out
+
+
 def test_models_are_looked_up_in_folders_that_are_named(robot, tmp_path, capsys) -> None:
     (tmp_path / "far/away").mkdir(parents=True)
     file = tmp_path / "far/away/world.sdf"
