@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+from rosbags.rosbag2 import Reader
 
 from benchmarks import dora
 from benchmarks.launching import launch, project_of_plugins
@@ -29,7 +32,10 @@ def neuros(
     connection: dict[str, Any],
     options: Sequence[str] = (),
 ) -> dict[str, float]:
-    """From hook to hook, :data:`QUEUE_SIZE` packets in the mailbox."""
+    """From hook to hook, :data:`QUEUE_SIZE` packets in the mailbox.
+
+    Where the run is recorded, ``behind_s`` is how long after its last packet the bag was complete.
+    """
     port = {"name": "ball", "type": packet.type}
     sender = {"name": "flood", "container": "neuros_python", "plugin": "flood.py"}
     receiver = {"name": "count", "container": "neuros_python", "plugin": "count.py"}
@@ -49,7 +55,15 @@ def neuros(
     with project_of_plugins(project) as folder:
         launch(folder, folder / "run", backend, options=options)
         result = json.loads((folder / "run" / "count" / "result.json").read_text())
-    return _figures(packet, result)
+        bags = [*(folder / "run" / "bag").glob("*.mcap")]
+        behind = {"behind_s": max(map(_behind_s, bags))} if bags else {}
+    return {**_figures(packet, result), **behind}
+
+
+def _behind_s(bag: Path) -> float:
+    """Seconds from the last packet to the last time that the bag was written to."""
+    with Reader(bag.parent) as reader:
+        return bag.stat().st_mtime - reader.end_time / 1e9
 
 
 def bare(packet: Packet, seconds: float) -> dict[str, float]:

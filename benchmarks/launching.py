@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ def launch(
     *,
     settings: Mapping[str, Any] | None = None,
     options: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+    codes: Collection[int] = (0,),
     timeout_s: float = RUN_S,
 ) -> dict[str, Any]:
     """Run a project to its end; returns its ``run.json``.
@@ -43,24 +45,25 @@ def launch(
         run_folder: must not exist yet.
         settings: values for ``--set``.
         options: further ones of the command line.
+        environment: variables on top of those of this process.
+        codes: exit codes that are taken for success.
         timeout_s: how long it may take, from the command to its end.
 
     Raises:
-        RuntimeError: if it does not end with 0, with what it printed.
+        RuntimeError: if it ends with another exit code, with what it printed.
         subprocess.TimeoutExpired: if it takes longer; it is ended.
     """
     command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
     command += ["--backend", backend, "-o", str(run_folder), *options]
     for key, value in (settings or {}).items():
         command += ["--set", f"{key}={value}"]
-    environment = {**os.environ, "NEUROS_GUI": "0"}
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=environment,
+        env={**os.environ, "NEUROS_GUI": "0", **(environment or {})},
     )
     try:
         output, _ = process.communicate(timeout=timeout_s)
@@ -68,7 +71,7 @@ def launch(
         if process.poll() is None:
             process.terminate()  # it ends its nodes
             process.wait()
-    if process.returncode:
+    if process.returncode not in codes:
         raise RuntimeError(f"{' '.join(command)}: exit code {process.returncode}\n{output}")
     result: dict[str, Any] = json.loads((run_folder / "run.json").read_text())
     return result

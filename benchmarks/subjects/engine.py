@@ -16,8 +16,12 @@ from benchmarks.launching import PLUGINS, launch, project_of_plugins
 from benchmarks.measure import Case, Figure, Group, Subject
 from neuros.core.engine import Engine
 from neuros.core.hook import Hook
+from neuros.core.journal import JournalledEngine
 from neuros.hooks import hook_specs_of, neuros_function
 from neuros.project.model import Connection, Node, Port
+
+RELAY = "engine alone, packet and acknowledgement"
+JOURNALLED = f"{RELAY}, with the journal of recorded runs"
 
 
 def subject(is_quick: bool) -> Subject:
@@ -25,7 +29,8 @@ def subject(is_quick: bool) -> Subject:
     count = 20_000 if is_quick else 100_000
     candidates = {
         "engine alone, loop-back": functools.partial(loop_back_us, count),
-        "engine alone, packet and acknowledgement": functools.partial(relay_us, count),
+        RELAY: functools.partial(relay_us, count),
+        JOURNALLED: functools.partial(relay_us, count, JournalledEngine),
         "in process": functools.partial(real_run_us, "in-process", count),
         "process": functools.partial(real_run_us, "process", count),
     }
@@ -34,6 +39,7 @@ def subject(is_quick: bool) -> Subject:
             f"execution of a hook, {name}",
             "us",
             Figure(name),
+            *((Figure(RELAY), "without journal") if name == JOURNALLED else ()),
             # The free-running hook as users have it; the engine alone is the profile of it.
             bound="hook" if name == "process" else None,
         )
@@ -73,7 +79,7 @@ def loop_back_us(count: int) -> float:
     return (time.perf_counter_ns() - start_ns) / count / 1e3
 
 
-def relay_us(count: int) -> float:
+def relay_us(count: int, kind: type[Engine] = Engine) -> float:
     """The same for a hook that sends on what arrives, losslessly: two events per execution."""
 
     def relay(node: Any, packet: Any) -> Any:
@@ -81,7 +87,9 @@ def relay_us(count: int) -> float:
 
     arriving = Connection("before", "out", "node", "in_", 0)
     leaving = Connection("node", "out", "after", "in_", 0)
-    engine = _engine([arriving, leaving], neuros_function("in_", "out")(relay), Surroundings())
+    engine = _engine(
+        [arriving, leaving], neuros_function("in_", "out")(relay), Surroundings(), kind
+    )
     engine.on_registered(leaving)
     engine.start()
     start_ns = time.perf_counter_ns()
@@ -105,7 +113,10 @@ def real_run_us(backend: str, count: int) -> float:
 
 
 def _engine(
-    connections: Sequence[Connection], hook: Callable[..., Any], surroundings: Surroundings
+    connections: Sequence[Connection],
+    hook: Callable[..., Any],
+    surroundings: Surroundings,
+    kind: type[Engine] = Engine,
 ) -> Engine:
     port = "std_msgs/msg/String"
     node = Node(
@@ -116,4 +127,4 @@ def _engine(
         outputs=tuple(Port("out", port) for c in connections if c.source_node == "node"),
     )
     specs = hook_specs_of({hook.__name__: hook})
-    return Engine(node, connections, specs, surroundings, time.monotonic_ns)
+    return kind(node, connections, specs, surroundings, time.monotonic_ns, None)

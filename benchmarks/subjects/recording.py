@@ -8,16 +8,18 @@ import time
 from pathlib import Path
 
 from benchmarks import flooding
+from benchmarks.in_turn import speed_with
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
-from benchmarks.subjects.whiskeye import RATE, orchestrated
+from benchmarks.subjects.whiskeye import WHISKEYE
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.spool import SpoolWriter
 from neuros.ports import Way
 
 RECORD = ("-r",)
-SIMULATED_S = 20.0
+SIMULATED_S = 40.0
+SLICE_S = 0.5  # the recorder writes what was kept 0.1 s before
 PROJECTS = {"hybrid": "project", "strict": "strict"}
 IMU_BYTES, IMAGE_BYTES = 360, 921_600
 
@@ -27,29 +29,35 @@ def subject(is_quick: bool) -> Subject:
     share = 0.1 if is_quick else 1.0
     return Subject(
         "recording: what it costs a run, and what the recorder keeps up with",
-        (*(_whiskeye(name, share) for name in PROJECTS), _recorder(share), *_floods(is_quick)),
+        (_whiskeye(0.4 if is_quick else 1.0), _recorder(share), *_floods(is_quick)),
     )
 
 
-def _whiskeye(name: str, share: float) -> Group:
-    simulated_s = share * SIMULATED_S
+def _whiskeye(share: float) -> Group:
+    """Within a run, recorded and not in turn: two runs of one program differ by far more."""
     candidates: dict[str, Measurement] = {}
     cases = []
-    for backend, label in (("process", "process"), ("in-process", "in process")):
-        plain, recorded = f"{name}, {label}", f"{name}, {label}, recorded"
-        run = functools.partial(orchestrated, PROJECTS[name], backend, simulated_s)
-        candidates |= {plain: run, recorded: functools.partial(run, options=RECORD)}
-        cases.append(
-            Case(
-                f"whiskeye {recorded}, real-time factor",
-                "",
-                Figure(recorded, RATE),
-                Figure(plain, RATE),
-                plain,
-                f"recorded-{name}" if backend == "process" else None,
+    for name, project in PROJECTS.items():
+        for backend, label in (("process", "process"), ("in-process", "in process")):
+            recorded_run = f"{name}, {label}"
+            candidates[recorded_run] = functools.partial(
+                speed_with,
+                "recording",
+                WHISKEYE / f"{project}.json",
+                backend,
+                SLICE_S,
+                {"nodes.robot.environment.DURATION": share * SIMULATED_S},
+                RECORD,
             )
-        )
-    return Group(candidates, tuple(cases), MINIMUM_PAIRS)
+            cases.append(
+                Case(
+                    f"whiskeye {recorded_run}, recorded: share of the speed without",
+                    "",
+                    Figure(recorded_run, "speed"),
+                    bound=f"recorded-{name}" if backend == "process" else None,
+                )
+            )
+    return Group(candidates, tuple(cases))
 
 
 def _recorder(share: float) -> Group:
@@ -68,25 +76,29 @@ def _recorder(share: float) -> Group:
 
 def _floods(is_quick: bool) -> tuple[Group, ...]:
     """As many packets as a connection carries, recorded and not."""
-    return tuple(_flood(packet, 0.3 if is_quick else 2.0) for packet in (IMU_PACKET, LARGE))
+    seconds = 0.3 if is_quick else 2.0
+    return (
+        _flood(IMU_PACKET, "process", seconds),
+        _flood(IMU_PACKET, "in-process", seconds, "recorder-live"),
+        _flood(LARGE, "process", seconds),
+    )
 
 
-def _flood(packet: Packet, seconds: float) -> Group:
-    run = functools.partial(flooding.neuros, packet, "process", seconds, {"discard_limit": 0})
+def _flood(packet: Packet, backend: str, seconds: float, bound: str | None = None) -> Group:
+    run = functools.partial(flooding.neuros, packet, backend, seconds, {"discard_limit": 0})
     is_image = packet is LARGE
     figure, unit = ("volume", "MB/s") if is_image else ("rate", "1/s")
-    case = Case(
-        f"throughput, {packet.name}, process, discard limit 0, recorded",
-        unit,
-        Figure("recorded", figure),
-        Figure("not recorded", figure),
-        "not recorded",
+    name = f"throughput, {packet.name}, {backend.replace('-', ' ')}, discard limit 0, recorded"
+    reference = (None, "") if bound else (Figure("not recorded", figure), "not recorded")
+    cases = (
+        Case(name, unit, Figure("recorded", figure), *reference, bound),
+        Case(f"{name}: bag complete after the last packet", "s", Figure("recorded", "behind_s")),
     )
     candidates: dict[str, Measurement] = {
         "not recorded": run,
         "recorded": functools.partial(run, options=RECORD),
     }
-    return Group(candidates, (case,), rounds=6)
+    return Group(candidates, cases, MINIMUM_PAIRS if bound else 6)
 
 
 def recorded(size: int, count: int) -> dict[str, float]:

@@ -13,7 +13,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +131,7 @@ def floor(simulated_s: float) -> dict[str, float]:
     return {name: figures[name] for name in (RATE, "overlap_bound", "overlapped")}
 
 
-def orchestrated(
-    name: str, backend: str, simulated_s: float, options: Sequence[str] = ()
-) -> dict[str, float]:
+def orchestrated(name: str, backend: str, simulated_s: float) -> dict[str, float]:
     """A project file of the example, without initialisation and ending."""
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = launch(
@@ -142,7 +139,6 @@ def orchestrated(
             Path(folder) / "run",
             backend,
             settings={"nodes.robot.environment.DURATION": simulated_s},
-            options=options,
         )
     return {
         RATE: float(run[RATE]),

@@ -11,7 +11,6 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
 LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
@@ -84,12 +83,7 @@ class LogTail:
     def __enter__(self) -> LogTail:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _show(self, found: list[tuple[_GrowingFile, list[bytes]]]) -> None:

@@ -14,7 +14,6 @@ import os
 import tempfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import TracebackType
 
 from neuros.errors import EnvironmentFault, UsageError
 
@@ -54,12 +53,7 @@ class DomainLock:
     def __enter__(self) -> DomainLock:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.release()
 
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 from neuros.core.engine import Engine
@@ -116,12 +115,7 @@ class NodeBench:
     def __enter__(self: _Bench) -> _Bench:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, *__: object) -> None:
         with contextlib.suppress(*([NeurosError] if error else [])):
             self.finalise()
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from observe.recordings import NUMBER, answer, number, plan, record, spool
+from observe.recordings import ANSWER, NUMBER, answer, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -147,6 +147,21 @@ def test_without_pandas_a_frame_says_what_to_do(
         pytest.raises(EnvironmentFault, match="pip install pandas"),
     ):
         bag["/answer"].frame()
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_topics_are_the_same_whichever_is_asked_for_first(tmp_path: Path, storage: str) -> None:
+    spool(tmp_path, "a", [(wall, None, number(wall)) for wall in range(1, 40_001)])
+    spool(tmp_path, "b", [(wall, None, answer(wall)) for wall in range(1, 9)])
+    record(tmp_path, plan(storage))
+    names = [NUMBER.name, ANSWER.name]
+    found = []
+    for order in (names, names[::-1]):
+        with neuros.bag.open(tmp_path) as bag:
+            found.append({name: bag[name].raw() for name in order})
+    assert found[0] == found[1]
+    assert [packet.data for packet in found[0][NUMBER.name]] == list(map(number, range(1, 40_001)))
+    assert [packet.data for packet in found[0][ANSWER.name]] == list(map(answer, range(1, 9)))
 
 
 def test_a_topic_without_packets_is_an_empty_array(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from neuros.errors import EnvironmentFault
 from neuros.observe.bag.columns import Column, columns_of
 from neuros.observe.recording.plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.observe.recording.repair import needs_repair, repair
-from neuros.observe.recording.stored import stored_messages
+from neuros.observe.recording.stored import StoredTopics
 
 LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 _MOST_COLUMNS = 100
@@ -158,6 +158,7 @@ class Bag:
             for name, count in (recorded or {}).items()
             if (lost := count - (self.topics[name].count if name in self.topics else 0)) > 0
         }
+        self._stored = StoredTopics(folder)
         self._packets: dict[str, list[RawPacket]] = {}
 
     @property
@@ -193,7 +194,7 @@ class Bag:
         if name not in self._packets:
             packets = [
                 RawPacket(log_ns, publish_ns, data)
-                for _, log_ns, publish_ns, data in stored_messages(self.folder, name)
+                for _, log_ns, publish_ns, data in self._stored.messages(name)
             ]
             packets.sort(key=itemgetter(0))
             self._packets[name] = packets

@@ -6,9 +6,12 @@ as it goes (https://mcap.dev/spec). Libraries begin at its end, where the index 
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -30,17 +33,43 @@ class Stored(NamedTuple):
     data: bytes
 
 
-def stored_messages(folder: Path, only: str | None = None) -> Iterator[Stored]:
-    """All messages in the files of a bag's folder, or those of one topic, as far as they go.
+def stored_messages(folder: Path) -> Iterator[Stored]:
+    """All messages in the files of a bag's folder, as far as they go.
 
     Raises:
         EnvironmentFault: if they are compressed, which is not how NeuROS records.
     """
     for path in sorted(folder.glob("*.mcap")):
         with open(path, "rb") as file:
-            yield from _of_mcap(file, only)
+            for topic, log_ns, publish_ns, content, start, end, _ in _of_mcap(file):
+                yield Stored(topic, log_ns, publish_ns, content[start:end])
     for path in sorted(folder.glob("*.db3")):
-        yield from (each for each in _of_sqlite(path) if only in (None, each.topic))
+        yield from _of_sqlite(path)
+
+
+class StoredTopics:
+    """The messages of a bag's folder, topic by topic.
+
+    With the first topic an MCAP file is gone through once, and it is noted where each message is:
+    32 bytes for one.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._places: dict[Path, dict[str, array[int]]] = {}
+
+    def messages(self, topic: str) -> list[Stored]:
+        """Those of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
+        found: list[Stored] = []
+        for path in sorted(self._folder.glob("*.mcap")):
+            with open(path, "rb") as file:
+                if path in self._places:
+                    found += _at(file, topic, self._places[path].get(topic, ()))
+                else:
+                    self._places[path] = _note_places(file, topic, found)
+        for path in sorted(self._folder.glob("*.db3")):
+            found += _of_sqlite(path, topic)
+        return found
 
 
 def is_whole(folder: Path) -> bool:
@@ -58,7 +87,32 @@ def _has_end(path: Path) -> bool:
         return size > 2 * len(_MAGIC) and file.read() == _MAGIC
 
 
-def _of_mcap(file: BinaryIO, only: str | None) -> Iterator[Stored]:
+_Found = tuple[str, int, int, bytes, int, int, int]
+"""Topic, both times, the chunk, where in it a message begins and ends, where the chunk begins."""
+
+
+def _note_places(file: BinaryIO, wanted: str, messages: list[Stored]) -> dict[str, array[int]]:
+    """By topic, four numbers for each message: both times, offset in the file, and length.
+
+    Those of the topic that is wanted go to ``messages`` at once.
+    """
+    places: dict[str, array[int]] = {}
+    for topic, log_ns, publish_ns, content, start, end, offset in _of_mcap(file):
+        if topic == wanted:
+            messages.append(Stored(topic, log_ns, publish_ns, content[start:end]))
+        if topic not in places:
+            places[topic] = array("q")
+        places[topic].extend((log_ns, publish_ns, offset + start, end - start))
+    return places
+
+
+def _at(file: BinaryIO, topic: str, places: Iterable[int]) -> Iterator[Stored]:
+    rows = iter(places)
+    for log_ns, publish_ns, start, size in zip(rows, rows, rows, rows, strict=True):
+        yield Stored(topic, log_ns, publish_ns, os.pread(file.fileno(), size, start))
+
+
+def _of_mcap(file: BinaryIO) -> Iterator[_Found]:
     if file.read(len(_MAGIC)) != _MAGIC:
         return
     topics: dict[int, str] = {}
@@ -67,16 +121,17 @@ def _of_mcap(file: BinaryIO, only: str | None) -> Iterator[Stored]:
         if len(head) < _HEAD.size:
             return
         kind, size = _HEAD.unpack(head)
+        offset = file.tell()
         content = file.read(size)
         if kind == _DATA_END:
             return
         if kind == _CHUNK_OP:
-            yield from _of_chunk(content, topics, only)
+            yield from _of_chunk(content, offset, topics)
         if len(content) < size:
             return
 
 
-def _of_chunk(content: bytes, topics: dict[int, str], only: str | None) -> Iterator[Stored]:
+def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_Found]:
     """The messages of a chunk without compression; ``topics`` grows by its channels."""
     at = _CHUNK.size
     if len(content) < at + 4:
@@ -93,27 +148,24 @@ def _of_chunk(content: bytes, topics: dict[int, str], only: str | None) -> Itera
         if kind == _CHANNEL:
             length = int.from_bytes(content[at + 4 : at + 8], "little")
             number = int.from_bytes(content[at : at + 2], "little")
-            name = content[at + 8 : at + 8 + length].decode()
-            if only in (None, name):
-                topics[number] = name
+            topics[number] = content[at + 8 : at + 8 + length].decode()
         elif kind == _MESSAGE_OP:
             number, _, log_ns, publish_ns = _MESSAGE.unpack_from(content, at)
+            start, end = at + _MESSAGE.size, at + size
             if number in topics:
-                data = content[at + _MESSAGE.size : at + size]
-                yield Stored(topics[number], log_ns, publish_ns, data)
+                yield topics[number], log_ns, publish_ns, content, start, end, offset
         at += size
 
 
-def _of_sqlite(path: Path) -> Iterator[Stored]:
-    connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+def _of_sqlite(path: Path, only: str | None = None) -> Iterator[Stored]:
     query = (
         "SELECT topics.name, timestamp, data FROM messages"
-        " JOIN topics ON topics.id = topic_id ORDER BY messages.id"
+        " JOIN topics ON topics.id = topic_id WHERE ?1 IS NULL OR topics.name = ?1"
+        " ORDER BY messages.id"
     )
-    try:
-        for topic, log_ns, data in connection.execute(query):
-            yield Stored(topic, log_ns, log_ns, data)
-    except sqlite3.DatabaseError:
-        return
-    finally:
-        connection.close()
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
+        try:
+            for topic, log_ns, data in connection.execute(query, (only,)):
+                yield Stored(topic, log_ns, log_ns, data)
+        except sqlite3.DatabaseError:
+            return

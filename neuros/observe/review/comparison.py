@@ -152,6 +152,8 @@ def comparison_figure(runs: Sequence[Run]) -> Any | None:
                 text = " ?" if value is None else f" {value:.3g}"
                 axes.text(value or 0.0, y, text, va="center", fontsize=7)
         plain(axes).set_yticks(places, [name for name, _ in cells], fontsize=8)
+        if not any(name for name, _ in cells):
+            axes.tick_params(axis="y", length=0)
         axes.set_title(title, fontsize=10, loc="left")
         axes.margins(x=0.1)
         axes.grid(visible=False, axis="y")

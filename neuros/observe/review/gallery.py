@@ -57,7 +57,7 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[Run], Any]], ...] = (
     (
         "system_load",
         "Processor and memory",
-        "Of each node's processes, once per second; 100 % is one core.",
+        "Of each node's processes, once per second from the command on; 100 % is one core.",
         series.load_figure,
     ),
 )

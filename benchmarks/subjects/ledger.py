@@ -1,0 +1,48 @@
+"""What the books of a run cost it: times and digests of packets, accounts, the timeline.
+
+Each run is measured with them and without in turn (:mod:`benchmarks.in_turn`). WhiskEye, strict; in
+process one thread does all, so its processor time tells more than the wall clock of a busy machine.
+"""
+
+from __future__ import annotations
+
+import functools
+
+from benchmarks.in_turn import speed_with
+from benchmarks.measure import Case, Figure, Group, Measurement, Subject
+from benchmarks.subjects.whiskeye import WHISKEYE
+
+SIMULATED_S = 20.0
+SLICE_S = 0.2
+RUNS = {
+    "in process": ("in-process", (), "work", "ledger"),
+    "in process, with --digests": ("in-process", ("--digests",), "work", None),
+    "process": ("process", (), "speed", None),
+}
+
+
+def subject(is_quick: bool) -> Subject:
+    """Simulated seconds per run."""
+    simulated_s = 0.3 * SIMULATED_S if is_quick else SIMULATED_S
+    candidates: dict[str, Measurement] = {
+        name: functools.partial(
+            speed_with,
+            "ledger",
+            WHISKEYE / "strict.json",
+            backend,
+            SLICE_S,
+            {"nodes.robot.environment.DURATION": simulated_s},
+            options,
+        )
+        for name, (backend, options, _, _) in RUNS.items()
+    }
+    cases = tuple(
+        Case(
+            f"whiskeye strict, {name}, with its books: share of the speed without",
+            "",
+            Figure(name, figure),
+            bound=bound,
+        )
+        for name, (_, _, figure, bound) in RUNS.items()
+    )
+    return Subject("what the books of a run cost it", (Group(candidates, cases),))
