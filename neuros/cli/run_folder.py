@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from datetime import datetime, timezone
@@ -88,8 +89,15 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
 
 
 def write_record(record: Mapping[str, Any], run_folder: Path) -> None:
-    """Write ``run.json``. Raises ``OSError``."""
-    (run_folder / "run.json").write_text(_text(record), "utf-8")
+    """Write ``run.json``, the whole of it or nothing. Raises ``OSError``."""
+    part = run_folder / ".run.json"
+    try:
+        part.write_text(_text(record), "utf-8")
+        part.replace(run_folder / "run.json")
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise
 
 
 def _text(content: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from ros_program import RosProgram
 from rosbags.rosbag2 import Reader
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, String
 from test_back_ends import talk_to_the_gate
 
@@ -132,7 +134,7 @@ def test_publish_time_is_simulated_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("back_end", BACKENDS)
-def test_external_topics_and_topics_of_nobody_in_the_project(
+def test_external_topics_topics_of_nobody_in_the_project_and_the_clock_of_somebody_else(
     back_end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -143,8 +145,11 @@ def test_external_topics_and_topics_of_nobody_in_the_project(
             start(PROJECTS / "outside", *options, cwd=tmp_path) as running,
         ):
             news = program.node.create_publisher(String, "/news", 10)
-            program.spin_until(lambda: news.get_subscription_count() > 0)
+            clock = program.node.create_publisher(Clock, "/clock", 10)
+            for publisher in (news, clock):
+                program.spin_until(lambda each=publisher: each.get_subscription_count() > 0)
             news.publish(String(data="rain"))
+            clock.publish(Clock())
             talk_to_the_gate(program)
             finished = running.finish(TIMEOUT_S)
     assert finished.exit_code == 0, finished.output
@@ -155,25 +160,7 @@ def test_external_topics_and_topics_of_nobody_in_the_project(
         assert set(asked) == {21}
         assert set(answered) == {42}
         assert bag["/news"].type == "std_msgs/msg/String"
-
-
-def test_clock_of_somebody_else_is_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from rosgraph_msgs.msg import Clock
-
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    with (
-        choose_domain(None, {}, False) as domain,
-        RosProgram(domain_id=domain.id) as program,
-        start(PROJECTS / "outside", "-r", "-d", str(domain.id), cwd=tmp_path) as running,
-    ):
-        clock = program.node.create_publisher(Clock, "/clock", 10)
-        program.spin_until(lambda: clock.get_subscription_count() > 0)
-        clock.publish(Clock())
-        talk_to_the_gate(program)
-        finished = running.finish(TIMEOUT_S)
-    assert recorded(finished)["/clock"]["recorded"] == 1
+        assert bag["/clock"].count == 1
 
 
 def test_replay_publishes_what_was_recorded(
@@ -240,33 +227,30 @@ def test_what_cannot_be_recorded_is_said_before_the_start(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_topic_that_nobody_publishes_is_said_and_the_run_goes_on(tmp_path: Path) -> None:
-    finished = launch(
-        PROJECTS / "pipeline", "-r", "-t", "/nobody", cwd=tmp_path, timeout_s=TIMEOUT_S
-    )
-    assert finished.exit_code == 4
-    assert "/nobody is not recorded: nobody published it" in finished.output
-    assert recorded(finished)[NUMBER]["recorded"] == 200
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A plugin puts a file where the spool of its node would go, and a topic has no publisher."""
+    folder = tmp_path_factory.mktemp("troubled")
+    project = folder / "project"
+    shutil.copytree(PROJECTS / "pipeline", project)
+    with (project / "relay.py").open("a") as relay:
+        relay.write("import os, pathlib\n")
+        relay.write("pathlib.Path(os.environ['NEUROS_RUN_DIR'], 'spool').touch()\n")
+    return launch(project, "-r", "-t", "/nobody", cwd=folder, timeout_s=TIMEOUT_S)
 
 
-def test_a_spool_that_cannot_be_written_ends_no_experiment(tmp_path: Path) -> None:
-    """A plugin puts a file where the spool of its node would go."""
-    project = tmp_path / "project"
-    project.mkdir()
-    for file in (PROJECTS / "pipeline").iterdir():
-        if file.is_file():
-            (project / file.name).write_text(file.read_text())
-    relay = project / "relay.py"
-    relay.write_text(
-        relay.read_text()
-        + "\nimport os, pathlib\npathlib.Path(os.environ['NEUROS_RUN_DIR'], 'spool').touch()\n"
-    )
-    finished = launch(project, "-r", cwd=tmp_path, timeout_s=TIMEOUT_S)
-    assert finished.exit_code == 4
-    assert "its packets are not recorded from now on" in finished.output
-    assert "200 of 200 packets of /neuros/relay/total/sink/total/data are not" in finished.output
-    assert recorded(finished)[NUMBER]["recorded"] == 200
-    assert finished.connection("relay.total -> sink.total")["consumed"] == 200
+def test_a_topic_that_nobody_publishes_is_said_and_the_run_goes_on(troubled: Finished) -> None:
+    assert troubled.exit_code == 4
+    assert "/nobody is not recorded: nobody published it" in troubled.output
+    assert recorded(troubled)[NUMBER]["recorded"] == 200
+
+
+def test_a_spool_that_cannot_be_written_ends_no_experiment(troubled: Finished) -> None:
+    assert troubled.exit_code == 4
+    assert "its packets are not recorded from now on" in troubled.output
+    assert "200 of 200 packets of /neuros/relay/total/sink/total/data are not" in troubled.output
+    assert recorded(troubled)[NUMBER]["recorded"] == 200
+    assert troubled.connection("relay.total -> sink.total")["consumed"] == 200
 
 
 # ------------------------------------------------------------------ SIGKILL

@@ -11,6 +11,7 @@ from launching import Finished, launch
 
 import neuros.bag
 from containers import nothing_left, require_containers
+from neuros.cli.main import main
 
 PROJECT = Path(__file__).parents[1] / "back_ends/time"
 
@@ -60,3 +61,18 @@ def test_its_record_names_engine_images_and_what_is_in_them(run: Finished) -> No
         assert inside["packages"] != run.record["versions"]["packages"]
         assert inside["python"].startswith("3.")
         assert inside["executable"] == "/opt/neuros/bin/python"
+
+
+def test_it_becomes_a_page_with_every_figure(run: Finished) -> None:
+    assert main(["report", str(run.run_folder)]) == 0
+    assert run.run_folder is not None
+    folder = run.run_folder / "report"
+    names = {path.stem for path in folder.glob("*.png")}
+    assert {"graph", "time_shares", "swim_lanes", "packets", "latency", "system_load"} <= names
+    assert (folder / "report.html").read_text("utf-8").count("data:image/png;base64,") == len(names)
+
+
+def test_its_packets_can_be_verified(run: Finished, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", str(run.run_folder), str(run.run_folder)]) == 0
+    sent = sum(each["sent"] for each in run.record["connections"])
+    assert capsys.readouterr().out.startswith(f"identical: {sent} packets")
