@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.launching import launch
 
 SWITCH = Path(__file__).resolve().parent / "switch"
-_SETTLING_PAIRS = 2
+_SETTLING_PAIRS = 1
 _INCOMPLETE_BAG = 4
 
 

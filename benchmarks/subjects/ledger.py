@@ -12,7 +12,7 @@ from benchmarks.in_turn import speed_with
 from benchmarks.measure import Case, Figure, Group, Measurement, Subject
 from benchmarks.subjects.whiskeye import WHISKEYE
 
-SIMULATED_S = 20.0
+SIMULATED_S = 60.0
 SLICE_S = 0.2
 RUNS = {
     "in process": ("in-process", (), "work", "ledger"),
@@ -23,7 +23,7 @@ RUNS = {
 
 def subject(is_quick: bool) -> Subject:
     """Simulated seconds per run."""
-    simulated_s = 0.3 * SIMULATED_S if is_quick else SIMULATED_S
+    simulated_s = 0.2 * SIMULATED_S if is_quick else SIMULATED_S
     candidates: dict[str, Measurement] = {
         name: functools.partial(
             speed_with,

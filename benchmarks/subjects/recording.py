@@ -18,7 +18,7 @@ from neuros.observe.recording.spool import SpoolWriter
 from neuros.ports import Way
 
 RECORD = ("-r",)
-SIMULATED_S = 40.0
+SIMULATED_S = 100.0
 SLICE_S = 0.5  # the recorder writes what was kept 0.1 s before
 PROJECTS = {"hybrid": "project", "strict": "strict"}
 IMU_BYTES, IMAGE_BYTES = 360, 921_600
@@ -29,7 +29,7 @@ def subject(is_quick: bool) -> Subject:
     share = 0.1 if is_quick else 1.0
     return Subject(
         "recording: what it costs a run, and what the recorder keeps up with",
-        (_whiskeye(0.4 if is_quick else 1.0), _recorder(share), *_floods(is_quick)),
+        (_whiskeye(0.2 if is_quick else 1.0), _recorder(share), *_floods(is_quick)),
     )
 
 
