@@ -91,7 +91,11 @@ def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> Ba
                 raise
             return BackEnd("process", (_why_not(fault), *_ignored(nodes)))
         notices = [("WARN", each.notice) for each in containers.images.values() if each.notice]
-        return BackEnd("docker", (*notices, *_without_display(nodes, os.environ)), containers)
+        notices += [
+            *_without_limits(nodes, containers.abilities.unkept),
+            *_without_display(nodes, os.environ),
+        ]
+        return BackEnd("docker", tuple(notices), containers)
     return BackEnd(wanted, tuple(_ignored(nodes)))
 
 
@@ -101,6 +105,24 @@ def _containers(project: Project, nodes: Sequence[Node]) -> Containers:
     from neuros.launch.docker.launcher import find_containers
 
     return find_containers(dict.fromkeys(node.container for node in nodes), project.folder)
+
+
+def _without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[tuple[str, str]]:
+    """One line on limits that the engine does not keep."""
+    asking = [
+        node.name
+        for node in nodes
+        if any(getattr(node.resources, limit) is not None for limit in unkept)
+    ]
+    if not asking:
+        return ()
+    return [
+        (
+            "WARN",
+            f"resources of {', '.join(asking)}: this Docker engine has no control groups for them"
+            " (docker info), so they do not hold",
+        )
+    ]
 
 
 def _without_display(

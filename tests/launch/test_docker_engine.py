@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -20,9 +20,12 @@ from docker.context import ContextAPI
 from docker.errors import APIError
 from urllib3.exceptions import ProtocolError
 
+from neuros.cli.back_end import _without_limits
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker import engine as engine_module
-from neuros.launch.docker.engine import connect, engine_faults
+from neuros.launch.docker.engine import Abilities, connect, engine_faults
+from neuros.project.model import Node
+from neuros.project.resources import Resources
 
 
 def fault_of(environ: dict[str, str]) -> str:
@@ -150,3 +153,34 @@ class TestFaultsWhileWorking:
     def test_mistakes_of_our_own_are_not_hidden(self) -> None:
         with pytest.raises(KeyError), engine_faults("node 'a'"):
             raise KeyError("x")
+
+
+class TestAbilities:
+    FACTS: Mapping[str, Any] = {
+        "SecurityOptions": ["name=seccomp,profile=default"],
+        "MemoryLimit": True,
+        "CpuCfsQuota": True,
+        "PidsLimit": True,
+    }
+
+    def test_an_engine_of_roots_keeps_to_all_limits(self) -> None:
+        assert Abilities.of(self.FACTS) == Abilities()
+
+    def test_a_rootless_one_may_have_no_control_groups(self) -> None:
+        facts = {
+            **self.FACTS,
+            "SecurityOptions": ["name=seccomp,profile=default", "name=rootless"],
+            "MemoryLimit": False,
+            "CpuCfsQuota": False,
+        }
+        assert Abilities.of(facts) == Abilities(True, frozenset({"mem_bytes", "cpus"}))
+
+    def test_limits_that_do_not_hold_are_said(self) -> None:
+        def node(name: str, **limits: float) -> Node:
+            return Node(name, "c", Path("/p.py"), resources=Resources(**limits))
+
+        nodes = [node("a", mem_bytes=1 << 30), node("b", pids=9), node("c")]
+        ((severity, text),) = _without_limits(nodes, {"mem_bytes", "cpus"})
+        assert severity == "WARN"
+        assert text.startswith("resources of a: this Docker engine has no control groups")
+        assert _without_limits(nodes, ()) == ()

@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ OLDEST_API, OLDEST_ENGINE = (1, 41), "20.10"
 _USUAL_SOCKET = Path("/var/run/docker.sock")
 _USUAL_ADDRESS = f"unix://{_USUAL_SOCKET}"
 _TIMEOUT_S = 60.0
+# Attributes of a node's resources, and how `docker info` calls the ability to keep to them.
+_LIMITS = {"mem_bytes": "MemoryLimit", "cpus": "CpuCfsQuota", "pids": "PidsLimit"}
 _WITHOUT = "or run without containers: --backend process"
 
 
@@ -57,9 +60,26 @@ def connect(
     return engine
 
 
-def is_rootless(engine: DockerClient) -> bool:
-    """Whether the engine runs as an ordinary user, who is root in its containers."""
-    return "name=rootless" in (engine.info().get("SecurityOptions") or ())
+@dataclass(frozen=True)
+class Abilities:
+    """What an engine can do, and whose it is.
+
+    Attributes:
+        is_rootless: whether it runs as an ordinary user, who is root in its containers.
+        unkept: what of :class:`neuros.project.resources.Resources` it accepts and does not keep
+            to, since there are no control groups for it.
+    """
+
+    is_rootless: bool = False
+    unkept: frozenset[str] = frozenset()
+
+    @staticmethod
+    def of(facts: Mapping[str, Any]) -> Abilities:
+        """Those in the answer of ``docker info``."""
+        return Abilities(
+            "name=rootless" in (facts.get("SecurityOptions") or ()),
+            frozenset(key for key, fact in _LIMITS.items() if facts.get(fact) is False),
+        )
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from docker import DockerClient
 from neuros.errors import EnvironmentFault
 from neuros.launch.dead_runs import hold
 from neuros.launch.docker.container import RunningContainer
-from neuros.launch.docker.engine import connect, engine_faults, is_rootless
+from neuros.launch.docker.engine import Abilities, connect, engine_faults
 from neuros.launch.docker.images import Image, images_for
 from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
@@ -31,10 +31,11 @@ _MOST_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Containers:
-    """The engine, and the image of every container that nodes name."""
+    """The engine, what it can do, and the image of every container that nodes name."""
 
     engine: DockerClient
     images: Mapping[str, Image]
+    abilities: Abilities
 
     def record(self) -> dict[str, Any]:
         """What there is to know of them later, ready for JSON. Raises ``EnvironmentFault``."""
@@ -55,7 +56,9 @@ def find_containers(names: Iterable[str], project_folder: Path | None) -> Contai
     """
     engine = connect()
     try:
-        return Containers(engine, images_for(names, project_folder, engine))
+        with engine_faults("Docker"):
+            abilities = Abilities.of(engine.info())
+        return Containers(engine, images_for(names, project_folder, engine), abilities)
     except BaseException:
         engine.close()
         raise
@@ -85,7 +88,7 @@ class DockerLauncher:
         self._on_started = on_started
         self._placement = placement
         self._environ = environ
-        self._is_rootless = False
+        self._is_rootless = containers.abilities.is_rootless
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
@@ -100,7 +103,6 @@ class DockerLauncher:
         except OSError as error:
             raise EnvironmentFault(f"no shared memory for containers: {error}") from error
         with engine_faults("the engine's events cannot be listened to"):
-            self._is_rootless = is_rootless(self._engine)
             watch = ContainerWatch(self._engine, environment.get(RUN_ID, ""))
         watch.start()
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
