@@ -341,7 +341,7 @@ class TestRegistries:
         ids = []
         for version in ("first", "second"):
             archive = context_of(None, f"FROM scratch\nCOPY Dockerfile /{version}\n")
-            image, _ = engine.images.build(fileobj=archive, custom_context=True, tag=name)
+            image, _ = engine.images.build(fileobj=archive, custom_context=True, rm=True, tag=name)
             ids.append(image.id)
             assert "error" not in engine.images.push(name)
         engine.images.get(ids[0]).tag(name)
