@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
-from neuros.project.model import Connection, NodeFile, Port
+from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.testing.step_loop import StepLoop
 from neuros.transport.copying import copy_packet
 from neuros.transport.making import make_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException
 
 _LEVELS = {
     "DEBUG": logging.DEBUG,
@@ -69,11 +71,18 @@ class RecordingLogger:
         return True
 
 
-class RosNodeStandIn:
-    """What ``node.get_ros_node()`` gives in a test: a name and a logger, and no ROS."""
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
-    def __init__(self, name: str, records: list[Record]) -> None:
+
+class RosNodeStandIn:
+    """What ``node.get_ros_node()`` gives in a test: name, logger and parameters, and no ROS."""
+
+    def __init__(
+        self, name: str, records: list[Record], parameters: Mapping[str, Value] = _NOTHING
+    ) -> None:
         self._name = name
+        self._parameters: dict[str, Any] = dict(parameters)
+        self._given = {*parameters}
         self._logger = RecordingLogger(name, records)
 
     def get_name(self) -> str:
@@ -84,12 +93,28 @@ class RosNodeStandIn:
         """The logger whose records are ``harness.log``."""
         return self._logger
 
+    def has_parameter(self, name: str) -> bool:
+        """Whether the project, or the plugin, has declared it."""
+        return name in self._parameters
+
+    def get_parameter(self, name: str) -> Parameter:
+        """A parameter that the project, or the plugin, has declared."""
+        if name not in self._parameters:
+            raise ParameterNotDeclaredException(name)
+        return Parameter(name, value=self._parameters[name])
+
+    def declare_parameter(self, name: str, value: Any = None, *_: Any, **__: Any) -> Parameter:
+        """As in rclpy; where the project gives a value, that one counts."""
+        if name not in self._given:
+            self._parameters[name] = value
+        return self.get_parameter(name)
+
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("__"):  # what copy, pickle and the like ask for
             raise AttributeError(attribute)
         raise NodeError(
             f"get_ros_node().{attribute}: there is no ROS behind a PluginHarness, only"
-            " get_logger() and get_name(): test this part in a project that is launched"
+            " get_logger(), get_name() and parameters: test this part in a project that is launched"
         )
 
 
@@ -137,7 +162,9 @@ class Workbench:
 
     def transport(self, file: NodeFile) -> Transport:
         """The real transport of nodes that share a process."""
-        self._ros_nodes[file.node.name] = RosNodeStandIn(file.node.name, self._log)
+        self._ros_nodes[file.node.name] = RosNodeStandIn(
+            file.node.name, self._log, file.node.parameters
+        )
         return MemoryTransport(file, self.hub, self.topics)
 
     def ros_node(self, file: NodeFile) -> RosNodeStandIn:

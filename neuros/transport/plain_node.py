@@ -12,12 +12,15 @@ from types import MappingProxyType
 from typing import Any
 
 from rclpy.context import Context
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from neuros.project.model import NodeFile, Value
 from neuros.project.names import Names
+
+__all__ = ["Parameter", "ParameterNotDeclaredException", "PlainNode", "plain_node"]
 
 _NO_NAMES = Names()
 _NOTHING: Mapping[str, Value] = MappingProxyType({})

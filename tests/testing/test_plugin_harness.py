@@ -311,7 +311,28 @@ def test_shutdown_is_seen_and_stops_the_node(plugin):
     assert numbers(bench.received("y")) == [1]
 
 
-def test_the_ros_node_has_a_logger_and_nothing_else(plugin, caplog):
+def test_the_ros_node_has_the_parameters_of_the_project(tmp_path):
+    (tmp_path / "node.py").write_text(
+        "from neuros.hooks import neuros_function\n"
+        "@neuros_function(inputs='x')\n"
+        "def hook(node, x):\n"
+        "    ros = node.get_ros_node()\n"
+        "    assert ros.get_parameter('gain.p').value == 1.5\n"
+        "    assert ros.declare_parameter('gain.p', 0.0).value == 1.5\n"
+        "    assert not ros.has_parameter('own')\n"
+        "    assert ros.declare_parameter('own', 3).value == 3\n"
+        "    node.get_logger().info(str(ros.get_parameter('unknown')))\n"
+    )
+    node = {"name": "a", "container": "neuros_python", "plugin": "node.py"}
+    node |= {"inputs": [{"name": "x", "type": INT}], "parameters": {"gain": {"p": 1.5}}}
+    (tmp_path / "node.json").write_text(json.dumps(node))
+    bench = PluginHarness.from_node_file(tmp_path / "node.json")
+    bench.send("x", Int32())
+    with pytest.raises(HookError, match=r"ParameterNotDeclared.*unknown"):
+        bench.run()
+
+
+def test_the_ros_node_has_a_logger_and_no_ros(plugin, caplog):
     path = plugin("""
         from neuros.hooks import *
 

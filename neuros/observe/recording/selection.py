@@ -64,8 +64,9 @@ def plan_recording(
     known = {place.topic.name for place in _places(project, names)}
     wanted = _asked_of_ros(request, known, project)
     listen = list(wanted)
-    if request.everything and not is_alone and CLOCK not in known:
-        listen.append(CLOCK)
+    clock = project.names.resolve(CLOCK, "")
+    if request.everything and not is_alone and clock not in known:
+        listen.append(clock)
     topics = list(dict.fromkeys(place.topic for place in places))
     owners = [n.name for n in project.nodes if n.name in names and n.owns_time]
     return RecordingPlan(
