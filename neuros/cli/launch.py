@@ -238,8 +238,11 @@ class _Run:
 
     def _where_to_start(self) -> str:
         """How nodes elsewhere join this run."""
-        reach = " and --network" if self._plan.network.is_wide else ""
-        return f" (started by -n, with the same nodes and connections, -d {self._domain.id}{reach})"
+        namespace = self._plan.project.names.namespace
+        options = [f"-d {self._domain.id}"]
+        options += [f"--namespace {namespace}"] if namespace else []
+        options += ["--network"] if self._plan.network.is_wide else []
+        return f" (started by -n, with the same nodes and connections, {' and '.join(options)})"
 
     def _environment(self) -> dict[str, str]:
         """What every node gets, whatever the shell that NeuROS was started from has sourced."""

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from launching import Finished, start
+from launching import Finished, launch, start
 from ros_program import RosProgram
 from std_srvs.srv import Trigger
 
@@ -83,3 +83,15 @@ def check(finished: Finished, namespace: str, *, shared: str) -> None:
         assert recorded[inside].count == counters["sent"]
         for topic in (inside, f"{namespace}/said", shared):
             assert {message.data for _, message in recorded[topic].messages()} == {namespace}
+
+
+@pytest.mark.acceptance
+def test_a_run_in_a_namespace_can_be_replayed(tmp_path: Path) -> None:
+    names = ("--namespace", "left", "--remap", "/shared:=shared")
+    with choose_domain(None, {}, False) as domain:
+        arguments = ("--backend", "process", "-d", str(domain.id), "-r", "--duration", "1")
+        finished = launch(PROJECT, *arguments, *names, cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    told = neuros("replay", str(finished.run_folder), "--node", "talker")
+    assert told.startswith("identical: ")
+    assert " on 3 connections; " in told
