@@ -25,6 +25,7 @@ from playwright.sync_api import sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
+DEADLINE_MS = 120_000
 WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
 
 
@@ -41,11 +42,13 @@ def dashboard_of(project: Path, *arguments: str) -> Iterator[str]:
         )
         assert process.stdout is not None
         with process.stdout as lines:
-            yield next(m[1] for line in lines if (m := re.search(r"dashboard: (\S+)", line)))
-            process.send_signal(signal.SIGINT)
-            for _ in lines:
-                pass
-        process.wait()
+            try:
+                yield next(m[1] for line in lines if (m := re.search(r"dashboard: (\S+)", line)))
+            finally:
+                process.send_signal(signal.SIGINT)
+                for _ in lines:
+                    pass
+                process.wait()
 
 
 def shoot_dashboard(page: Any) -> None:
@@ -59,7 +62,8 @@ def shoot_dashboard(page: Any) -> None:
             page.click(f'#connections tr[data-name="{connection}"]')
             page.click(f'#details tr[data-name="{field}"] button')
         page.wait_for_function(
-            "() => [...document.querySelectorAll('.chart')].every((c) => c.dataset.points > 300)"
+            "() => [...document.querySelectorAll('.chart')].every((c) => c.dataset.points > 150)",
+            timeout=DEADLINE_MS,
         )
         page.screenshot(path=FIGURES / "dashboard.png")
 

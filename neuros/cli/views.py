@@ -118,7 +118,6 @@ class Views:
         if self._rerun is not None:
             self._start_rerun(self._rerun, run, guardian)
             log("INFO", f"visualisations: {self._rerun.url}")
-            _open(self._rerun.url)
 
     def finish(self) -> None:
         """Close what was opened."""
@@ -175,6 +174,7 @@ def _open(url: str) -> None:
 
 
 def _run_view(options: argparse.Namespace) -> int:
+    from neuros.launch.rerun import await_server
     from neuros.views.onlooker import look_on
     from neuros.views.rerun_feed import RerunFeed
     from neuros.views.scene import Source
@@ -183,8 +183,10 @@ def _run_view(options: argparse.Namespace) -> int:
     sources = {
         each["name"]: (each["node"], each["port"], Source(each["type"])) for each in told["sources"]
     }
+    await_server(told["url"])
+    _open(told["url"])
     feed = RerunFeed(
-        told["project"], told["url"], {name: source for name, (*_, source) in sources.items()}
+        told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
     )
     look_on(Path(options.run), sources, feed.show)
     feed.close()

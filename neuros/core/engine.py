@@ -297,7 +297,12 @@ class Engine:
                         self._run(hook)
             finally:
                 self._is_passing = False
-        self._cause = self._cause_of_rest()
+        if life.is_stopped:
+            self._cause = self.rest()
+        elif gate.is_closed:
+            self._cause = gate.cause_of_rest(self._schedule.candidates)
+        else:
+            self._cause = self._schedule.cause_of_rest()
         if self._cause is SCHEDULING and not (self._has_posted_loop_back or life.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
@@ -334,14 +339,6 @@ class Engine:
         elif hook.spec.kind is HookKind.INITIALISE:
             self._exchange.retire(hook)
             self._life.finish_initialiser(hook)
-
-    def _cause_of_rest(self) -> Rest:
-        if self._life.is_stopped:
-            return self.rest()
-        if self._gate.is_closed:
-            may_start = (self._gate.lets(h) and h.can_send() for h in self._schedule.candidates)
-            return SCHEDULING if any(may_start) else PAUSED
-        return self._schedule.cause_of_rest()
 
     def _add_source(self, names: tuple[str, ...]) -> Source:
         for name in names:

@@ -10,8 +10,9 @@ Ticks have a time of their own, which stands still meanwhile: none is missed by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
+from neuros.core.accounting import PAUSED, SCHEDULING, Rest
 from neuros.core.hook import Hook
 from neuros.core.life import Life
 from neuros.hooks import HookKind
@@ -69,6 +70,11 @@ class Gate:
         if self._limits_all or drives(hook):
             return self._started.get(hook, 0) < self._granted
         return self._granted > 0
+
+    def cause_of_rest(self, candidates: Iterable[Hook]) -> Rest:
+        """Why nothing runs while the gate is closed, unless something is about to."""
+        may_start = any(self.lets(hook) and hook.can_send() for hook in candidates)
+        return SCHEDULING if may_start else PAUSED
 
     def note(self, hook: Hook) -> None:
         """A hook starts while the gate is closed."""

@@ -7,16 +7,18 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from neuros.launch.companion import start_companion
 
 HOST = "127.0.0.1"
 _MEMORY = "512MB"
 _END_S = 3.0
+_START_S, _LOOK_S = 30.0, 0.1
 
 
 class RerunProcesses:
@@ -57,7 +59,8 @@ class RerunProcesses:
         pipe = self._processes[-1].stdin
         assert pipe is not None
         with contextlib.suppress(BrokenPipeError), pipe:
-            pipe.write(json.dumps({**told, "url": self.feed_url}).encode() + b"\n")
+            text = json.dumps({**told, "feed_url": self.feed_url, "url": self.url})
+            pipe.write(text.encode() + b"\n")
         return [process.pid for process in self._processes]
 
     def finish(self) -> None:
@@ -70,6 +73,21 @@ class RerunProcesses:
             for pipe in (process.stdin, process.stdout):
                 if pipe is not None:
                     pipe.close()
+
+
+def await_server(url: str) -> None:
+    """Until the server of a page answers. Raises ``OSError`` if it does not."""
+    where = urlsplit(url)
+    give_up_s = time.monotonic() + _START_S
+    while True:
+        try:
+            socket.create_connection((HOST, where.port or 0), 1.0).close()
+        except ConnectionRefusedError:
+            if time.monotonic() > give_up_s:
+                raise
+            time.sleep(_LOOK_S)
+        else:
+            return
 
 
 def _free_ports(count: int) -> list[int]:

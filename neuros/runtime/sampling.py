@@ -85,8 +85,9 @@ class Sampler:
         request = self.requests.get(port)
         if request is not None:
             request.look_at(packet)
-            if request.is_met:
-                self.requests.pop(port, None)
+            # Meanwhile the next question may have come.
+            if request.is_met and self.requests.get(port) is request:
+                del self.requests[port]
 
     def ask(self, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         """What was found since the last question; ``wanted`` is the next one. Any other thread.

@@ -11,6 +11,8 @@ import pytest
 import requests
 from launching import REPOSITORY, launch, start
 
+from neuros.launch.rerun import await_server
+
 WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
 # A stand-in for a tool with a window: it tells how it was started, and stays.
 TOOL = """\
@@ -75,6 +77,7 @@ def test_rerun_is_served_and_fed(tmp_path: Path) -> None:
             for line in running.output.splitlines()
             if "visualisations: http" in line
         )
+        await_server(url)
         assert "Rerun" in requests.get(url, timeout=20).text
         running.signal(2)
         finished = running.finish()

@@ -9,9 +9,9 @@ const COLOURS = {
 };
 const STYLE = [
   {selector: "node", style: {
-    shape: "round-rectangle", width: 190, height: 60, "background-color": "data(colour)",
+    shape: "round-rectangle", width: 180, height: 64, "background-color": "data(colour)",
     label: "data(label)", "text-valign": "center", "text-halign": "center", "text-wrap": "wrap",
-    "text-max-width": 186, color: "#fff", "font-size": 13, "font-family": "system-ui, sans-serif",
+    "text-max-width": 176, color: "#fff", "font-size": 14, "font-family": "system-ui, sans-serif",
   }},
   {selector: "node.topic, node.elsewhere", style: {
     "background-color": "#fff", "border-width": 1, "border-color": "#7b8794", color: "#1d2733",
@@ -19,7 +19,7 @@ const STYLE = [
   {selector: "node.topic", style: {shape: "ellipse"}},
   {selector: "edge", style: {
     "curve-style": "bezier", "target-arrow-shape": "triangle", width: 2, label: "data(label)",
-    "line-color": "#7b8794", "target-arrow-color": "#7b8794", "font-size": 11,
+    "line-color": "#7b8794", "target-arrow-color": "#7b8794", "font-size": 12,
     "text-wrap": "wrap", "text-background-color": "#fff", "text-background-opacity": 0.9,
     "text-background-padding": 2, color: "#1d2733", "font-family": "system-ui, sans-serif",
     "control-point-step-size": 90,
@@ -36,7 +36,7 @@ export class Graph {
     this.plan = plan;
     this.cy = cytoscape({container: box, elements: elementsOf(plan), style: STYLE,
       maxZoom: 2});
-    this.cy.layout({name: "dagre", rankDir: "LR", nodeSep: 70, rankSep: 190, edgeSep: 60,
+    this.cy.layout({name: "dagre", rankDir: "LR", nodeSep: 110, rankSep: 170, edgeSep: 110,
       fit: true, padding: 20}).run();
     this.cy.on("tap", "node, edge", (event) => {
       const {kind, name} = event.target.data();

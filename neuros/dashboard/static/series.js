@@ -46,6 +46,13 @@ export class Series {
   }
 }
 
+// What hardly changes is a line in the middle, not noise of the last digit.
+function rangeOf(_, low, high) {
+  if (low === null) return [0, 1];
+  const margin = Math.max(0.08 * (high - low), 1e-3 * Math.abs(high), 1e-9);
+  return [low - margin, high + margin];
+}
+
 class Chart {
   constructor(box, source, path, onClose) {
     this.source = source;
@@ -58,7 +65,7 @@ class Chart {
     box.append(this.element);
     this.plot = new uPlot({
       width: this.element.clientWidth - 12, height: HEIGHT, legend: {show: false},
-      scales: {x: {time: false}}, axes: [{size: 28}, {size: 62}],
+      scales: {x: {time: false}, y: {range: rangeOf}}, axes: [{size: 28}, {size: 62}],
       series: [{}, {stroke: "#1a66c2", width: 1.3, points: {show: false}}],
     }, this.data, this.element);
     this.observer = new ResizeObserver(() => this.plot.setSize(
