@@ -284,6 +284,16 @@ def test_importing_neuros_imports_no_adapter() -> None:
     )
 
 
+def test_the_command_line_starts_without_what_single_commands_need() -> None:
+    """Every node starts through it."""
+    run_python(
+        "-c",
+        "import sys; sys.path.insert(0, '.'); import neuros.cli.main\n"
+        "heavy = {'asyncio', 'starlette', 'uvicorn', 'webbrowser', 'rclpy', 'docker', 'numpy'}\n"
+        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}",
+    )
+
+
 def ends_or_evaluates(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Calls that a library must not make: it would end the process, or run text as code."""
     banned = {"eval", "exec", "exit", "quit", "sys.exit"}

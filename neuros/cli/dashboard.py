@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
-import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,6 +78,9 @@ def start_dashboard(
 
 
 def _run_dashboard(options: argparse.Namespace) -> int:
+    import asyncio
+    import socket
+
     from neuros.dashboard.server import Dashboard
 
     told = json.loads(sys.stdin.readline())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -167,6 +166,8 @@ class Views:
 
 def _open(url: str) -> None:
     """Open a page where there is a display; its address is printed in any case."""
+    import webbrowser
+
     from neuros.launch.tools import has_display
 
     if has_display():

@@ -162,7 +162,6 @@ class Dashboard:
     async def _read_logs(self) -> None:
         while True:
             await self._pages.are_watched.wait()
-            self._lines.clear()
             log = self._sources.open_log()
             try:
                 while self._pages.are_watched.is_set():
@@ -175,6 +174,7 @@ class Dashboard:
                     await asyncio.sleep(0)
             finally:
                 log.close()
+                self._lines.clear()  # the next page begins with the last lines of then
 
     async def _read_load(self) -> None:
         while True:

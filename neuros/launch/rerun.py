@@ -53,6 +53,7 @@ class RerunProcesses:
         server = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST]
         server += ["--port", str(self._feed_port), "--web-viewer-port", str(self._web_port)]
         server += ["--server-memory-limit", _MEMORY, "--hide-welcome-screen"]
+        server += ["--newest-first"]  # who opens it late wants to see what is now
         log = run / "rerun.log"
         for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
             self._processes.append(start_companion(what, command, run, log, environment))
