@@ -61,7 +61,9 @@ export class Graph {
         const window = edge.data("window");
         const parts = [`${rate(c.rate_hz)}/s`];
         if (c.latency_ms !== null && c.latency_ms !== undefined) parts.push(milliseconds(c.latency_ms));
-        if (edge.data("isReliable")) parts.push(`${c.outstanding ?? 0} of ${window} out`);
+        if (edge.data("isReliable") && c.outstanding !== undefined) {
+          parts.push(`${c.outstanding} of ${window} out`);
+        }
         if (c.discarded) parts.push(`${c.discarded} discarded`);
         edge.data({blocked: Boolean(c.is_blocked),
           label: `${edge.data("title")}\n${parts.join(", ")}`});

@@ -24,8 +24,9 @@ export class Tables {
     for (const [name, {plan, row}] of this.connections) {
       const c = figures.connections[name];
       if (!c) continue;
-      const out = plan.window && plan.discard_limit !== null
-        ? `${c.outstanding ?? 0} of ${plan.window}` : "–";
+      // A sender elsewhere does not say, and one of best effort does not count.
+      const out = plan.discard_limit === null || c.outstanding === undefined
+        ? "–" : `${c.outstanding} of ${plan.window}`;
       row.show(name, plan.guarantee, number(c.sent ?? c.received), rate(c.rate_hz),
         milliseconds(c.latency_ms), out, number(c.unread), number(c.discarded));
     }
