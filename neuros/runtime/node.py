@@ -159,8 +159,8 @@ class NodeRuntime:
         self._guard(self._loaded.start)
 
     def drain(self) -> None:
-        """Stop the hooks that send unasked."""
-        self._loaded.drain()
+        """Stop the hooks that send unasked; after a pause, the others go on."""
+        self._guard(self._loaded.drain)
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
