@@ -201,7 +201,7 @@ TARGETS = (
                 20_000,
                 is_maximum=False,
                 unit="1/s",
-                label="IMU packets of a run that goes on",
+                label="IMU packets, live",
             ),
             Bound("recorder-volume", 120, is_maximum=False, unit="MB/s", label="VGA images"),
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -12,6 +13,7 @@ from benchmarks.in_turn import speed_with
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
 from benchmarks.subjects.whiskeye import WHISKEYE
+from neuros.launch.recording import RecorderProcess
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.spool import SpoolWriter
@@ -22,6 +24,8 @@ SIMULATED_S = 100.0
 SLICE_S = 0.5  # the recorder writes what was kept 0.1 s before
 PROJECTS = {"hybrid": "project", "strict": "strict"}
 IMU_BYTES, IMAGE_BYTES = 360, 921_600
+LIVE_RATE = 40_000
+PAUSE_S = 0.005
 
 
 def subject(is_quick: bool) -> Subject:
@@ -65,7 +69,15 @@ def _recorder(share: float) -> Group:
         "IMU": functools.partial(recorded, IMU_BYTES, round(100_000 * share)),
         "image": functools.partial(recorded, IMAGE_BYTES, round(500 * share)),
     }
+    candidates["live"] = functools.partial(live, IMU_BYTES, 4.0 * share)
     cases = (
+        Case(
+            "recorder, IMU packets of 4 nodes that go on",
+            "1/s",
+            Figure("live", "rate"),
+            bound="recorder-live",
+        ),
+        Case("recorder, bag complete after the last of them", "s", Figure("live", "behind_s")),
         Case("recorder, IMU packets", "1/s", Figure("IMU", "rate"), bound="recorder-packets"),
         Case("recorder, VGA images", "MB/s", Figure("image", "volume"), bound="recorder-volume"),
         Case("node, keep an IMU packet", "us", Figure("IMU", "keep_us")),
@@ -79,26 +91,60 @@ def _floods(is_quick: bool) -> tuple[Group, ...]:
     seconds = 0.3 if is_quick else 2.0
     return (
         _flood(IMU_PACKET, "process", seconds),
-        _flood(IMU_PACKET, "in-process", seconds, "recorder-live"),
+        _flood(IMU_PACKET, "in-process", seconds),
         _flood(LARGE, "process", seconds),
     )
 
 
-def _flood(packet: Packet, backend: str, seconds: float, bound: str | None = None) -> Group:
+def _flood(packet: Packet, backend: str, seconds: float) -> Group:
     run = functools.partial(flooding.neuros, packet, backend, seconds, {"discard_limit": 0})
     is_image = packet is LARGE
     figure, unit = ("volume", "MB/s") if is_image else ("rate", "1/s")
     name = f"throughput, {packet.name}, {backend.replace('-', ' ')}, discard limit 0, recorded"
-    reference = (None, "") if bound else (Figure("not recorded", figure), "not recorded")
     cases = (
-        Case(name, unit, Figure("recorded", figure), *reference, bound),
+        Case(
+            name, unit, Figure("recorded", figure), Figure("not recorded", figure), "not recorded"
+        ),
         Case(f"{name}: bag complete after the last packet", "s", Figure("recorded", "behind_s")),
     )
     candidates: dict[str, Measurement] = {
         "not recorded": run,
         "recorded": functools.partial(run, options=RECORD),
     }
-    return Group(candidates, cases, MINIMUM_PAIRS if bound else 6)
+    return Group(candidates, cases, rounds=6)
+
+
+def live(size: int, seconds: float) -> dict[str, float]:
+    """Four nodes keep packets, faster together than is asked for, while the recorder runs.
+
+    ``rate`` is of all packets, from the first one until the bag is complete with none missing.
+    """
+    names = "abcd"
+    count = round(LIVE_RATE * seconds / len(names))
+    topics = tuple(Topic(f"/neuros/{n}/out/z/{n}/data", "std_msgs/msg/String") for n in names)
+    streams = {name: (Stream("sent", "out", (place,)),) for place, name in enumerate(names)}
+    plan = RecordingPlan("mcap", topics, streams)
+    with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
+        run = Path(folder)
+        plan.save(run)
+        command = [sys.executable, "-m", "neuros.cli", "recorder", folder]
+        recorder = RecorderProcess(command, run, run / "log", {})
+        senders = [SpoolWriter(run / name, plan.streams[name]) for name in names]
+        start_s = time.perf_counter()
+        for number in range(count):
+            for sender in senders:
+                sender.keep(Way.SENT, "out", bytes(size), None)
+            ahead_s = number * len(names) / LIVE_RATE - (time.perf_counter() - start_s)
+            if ahead_s > PAUSE_S:
+                time.sleep(ahead_s)
+        sent_s = time.perf_counter()
+        for sender in senders:
+            sender.close()
+        done = recorder.finish(lambda: False)
+        end_s = time.perf_counter()
+    if done.problems or sum(done.counts.values()) != count * len(names):
+        raise RuntimeError(f"{done.counts} of {count} packets each: {done.problems}")
+    return {"rate": count * len(names) / (end_s - start_s), "behind_s": end_s - sent_s}
 
 
 def recorded(size: int, count: int) -> dict[str, float]:

@@ -24,6 +24,7 @@ from std_msgs.msg import Float64, String
 from test_back_ends import talk_to_the_gate
 
 import neuros.bag
+from neuros.cli.main import main
 from neuros.launch.domain import choose_domain
 
 HERE = Path(__file__).parent
@@ -219,12 +220,12 @@ def test_only_what_is_named_is_recorded(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_recorded_is_said_before_the_start(
-    options: tuple[str, ...], text: str, tmp_path: Path
+    options: tuple[str, ...], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    finished = launch(PROJECTS / "pipeline", *options, cwd=tmp_path)
-    assert finished.exit_code == 2
-    assert text in finished.output
-    assert list(tmp_path.iterdir()) == []
+    run = tmp_path / "run"
+    assert main(["launch", str(PROJECTS / "pipeline"), "-o", str(run), *options]) == 2
+    assert text in capsys.readouterr().err
+    assert not run.exists()
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ def test_a_run_of_the_elevator_becomes_a_page(
 ) -> None:
     finished = launch(
         EXAMPLES / "3_physics_simulation/elevator",
-        *("--backend", back_end, "--duration", "5sim", "-o", str(tmp_path / "run")),
+        *("--backend", back_end, "--duration", "2sim", "-o", str(tmp_path / "run")),
         cwd=tmp_path,
     )
     assert finished.exit_code == 0, finished.output
