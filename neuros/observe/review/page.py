@@ -31,7 +31,7 @@ img { max-width: 100%; height: auto }
 .table { overflow-x: auto }
 table { border-collapse: collapse; font-size: .88rem }
 th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #DDD }
-th:first-child, td:first-child { text-align: left }
+th:first-child, td:first-child, .words td { text-align: left }
 code { background: #F0F0F0; padding: .1rem .3rem; overflow-wrap: anywhere }
 </style>
 </head>
@@ -81,14 +81,16 @@ def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
     return f'<h2>{escape(title)}</h2>\n<div class="main">{"".join(lines)}</div>'
 
 
-def table_part(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table under a heading."""
+def table_part(
+    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "numbers"
+) -> str:
+    """A table under a heading; of ``kind`` ``numbers`` or ``words``, by which it is aligned."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join(
         f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
     )
     return (
-        f'<h2>{escape(title)}</h2>\n<div class="table"><table><thead><tr>{head}</tr></thead>'
+        f'<h2>{escape(title)}</h2>\n<div class="table {kind}"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
 
@@ -145,6 +147,7 @@ def _provenance(run: Run) -> str:
     record = run.record
     machine, versions = record.get("machine") or {}, record.get("versions") or {}
     git = record.get("git") or {}
+    images = ((record.get("docker") or {}).get("images") or {}).values()
     started = record.get("started")
     when = datetime.fromtimestamp(started, timezone.utc) if started else None
     cells = {
@@ -152,11 +155,23 @@ def _provenance(run: Run) -> str:
         "project": record.get("file"),
         "started": when and when.strftime("%Y-%m-%d %H:%M:%S UTC"),
         "back end": record.get("backend"),
-        "machine": ", ".join(f"{key}: {value}" for key, value in machine.items()),
+        "machine": machine and _machine(machine),
         "NeuROS, Python": versions and f"{versions.get('neuros')}, {versions.get('python')}",
         "git": git and f"{git.get('commit')}{' (changed)' if git.get('is_dirty') else ''}",
-        "seeds": record.get("seeds"),
+        "images": ", ".join(image["name"] for image in images),
+        "seeds": ", ".join(
+            f"{node}: {name} {value}"
+            for node, found in (record.get("seeds") or {}).items()
+            for name, value in found.items()
+        ),
         "command": " ".join(record.get("command", ())),
     }
     rows = [[key, str(value)] for key, value in cells.items() if value]
-    return table_part("Where it comes from", ["", ""], rows)
+    return table_part("Where it comes from", ["", ""], rows, "words")
+
+
+def _machine(machine: Mapping[str, Any]) -> str:
+    memory = f"{machine['memory_bytes'] / 1e9:.1f} GB" if "memory_bytes" in machine else None
+    cores = f"{machine['cores']} cores" if "cores" in machine else None
+    parts = [machine.get("processor"), cores, memory, machine.get("system")]
+    return ", ".join(str(part) for part in parts if part)
