@@ -30,11 +30,9 @@ HEARD = [f"{[0.5 * number, 1.5]} 3.0 ['neck', 'jaw']" for number in range(3)]
 
 ROUND_TRIP = """
 import rclpy
-from demo_msgs.action import Nod
 from demo_msgs.msg import Joints, Limits
 from demo_msgs.srv import Move
 from demo_more_msgs.msg import Told
-from rclpy.action import ActionServer
 from rclpy.serialization import deserialize_message, serialize_message
 
 joints = Joints(angles=[1.0, -2.5], names=["a", "b"], flags=[True, False], raw=b"xyz", one=b"\\x07")
@@ -43,7 +41,8 @@ joints.header.frame_id = "w\\u00e4nd"
 joints.limits[0].lower = -1.0
 joints.fixed[2] = 2.5
 assert (Joints.MANY, joints.label, joints.limits[1].upper) == (5, "none", 1.0)
-for message in (joints, Told(joints=joints, hash="x"), Move.Request(to=joints), Nod.Goal(times=3)):
+told = Told(joints=joints, hash="x")
+for message in (joints, told, Move.Request(to=joints), Move.Response(done=True)):
     again = deserialize_message(serialize_message(message), type(message))
     assert again == message, (again, message)
     assert again is not message
@@ -51,7 +50,6 @@ for message in (joints, Told(joints=joints, hash="x"), Move.Request(to=joints), 
 rclpy.init()
 node = rclpy.create_node("node")
 node.create_service(Move, "move", print)
-ActionServer(node, Nod, "nod", print)
 publishers = [node.create_publisher(kind, kind.__name__, 1) for kind in (Joints, Limits, Told)]
 for publisher in publishers:
     (info,) = node.get_publishers_info_by_topic(publisher.topic)
@@ -142,7 +140,7 @@ class TestBuilding:
     def test_two_programs_build_each_package_once(self, custom_messages: CustomMessages) -> None:
         rows = "".join(custom_messages.outputs).splitlines()
 
-        for package in ("demo_msgs: 2 messages, 1 service, 1 action", "demo_more_msgs: 1 message"):
+        for package in ("demo_msgs: 2 messages, 1 service", "demo_more_msgs: 1 message"):
             assert len([row for row in rows if f"building {package} " in row]) == 1
 
     def test_nothing_but_whole_packages_is_left(self, custom_messages: CustomMessages) -> None:
@@ -194,6 +192,52 @@ class TestBuilding:
         # manylinux_2_28, for which the wheels of ROS are made: glibc 2.28, and GCC 8.
         assert max(versions) <= (2, 28)
         assert max(plus) <= (3, 4, 24)
+
+
+ACTION = """
+import rclpy
+from nod_msgs.action import Nod
+from rclpy.action import ActionClient, ActionServer
+from rclpy.executors import SingleThreadedExecutor
+
+def nod(goal):
+    goal.publish_feedback(Nod.Feedback(so_far=1))
+    goal.succeed()
+    return Nod.Result(done=goal.request.times == 3)
+
+rclpy.init()
+node = rclpy.create_node("node")
+server, client = ActionServer(node, Nod, "nod", nod), ActionClient(node, Nod, "nod")
+heard = []
+assert client.wait_for_server(20)
+sent = client.send_goal_async(Nod.Goal(times=3), lambda message: heard.append(message.feedback))
+rclpy.spin_until_future_complete(node, sent, timeout_sec=20)
+result = sent.result().get_result_async()
+rclpy.spin_until_future_complete(node, result, timeout_sec=20)
+print(result.result().result.done, [each.so_far for each in heard])
+"""
+
+
+@pytest.mark.acceptance
+def test_actions_are_built_too(tmp_path: Path) -> None:
+    action = "int32 times\n---\nbool done\n---\nint32 so_far\n"
+    write_package(
+        tmp_path / "workspace", "nod_msgs", {"action/Nod.action": action}, ["action_msgs"]
+    )
+    done = build("-p", str(tmp_path), "nod_msgs", XDG_CACHE_HOME=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    path = str(Path(done.stdout.split()[-1]) / "python")
+
+    program = subprocess.run(
+        [sys.executable, "-c", ACTION],
+        env={**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": "93"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+
+    assert program.stdout == "True [1]\n", program.stderr
 
 
 @pytest.mark.parametrize("package", ["std_msgs", "geometry_msgs", "std_srvs", "action_msgs"])
