@@ -15,15 +15,10 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
 from neuros.messages import generation
 from neuros.messages.cache import Built, sweep
-from neuros.messages.compilation import CompilationError, Compilers, Job, compile_package
+from neuros.messages.compilation import HEADERS, CompilationError, Compilers, Job, compile_package
 from neuros.messages.installed import Ros
 from neuros.messages.package import MANIFEST, Package
 
-_HEADERS = (
-    "rosidl_generator_c",
-    "rosidl_typesupport_introspection_c",
-    "rosidl_typesupport_fastrtps_c",
-)
 # What services and actions are made of, besides what their files name.
 _IMPLIED: Mapping[str, set[str]] = {
     ".msg": set(),
@@ -162,7 +157,7 @@ def _install(package: Package, source: Path, prefix: Path) -> None:
         _copy(generation.generated(source, generator, package.name), share, {".idl", ".json"})
     for file in (Path(MANIFEST), *package.files):
         shutil.copyfile(package.folder / file, share / file)
-    for generator in _HEADERS:
+    for generator in HEADERS:
         folder = generation.generated(source, generator, package.name)
         _copy(folder, prefix / "include" / package.name / package.name, {".h"})
     _copy(generation.generated(source, "rosidl_generator_py", package.name), python, {".py"})

@@ -20,11 +20,13 @@ _ABI = Path(__file__).with_name("stable_abi.h")
 _C = ("-std=gnu11", "-O2", "-fPIC", "-DNDEBUG", "-w")
 _CPP = ("-std=c++17", "-O2", "-fPIC", "-DNDEBUG", "-w")
 _LINK = ("-shared", "-Wl,--strip-all", "-Wl,--as-needed", "-Wl,--no-undefined")
-_HEADERS = (
+HEADERS = (
     "rosidl_generator_c",
     "rosidl_typesupport_introspection_c",
     "rosidl_typesupport_fastrtps_c",
 )
+"""The generators that write headers."""
+
 _TO_C, _TO_PYTHON = "rosidl_generator_c", "rosidl_generator_py"
 # Each library with what it needs of ROS; generators of the same name make its code.
 _LIBRARIES: Mapping[str, Sequence[str]] = {
@@ -129,7 +131,7 @@ def compile_package(job: Job) -> None:
 
 def _compile(job: Job, source: Path) -> Path:
     out = source.with_suffix(f"{source.suffix}.o")
-    own = [generated(job.source, kind, job.package).parent for kind in _HEADERS]
+    own = [generated(job.source, kind, job.package).parent for kind in HEADERS]
     others = [folder / "include" / name for name, folder in job.built.items()]
     # In ROS the headers of a package are in a folder of its name twice; fastcdr has one.
     ros = [job.ros.include, *sorted(p for p in job.ros.include.iterdir() if p.is_dir())]
