@@ -269,7 +269,7 @@ def test_packages_of_ros_get_the_hashes_that_they_are_shipped_with(
 
 class TestRuns:
     @pytest.mark.parametrize("back_end", BACKENDS)
-    def test_nodes_exchange_them_and_the_bag_brings_their_definitions(
+    def test_nodes_exchange_them_in_the_run_in_its_bag_and_in_its_replay(
         self, custom_messages: CustomMessages, back_end: str, tmp_path: Path
     ) -> None:
         arguments = ("--backend", back_end, "-d", "90", "-t", "body.joints")
@@ -291,15 +291,8 @@ class TestRuns:
             angles = [list(message.angles) for _, message in topic.messages()]
         assert angles == [[0.0, 1.5], [0.5, 1.5], [1.0, 1.5]]
 
-    def test_a_replayed_node_finds_them(
-        self, custom_messages: CustomMessages, tmp_path: Path
-    ) -> None:
-        environment = {**os.environ, **custom_messages.environment}
-        run = launch(custom_messages.project, "-d", "90", "-r", cwd=tmp_path, **environment)
-        assert run.exit_code == 0, run.output
         command = [sys.executable, "-m", "neuros.cli", "replay", str(run.run_folder), "-n", "brain"]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "3 starts of hooks" in done.stdout
 
