@@ -42,6 +42,7 @@ pause   the run stands still
 resume  the run goes on
 step    while it stands still, let it do so many steps   count
 end     end the run, drained, with exit code 0           reason
+signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 
 ======= ================================================ =================

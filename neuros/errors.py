@@ -7,6 +7,7 @@
     │   └── DescriptionError   ... a robot's description is
     ├── UsageError          the command line is wrong          exit code 2
     ├── EnvironmentFault    something is missing on this machine   exit code 4
+    ├── RunError            a run did not end well, and was to
     └── NodeError           a node failed                      exit code 1
         ├── HookError       ... in a hook of its plugin
         ├── CallbackError   ... in a callback that its plugin has registered with ROS
@@ -71,6 +72,17 @@ class UsageError(NeurosError):
 
 class EnvironmentFault(NeurosError):
     """A package, an engine or an image that the run needs is missing on this machine."""
+
+
+class RunError(NeurosError):
+    """A run has ended, but not well, and the program that asks wants only those that have.
+
+    ``exit_code`` is that of the run.
+    """
+
+    def __init__(self, text: str, exit_code: int) -> None:
+        self.exit_code = exit_code
+        super().__init__(text)
 
 
 class NodeError(NeurosError):

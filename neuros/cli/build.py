@@ -32,8 +32,9 @@ def add_build(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def _build(options: argparse.Namespace) -> int:
+    from neuros.api.loading import workspaces_of
+    from neuros.api.workspace import WORKSPACE
     from neuros.cli.environments import build_messages
-    from neuros.cli.projects import WORKSPACE, workspaces_of
     from neuros.messages.compilation import Compilers
     from neuros.messages.needed import Messages
     from neuros.project.suggest import did_you_mean

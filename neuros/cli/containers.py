@@ -159,7 +159,8 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
-    from neuros.cli.projects import WORKSPACE, workspaces_of
+    from neuros.api.loading import workspaces_of
+    from neuros.api.workspace import WORKSPACE
     from neuros.launch.containers import OWN_FOLDER
     from neuros.launch.docker.recipes import names_in
     from neuros.project.load import load_project

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neuros.cli.plan import Plan
+    from neuros.api.plan import Plan
     from neuros.dashboard.server import Sources
     from neuros.launch.dashboard import DashboardProcess
 
@@ -92,7 +92,7 @@ def _run_dashboard(options: argparse.Namespace) -> int:
 
 
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
-    from neuros.cli.observation import owner_of_processes
+    from neuros.api.observation import owner_of_processes
     from neuros.dashboard.server import Sources
     from neuros.observe.load import LAUNCHER, LoadMeter
     from neuros.observe.load_now import LoadNow

@@ -1,7 +1,4 @@
-"""Makes what a run needs before it begins: virtual environments, and message packages.
-
-It can be interrupted at any time.
-"""
+"""Makes what a run needs before it begins, and can be ended by signals while it does."""
 
 from __future__ import annotations
 
@@ -9,20 +6,17 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from types import FrameType
 
-from neuros.installation.progress import Progress
+from neuros.api.environments import are_made, make_environments
 from neuros.launch.environments.pythons import Pythons
-from neuros.launch.guardian import Guardian
-from neuros.launch.run_processes import RUN_ID
-from neuros.launch.wheels import without_mark
 from neuros.messages.needed import Messages
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def make_environments(
+def make_shown_environments(
     pythons: Pythons, signals: list[int], messages: Messages | None = None
 ) -> int:
     """Make what is missing, and say so; returns 0, or the exit code of a signal that ended it.
@@ -35,14 +29,10 @@ def make_environments(
     """
     for notice in pythons.notices:
         print(f"neuros: {notice}", file=sys.stderr)
-    pythons.note_use()
-    if messages is not None:
-        messages.note_use()
-    if pythons.is_made and (messages is None or messages.is_made):
-        return 0
+    heeding = nullcontext() if are_made(pythons, messages) else _signals_interrupt(signals)
     try:
-        with _signals_interrupt(signals):
-            _make(pythons, messages)
+        with heeding:
+            make_environments(pythons, messages, _Output())
     except KeyboardInterrupt:
         return 130 if signals[:1] == [signal.SIGINT] else 143
     return 0
@@ -54,20 +44,7 @@ def build_messages(messages: Messages) -> int:
     Raises:
         EnvironmentFault: with what failed.
     """
-    return make_environments(Pythons({}), [], messages)
-
-
-def _make(pythons: Pythons, messages: Messages | None) -> None:
-    # pip, the compiler, and what they start must not outlive a launcher that is killed.
-    run_id = os.urandom(8).hex()
-    guardian = Guardian.start(run_id)
-    try:
-        progress = Progress(_Output())
-        if messages is not None:
-            messages.make(progress, {**without_mark(os.environ), RUN_ID: run_id})
-        pythons.make(progress, {RUN_ID: run_id})
-    finally:
-        guardian.finish()
+    return make_shown_environments(Pythons({}), [], messages)
 
 
 class _Output:

@@ -38,6 +38,7 @@ from neuros.cli.replay import add_replay
 from neuros.cli.report import add_report
 from neuros.cli.reproduce import add_reproduce
 from neuros.cli.sessions import add_sessions
+from neuros.cli.sweep import add_sweep
 from neuros.cli.verify import add_verify
 from neuros.cli.views import add_view, add_view_options
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
@@ -108,6 +109,7 @@ def parser() -> argparse.ArgumentParser:
     _add_graph(commands)
     add_build(commands)
     add_sessions(commands)
+    add_sweep(commands)
     add_verify(commands)
     add_report(commands)
     add_bag(commands)
@@ -178,6 +180,12 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add_dashboard_options(launch)
     add_view_options(launch)
     add_recording_options(launch)
+    launch.add_argument(
+        "--progress",
+        action=argparse.BooleanOptionalAction,
+        help="show how far the run has come: a line that stays, or, where standard output is no"
+        " terminal, a line every 10 s (default: if it is known when the run ends)",
+    )
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
     launch.set_defaults(command=_launch)

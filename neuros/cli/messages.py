@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from neuros.api.loading import workspaces_of
 from neuros.cli.environments import build_messages
-from neuros.cli.projects import workspaces_of
 from neuros.errors import UsageError
 from neuros.messages.cache import message_cache
 from neuros.messages.needed import Messages

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
-from neuros.errors import ProjectError, UsageError
+from neuros.api import loading
+from neuros.errors import UsageError
 from neuros.messages.needed import Messages
-from neuros.messages.workspace import Workspaces
-from neuros.project.load import load_project
 from neuros.project.model import Project
-
-WORKSPACE = Path(__file__).resolve().parents[2] / "workspace"
-"""ROS packages with messages of the user's own; ``@path`` in project files is relative to it."""
 
 
 def project_path(options: argparse.Namespace) -> Path:
@@ -42,29 +37,9 @@ def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
-    path = project_path(options)
-    workspaces = workspaces_of(path)
-    try:
-        loaded = load_project(
-            path,
-            workspace=WORKSPACE,
-            overrides=options.set,
-            packages=workspaces,
-            namespace=options.namespace,
-            remap=options.remap,
-        )
-    except ProjectError as error:
-        problems = Messages(workspaces, workspaces.own).problems()
-        raise ProjectError([*error.problems, *problems]) from None
+    loaded, messages = loading.load_with_messages(
+        project_path(options), options.set, options.namespace, options.remap
+    )
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    messages = Messages.of_nodes(loaded.project.nodes, workspaces)
-    if problems := messages.problems():
-        raise ProjectError(problems)
     return loaded.project, messages
-
-
-def workspaces_of(project: Path) -> Workspaces:
-    """The workspaces that a project, a file or a folder, sees."""
-    folder = project if project.is_dir() else project.parent
-    return Workspaces(folder.resolve() / "workspace", WORKSPACE, os.environ)

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
+
+from neuros.errors import UsageError
+
+if TYPE_CHECKING:
+    from neuros.observe.recording.selection import Request
 
 
 def add_recording_options(launch: argparse.ArgumentParser) -> None:
@@ -40,9 +46,21 @@ def add_recording_options(launch: argparse.ArgumentParser) -> None:
     )
 
 
-def is_recorded(options: argparse.Namespace) -> bool:
-    """Whether a run is to be recorded."""
-    return bool(options.record or options.record_topics)
+def recording_request(options: argparse.Namespace) -> Request | None:
+    """What the command line has recorded, ``None``: nothing. Raises ``UsageError``."""
+    from neuros.observe.recording.selection import Request
+
+    if options.record or options.record_topics:
+        return Request(
+            everything=options.record,
+            topics=tuple(options.record_topics),
+            exclude=tuple(options.exclude),
+            storage=options.storage,
+        )
+    if options.exclude or options.storage != "mcap":
+        name = "--exclude" if options.exclude else "--storage"
+        raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+    return None
 
 
 def add_recorder(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -37,8 +37,8 @@ def replay_node(options: argparse.Namespace) -> int:
         UsageError: if the run, the node or the recording is not there.
         EnvironmentFault: if the node's Python cannot be made.
     """
+    from neuros.api.workspace import WORKSPACE
     from neuros.cli.messages import require_messages
-    from neuros.cli.projects import WORKSPACE
     from neuros.messages.cache import message_cache
     from neuros.observe.replayed import RecordedNode, recorded_node
     from neuros.replay.containers import as_on_this_machine, ran_in_container
@@ -70,14 +70,14 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
     Raises:
         EnvironmentFault: if it cannot be made.
     """
-    from neuros.cli.environments import make_environments
+    from neuros.cli.environments import make_shown_environments
     from neuros.launch.environments.pythons import Pythons
     from neuros.replay.containers import not_here, ran_in_container
 
     own = [] if run.record.get("backend") == "in-process" else [file.node]
     try:
         pythons = Pythons.choose(own, file.folders.project, dict(os.environ))
-        ended = make_environments(pythons, [])
+        ended = make_shown_environments(pythons, [])
     except EnvironmentFault as fault:
         raise not_here(run, file.node.name, fault) if ran_in_container(run) else fault from fault
     return pythons.paths.get(file.node.name, Path(sys.executable)), ended
@@ -174,7 +174,7 @@ def _folder(output: str | None) -> Path:
     """What is the run folder for the replayed node."""
     if output is None:
         return Path(tempfile.mkdtemp(prefix="neuros-replay-"))
-    from neuros.cli.run_folder import make_run_folder
+    from neuros.api.run_folder import make_run_folder
 
     return make_run_folder(output, "replay")
 

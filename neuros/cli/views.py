@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -15,7 +14,8 @@ from neuros.cli.dashboard import dashboard_of, start_dashboard
 from neuros.errors import EnvironmentFault
 
 if TYPE_CHECKING:
-    from neuros.cli.plan import Plan
+    from neuros.api.execution import Shown
+    from neuros.api.plan import Plan
     from neuros.launch.guardian import Guardian
     from neuros.launch.rerun import RerunProcesses
     from neuros.launch.tools import Tool
@@ -51,16 +51,6 @@ class Closable(Protocol):
     """Something that shows a run, and is closed with it."""
 
     def finish(self) -> None: ...
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The run that is shown: its id, its folder, the environment of its nodes, and its logs."""
-
-    run_id: str
-    folder: Path
-    environment: Mapping[str, str]
-    logs: Mapping[str, Path]
 
 
 class Views:

@@ -13,8 +13,10 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
+from neuros.control import connect
 from neuros.launch.run_processes import RunProcesses, environ_of, started_at
 
 _VARIABLE = "NEUROS_GUARDED_RUN"
@@ -58,10 +60,21 @@ class Session:
         return {node: up if node in there else "not running" for node in self.nodes}
 
     def interrupt(self) -> None:
-        """Ask its launcher to end it, as Ctrl+C does."""
-        if self.is_led:
+        """Ask its launcher to end it, as Ctrl+C does.
+
+        Over its control socket: where a Python program has started it, a signal would reach that
+        program, which may do something else meanwhile. A signal where that socket is not there yet.
+        """
+        if not self.is_led:
+            return
+        try:
+            lines = connect(Path(self.folder))
+        except OSError:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
+        else:
+            lines.send("signal")
+            lines.close()
 
 
 def guardian_environment(session: Session) -> dict[str, str]:

@@ -7,6 +7,7 @@ for a node or for a reader of its output.
 
 from __future__ import annotations
 
+import signal
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -40,6 +41,8 @@ class Supervisor:
         run_folder: the control socket is put there.
         output: for log records; its ``poll`` shows what nodes have logged.
         signals: numbers of the signals that have arrived, appended to by a signal handler.
+        wishes: reasons for which this program wants the run to end, drained; appended to by any
+            thread.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
         sides: who starts the other nodes of the project, where not all are started here.
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
@@ -62,6 +65,7 @@ class Supervisor:
         output: Output,
         signals: list[int],
         *,
+        wishes: Sequence[str] = (),
         duration_s: float | None = None,
         sides: Sides | None = None,
         waker: socket.socket | None = None,
@@ -70,6 +74,7 @@ class Supervisor:
         self._launcher = launcher
         self._environment = environment
         self._output = output = Overheard(output, lambda *a, **k: self.onlookers.tell(*a, **k))
+        self._wishes = wishes
         self._duration_s = duration_s
         self._sides = sides or Sides("", (), files)
         names = [file.node.name for file in files]
@@ -111,6 +116,7 @@ class Supervisor:
             "explanation": self._on_explanation,
             "heard": self._on_heard,
             **self.onlookers.handlers,
+            "signal": lambda *_: signals.append(signal.SIGINT),
         }
 
     def run(self) -> Outcome:
@@ -219,6 +225,9 @@ class Supervisor:
             self._look_at_run(now_s)
 
     def _look_at_run(self, now_s: float) -> None:
+        if self._wishes:
+            self._ending.drain(self._wishes[0], STOP_S)
+            return
         if self.pause.is_on:
             self._watch.begin_anew(now_s)
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -59,7 +60,10 @@ def run_record(
             _connection(c, ledgers, running_s, run_folder, _cut_off(ended))
             for c in _connections(files)
         ],
-        "nodes": {file.node.name: _node(file.node.name, ended) for file in files},
+        "nodes": {
+            name: {**_node(name, ended), "results": _results(run_folder / name)}
+            for name in (file.node.name for file in files)
+        },
         "expanded_project": project_to_json(project),
     }
 
@@ -172,6 +176,15 @@ def _node(name: str, ended: Ended) -> dict[str, Any]:
         "sim_time": report["sim_time"],
         "report": "final" if is_final else f"last report {age_s:.1f} s before the end",
     }
+
+
+def _results(node_folder: Path) -> dict[str, Any]:
+    """What the node's plugin has found out."""
+    try:
+        results = json.loads((node_folder / "results.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return results if isinstance(results, dict) else {}
 
 
 def _shares(node: Mapping[str, Any]) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from neuros.errors import ModelError, NodeError
 from neuros.ports import Logger
 from neuros.project.model import Node, NodeFile
+from neuros.runtime.results import Results
 
 _POLL_S = 0.05
 
@@ -22,6 +23,7 @@ class Host(Protocol):
     def make_packet(self, type_name: str) -> Any: ...
     def shutdown(self, reason: str, drain_s: float) -> None: ...
     def own_simulated_time(self, read_s: Callable[[], float]) -> None: ...
+    def expect_end(self, sim_s: float) -> None: ...
     def on_close(self, callback: Callable[[], None]) -> None: ...
     def fail_from_thread(self, error: BaseException) -> None: ...
     def offer_from_thread(
@@ -38,6 +40,7 @@ class NodeHandle:
         self._host = host
         self._types = {port.name: port.type for port in file.node.outputs}
         self._user_data: Any = None
+        self._results = Results(self.run_dir)
 
     @property
     def name(self) -> str:
@@ -86,6 +89,24 @@ class NodeHandle:
         """What was kept last, ``None`` before."""
         return self._user_data
 
+    def set_result(self, name: str, value: Any) -> None:
+        """Note a result of the run: it is in ``run.json``, and a column of a sweep's table.
+
+        A later one of the same name takes its place. Each is written to ``results.json`` in
+        :attr:`run_dir` at once: for figures at the end, or now and then, not for every packet.
+
+        Args:
+            value: what JSON knows, or NumPy's numbers and arrays. A float that is no finite number
+                becomes ``None``.
+
+        Raises:
+            NodeError: for anything else.
+        """
+        try:
+            self._results.set(name, value)
+        except (TypeError, ValueError) as error:
+            raise NodeError(f"set_result: '{name}' cannot be kept: {error}") from error
+
     def shutdown(self, reason: str = "", drain_s: float = 5.0) -> None:
         """End the project: drained within ``drain_s`` seconds, with exit code 0."""
         self._host.shutdown(str(reason), float(drain_s))
@@ -117,6 +138,13 @@ class NodeHandle:
                     )
                 return place
         raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
+
+    def expect_end(self, sim_s: float) -> None:
+        """Tell after how many seconds of simulated time this plugin will end the project.
+
+        It is for those who watch the run; the end itself is :meth:`shutdown`.
+        """
+        self._host.expect_end(float(sim_s))
 
     def _built(self, wanted: str) -> list[Path]:
         """Where ``install/PACKAGE/path`` may be: in the folder of a built message package."""

@@ -58,6 +58,10 @@ class NodeHost:
             self.engine.stop_hooks()
         self._ask_for_end(reason=reason, drain_s=drain_s)
 
+    def expect_end(self, sim_s: float) -> None:
+        """It will end at this simulated time."""
+        self._time.expected_end_s = sim_s
+
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Take simulated time from a simulator, rather than from a clock that it publishes."""
         self._time.own(read_s)

@@ -21,6 +21,7 @@ class SimulatedTime:
 
     Attributes:
         is_watched: whether the node owns time, so that :meth:`look` is wanted after each hook.
+        expected_end_s: when the plugin says that it will end the project, ``None``: not known.
         clock_outputs: the outputs whose packets :meth:`hear` wants.
     """
 
@@ -33,6 +34,7 @@ class SimulatedTime:
     ) -> None:
         self.is_watched = node.owns_time
         self.clock_outputs = {port.name for port in node.outputs if port.type == CLOCK_TYPE}
+        self.expected_end_s: float | None = None
         self._duration_s = duration_s if node.owns_time else None
         self._clock = clock
         self._on_over = on_over
@@ -71,4 +73,8 @@ class SimulatedTime:
         time_s = self.now_s
         if self.is_watched and time_s is not None:
             self._timeline.note(time_s, now_ns / 1e9)
-        return {"sim_time": time_s, "timeline": self._timeline.take()}
+        return {
+            "sim_time": time_s,
+            "expected_end_s": self.expected_end_s,
+            "timeline": self._timeline.take(),
+        }

@@ -12,15 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from neuros.cli.back_end import BackEnd
+from neuros.api.back_end import BackEnd
+from neuros.api.plan import Plan, check_machine
+from neuros.api.request import Duration, parse_duration
+from neuros.api.run_folder import make_run_folder
 from neuros.cli.main import main
-from neuros.cli.plan import (
-    Duration,
-    Plan,
-    check_machine,
-    parse_duration,
-)
-from neuros.cli.run_folder import make_run_folder
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
 from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS
@@ -160,7 +156,7 @@ def test_a_project_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None
 def test_a_machine_without_rclpy_is_one_sentence(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("neuros.cli.plan.find_spec", lambda name: None)
+    monkeypatch.setattr("neuros.api.plan.find_spec", lambda name: None)
     assert main(["launch", "."]) == 4
     output = capsys.readouterr()
     assert output.err.startswith("neuros: rclpy, the Python library of ROS 2, is not installed")
@@ -197,7 +193,7 @@ def test_a_dry_run_shows_the_cores_and_no_placement_leaves_them_to_the_kernel(
         assert main(["launch", ".", "--dry-run", "-d", "1", *options]) == 0
         return [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()[1:]]
 
-    monkeypatch.setattr("neuros.cli.plan.usable_cores", lambda: frozenset({2, 3, 5, 7}))
+    monkeypatch.setattr("neuros.api.plan.usable_cores", lambda: frozenset({2, 3, 5, 7}))
     affinity = ("--set", "nodes.b.affinity=[3]")
     assert shown() == ["process a on cores 2, 3", "process b on cores 5, 7"]
     assert shown(*affinity) == ["process a on cores 2, 5, 7", "process b on core 3"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.cli.network import chosen_network
+from neuros.api.network import chosen_network
 from neuros.errors import EnvironmentFault, UsageError
 
 RANGE, PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"

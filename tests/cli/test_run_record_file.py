@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.cli.run_folder import write_record
+from neuros.api.run_folder import write_record
 
 
 @contextmanager

@@ -44,7 +44,7 @@ def test_without_the_option_nothing_is_written(tmp_path: Path) -> None:
 def test_a_missing_package_is_said_before_anything_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from neuros.cli import observation
+    from neuros.api import observation
     from neuros.cli.main import main
 
     monkeypatch.setattr(observation, "find_spec", lambda name: None)

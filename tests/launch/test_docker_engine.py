@@ -20,7 +20,7 @@ from docker.context import ContextAPI
 from docker.errors import APIError
 from urllib3.exceptions import ProtocolError
 
-from neuros.cli.back_end import _without_limits
+from neuros.api.back_end import _without_limits
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker import engine as engine_module
 from neuros.launch.docker.engine import Abilities, connect, engine_faults

@@ -7,7 +7,7 @@ from neuros.hooks import Optional, neuros_function, neuros_initialise
 
 @neuros_initialise()
 def start(node):
-    start_turning(node)
+    node.expect_end(start_turning(node).duration_s)
 
 
 # No input is required, so this is the node's main loop: it runs again and again, and waits while

@@ -13,7 +13,9 @@ from neuros.hooks import neuros_initialise, neuros_tick
 @neuros_initialise()
 def start(node):
     factor = os.environ.get("REAL_TIME_FACTOR", "1.0")
-    start_turning(node).sim.run_asynchronous(None if factor == "max" else float(factor))
+    robot = start_turning(node)
+    node.expect_end(robot.duration_s)
+    robot.sim.run_asynchronous(None if factor == "max" else float(factor))
 
 
 @neuros_tick(seconds=0.01)

@@ -9,7 +9,7 @@ from neuros.hooks import Optional, neuros_initialise, neuros_tick
 
 @neuros_initialise()
 def start(node):
-    start_turning(node)
+    node.expect_end(start_turning(node).duration_s)
 
 
 @neuros_tick(

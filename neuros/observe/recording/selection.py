@@ -18,7 +18,7 @@ CLOCK = "/clock"
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for.
+    """What is to be recorded.
 
     Attributes:
         everything: all that the project's nodes send and hear, and ``/clock``.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from neuros.launch.docker.launcher import Containers
 
 BACK_ENDS = ("auto", "docker", "process", "in-process")
-BACK_END_VARIABLE = "NEUROS_BACKEND"
+_VARIABLE = "NEUROS_BACKEND"
 _COMMAND = (sys.executable, "-m", "neuros.cli", "node")
 
 
@@ -74,6 +74,11 @@ class BackEnd:
         return ProcessLauncher([*_COMMAND, *options], on_started, placement, pythons)
 
 
+def default_back_end(environ: Mapping[str, str]) -> str:
+    """What is used where nobody names one."""
+    return environ.get(_VARIABLE) or "auto"
+
+
 def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> BackEnd:
     """The back end for ``--backend``.
 
@@ -81,8 +86,8 @@ def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> Ba
         EnvironmentFault: if containers are wanted, and the engine or an image is not there.
     """
     nodes = [node for node in project.nodes if node.name in names]
-    if wanted not in BACK_ENDS:  # argparse lets a default pass
-        raise UsageError(f"{BACK_END_VARIABLE}={wanted}: choose one of {', '.join(BACK_ENDS)}")
+    if wanted not in BACK_ENDS:
+        raise UsageError(f"back end {wanted!r}: choose one of {', '.join(BACK_ENDS)}")
     if wanted in ("docker", "auto"):
         try:
             containers = _containers(project, nodes)

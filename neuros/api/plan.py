@@ -1,39 +1,29 @@
-"""What is to be run: the choices of the command line, put together and checked before a start."""
+"""What is to be run: project and request, put together and checked before a start."""
 
 from __future__ import annotations
 
-import argparse
 import os
-import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
-from neuros.cli.back_end import BackEnd, choose_back_end
-from neuros.cli.network import THIS_MACHINE, Network, chosen_network
-from neuros.cli.projects import load_with_messages
-from neuros.cli.recording_options import is_recorded
+from neuros.api.back_end import BackEnd, choose_back_end
+from neuros.api.network import THIS_MACHINE, Network, chosen_network
+from neuros.api.request import Duration, Request
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
 from neuros.launch.guardian import Guardian
 from neuros.launch.placement import Cores, place
 from neuros.messages.needed import Messages
+from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
 from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS, RANGE_VARIABLE
-
-
-@dataclass(frozen=True)
-class Duration:
-    """What ``--duration`` says: wall seconds, or simulated seconds."""
-
-    wall_s: float | None = None
-    sim_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +38,7 @@ class Plan:
     is_placed: bool = True
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
     has_digests: bool = False
-    is_recorded: bool = False
+    recording: RecordingRequest | None = None
     network: Network = THIS_MACHINE
     messages: Messages | None = None
 
@@ -106,25 +96,28 @@ class Plan:
             options.append("--debug")
         if self.has_digests and self.backend == "in-process":  # elsewhere they are always kept
             options.append("--digests")
-        if self.is_recorded:
+        if self.recording is not None:
             options.append("--record")
         return self.back_end.launcher(
             options, self.placement(domain_id), self.pythons.paths, guardian
         )
 
 
-def make_plan(options: argparse.Namespace) -> Plan:
-    """Put together what the command line asks for.
+def make_plan(
+    project: Project, messages: Messages, request: Request, *, is_tried: bool = True
+) -> Plan:
+    """Put together what is asked for.
+
+    Args:
+        messages: the message packages of the project.
+        is_tried: whether it is to run on this machine, or only to be described.
 
     Raises:
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
     """
-    duration = parse_duration(options.duration)
-    project, messages = load_with_messages(options)
-    network = chosen_network(options.network, options.peers)
-    names = _chosen_names(project, options.node, options.backend)
-    back_end = choose_back_end(options.backend, project, names)
-    is_placed = not options.no_placement
+    network = chosen_network(request.network, request.peers)
+    names = _chosen_names(project, request.nodes, request.backend)
+    back_end = choose_back_end(request.backend, project, names)
     nodes = [project.node(name) for name in names]
     is_process = back_end.name == "process"
     pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
@@ -132,12 +125,12 @@ def make_plan(options: argparse.Namespace) -> Plan:
         project,
         names,
         back_end,
-        duration,
-        options.verbose,
-        is_placed,
+        request.duration,
+        request.is_verbose,
+        request.is_placed,
         pythons,
-        has_digests=options.digests,
-        is_recorded=is_recorded(options),
+        has_digests=request.has_digests,
+        recording=request.recording,
         network=network,
         messages=messages,
     )
@@ -149,24 +142,9 @@ def make_plan(options: argparse.Namespace) -> Plan:
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
-    if not options.dry_run:
+    if is_tried:
         check_machine(plan, os.environ)
     return plan
-
-
-def parse_duration(text: str | None) -> Duration:
-    """``30``, ``0.5``, or ``30sim``.
-
-    Raises:
-        UsageError: for anything else.
-    """
-    if text is None:
-        return Duration()
-    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(sim)?", text.strip())
-    if match is None or float(match[1]) <= 0:
-        raise UsageError(f"--duration {text}: give seconds, as 30, or 30sim for simulated time")
-    seconds = float(match[1])
-    return Duration(sim_s=seconds) if match[2] else Duration(wall_s=seconds)
 
 
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:

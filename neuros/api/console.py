@@ -3,41 +3,49 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TextIO
 
+from neuros.api.progress_line import ProgressLine
 from neuros.launch.console import LAYOUT, LogTail, format_record, wants_colours
+from neuros.launch.progress import Progress
 from neuros.launch.screen import Screen
 
 
 class Console:
-    """Standard output of the launcher; nothing here waits for a reader but :meth:`finish`.
+    """Where a run is shown; nothing here waits for a reader but :meth:`finish`.
 
     Args:
+        stream: where to write, ``None``: nowhere.
         logs: the log files to show, by name.
         is_enough: whether the user wants no more of it (asked while it waits).
         translate: from what nodes say to what the user knows (names of paths).
+        shows_progress: whether to show how far the run has come; ``None``: if its end is known.
     """
 
     def __init__(
         self,
+        stream: TextIO | None,
         logs: Mapping[str, Path],
         is_enough: Callable[[], bool],
         translate: Callable[[str], str] = str,
+        *,
+        shows_progress: bool | None = None,
     ) -> None:
-        self._screen = Screen(sys.stdout)
+        self._screen = Screen(stream)
         self._translate = translate
         self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
-        colours = sys.stdout is not None and wants_colours(sys.stdout, os.environ)
-        self._tail = LogTail(logs, self.write, colours)
+        colours = stream is not None and wants_colours(stream, os.environ)
+        self._tail = LogTail({} if stream is None else logs, self.write, colours)
+        self._line = ProgressLine(stream, shows_progress, lambda text: self.log("INFO", text))
         self._is_enough = is_enough
         self._is_finishing = False
         self._patience_s: float | None = None
 
     def write(self, text: str) -> None:
         """Write as it is, but for the names of paths."""
-        self._screen.write(self._translate(text))
+        self._screen.write(self._line.around(self._translate(text)))
         if self._is_finishing:
             self._screen.finish(self._is_enough, self._patience_s)
 
@@ -46,13 +54,21 @@ class Console:
         self.poll()
         self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
 
+    def follow(self, progress: Progress) -> None:
+        """Show how far the run has come."""
+        self._line.follow(progress)
+
     def poll(self) -> object:
         """Show what nodes have logged since; it stays in their files while the reader is behind."""
         self._screen.flush()
-        return None if self._screen.is_behind or self._is_finishing else self._tail.poll()
+        if self._screen.is_behind or self._is_finishing:
+            return None
+        self._screen.write(self._line.update())
+        return self._tail.poll()
 
     def finish(self, patience_s: float | None) -> None:
         """Show the rest; from now on wait for the reader, or lose ``patience_s`` seconds."""
+        self._screen.write(self._line.end())
         self._is_finishing = True
         self._patience_s = patience_s
         self.write("")

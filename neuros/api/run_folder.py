@@ -19,8 +19,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from neuros.cli.plan import Plan
-from neuros.cli.projects import WORKSPACE
+from neuros.api.plan import Plan
+from neuros.api.workspace import WORKSPACE
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile
 from neuros.project.split import node_file_to_json, project_to_json

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import platform
@@ -15,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from neuros import __version__
-from neuros.cli.plan import Plan
+from neuros.api.plan import Plan
 from neuros.errors import UsageError
 from neuros.launch.guardian import Guardian
 from neuros.launch.recording import Recorded, RecorderProcess
 from neuros.observe.recording.plan import BAG_NAME, RecordingPlan
-from neuros.observe.recording.selection import Request, plan_recording
+from neuros.observe.recording.selection import plan_recording
 from neuros.project.model import Project
 from neuros.project.split import project_to_json
 
@@ -89,25 +88,24 @@ class Recording:
         return topics
 
 
-def plan_of(
-    options: argparse.Namespace, plan: Plan, environ: Mapping[str, str]
+def recording_of(
+    plan: Plan, domain_id: int | None, environ: Mapping[str, str]
 ) -> RecordingPlan | None:
-    """What the command line has recorded of a run, ``None``: nothing. Raises ``UsageError``."""
-    if not plan.is_recorded:
-        if options.exclude or options.storage != "mcap":
-            name = "--exclude" if options.exclude else "--storage"
-            raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+    """What is recorded of a run, ``None``: nothing.
+
+    Args:
+        domain_id: the domain that was asked for.
+
+    Raises:
+        UsageError: if something is to be recorded that does not exist.
+    """
+    if plan.recording is None:
         return None
-    is_open = plan.needs_known_domain or options.domain_id is not None
+    is_open = plan.needs_known_domain or domain_id is not None
     return plan_recording(
         plan.project,
         plan.names,
-        Request(
-            everything=options.record,
-            topics=tuple(options.record_topics),
-            exclude=tuple(options.exclude),
-            storage=options.storage,
-        ),
+        plan.recording,
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
         custom=_custom_data(plan.project),
     )

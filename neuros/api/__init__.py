@@ -1,0 +1,1 @@
+"""Runs of projects, for Python programs; the command line is one of them."""

@@ -1,0 +1,304 @@
+"""One run of a plan, from its first process to ``run.json``."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from neuros.api.console import Console
+from neuros.api.observation import Observation, check_observation
+from neuros.api.plan import Plan
+from neuros.api.recording import Recording, log_of, recording_of, summary
+from neuros.api.request import Request
+from neuros.api.run_folder import make_run_folder, write_node_files, write_record
+from neuros.control import SOCKET_NAME
+from neuros.errors import EnvironmentFault
+from neuros.launch.domain import DomainLock, choose_domain
+from neuros.launch.guardian import Guardian
+from neuros.launch.host_command import with_messages
+from neuros.launch.outcome import Outcome
+from neuros.launch.progress import Progress
+from neuros.launch.sessions import Session, guardian_environment, this_process
+from neuros.launch.sides import Sides
+from neuros.launch.supervisor import Supervisor
+from neuros.observe.budgets import broken_budgets
+from neuros.observe.recording.plan import RecordingPlan
+from neuros.observe.report import run_record, run_table
+from neuros.runtime.side import ELSEWHERE_VARIABLE
+
+EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
+_ENDED_BY_SIGNAL = (130, 143)
+_PATIENCE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The run that is shown: its id, its folder, the environment of its nodes, and its logs."""
+
+    run_id: str
+    folder: Path
+    environment: Mapping[str, str]
+    logs: Mapping[str, Path]
+
+
+class Views(Protocol):
+    """Windows and pages that show a run, from when there is a control socket to its end."""
+
+    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None: ...
+    def finish(self) -> None: ...
+
+
+class Execution:
+    """One run of a plan.
+
+    Args:
+        request: what it was planned from.
+        stream: where to show what goes on, ``None``: nowhere.
+        signals: numbers of the signals that have arrived; whoever notes one appends it.
+        waker: bytes arrive here whenever a signal does, or a wish.
+        wishes: reasons for which this program wants the run to end, drained.
+        views: what it is to be looked at with.
+
+    Raises:
+        UsageError: if there can be no such run folder, domain or recording.
+        EnvironmentFault: if no domain is free, or what it is to be watched with is missing.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        request: Request,
+        stream: TextIO | None,
+        signals: list[int],
+        waker: socket.socket,
+        wishes: Sequence[str] = (),
+        views: Views | None = None,
+    ) -> None:
+        self._plan = plan
+        self._monitors_load = request.monitors_load
+        self._signals = signals
+        self._waker = waker
+        self._wishes = wishes
+        self._views = views
+        self._run_id = os.urandom(8).hex()
+        check_observation(monitors_load=request.monitors_load)
+        self._recording_plan = recording_of(plan, request.domain_id, os.environ)
+        self._domain = run_domain(plan, request, self._recording_plan)
+        try:
+            self.folder = make_run_folder(request.output, plan.project.name)
+            self._files = write_node_files(plan, self.folder)
+        except BaseException:
+            self._domain.release()
+            raise
+        self._logs = self._log_files()
+        self._console = Console(
+            stream,
+            self._logs,
+            lambda: bool(signals),
+            self._as_here,
+            shows_progress=request.shows_progress,
+        )
+
+    def _log_files(self) -> dict[str, Path]:
+        """The log files, by what is to be shown of their origin."""
+        names = [file.node.name for file in self._files]
+        logs = {name: self.folder / name / "node.log" for name in names}
+        if self._plan.backend == "in-process":
+            logs["host"] = self.folder / "host.log"
+        if self._recording_plan is not None:
+            logs["recorder"] = log_of(self.folder)
+        return logs
+
+    def run(self) -> dict[str, Any]:
+        """Start, supervise, clean up, report; returns the content of ``run.json``.
+
+        Raises:
+            EnvironmentFault: if it could not be started.
+        """
+        try:
+            return self._run()
+        finally:
+            self._domain.release()
+
+    def _run(self) -> dict[str, Any]:
+        started, started_s = time.time(), time.monotonic()
+        guardian = Guardian.start(
+            self._run_id, self._domain, guardian_environment(self._session(started))
+        )
+        guardian.remove_later(self.folder / SOCKET_NAME)
+        observation = self._observation()
+        outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
+        recording = None
+        try:
+            self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
+            for severity, notice in self._plan.back_end.notices:
+                self._console.log(severity, notice)
+            recording = self._recording(guardian)
+            supervisor = self._supervisor(guardian)
+            outcome = supervisor.outcome
+            duration = self._plan.duration
+            self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
+            if self._views is not None:
+                shown = Shown(self._run_id, self.folder, self._beside(), self._logs)
+                self._views.start(shown, guardian, self._console.log)
+            supervisor.run()
+        except BaseException as error:  # for run.json; the command line knows what to say
+            outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
+            outcome.reason = f"not started: {error}"
+            raise
+        finally:
+            recorded = None if recording is None else recording.finish(self._signals)
+            observed, faults = observation.finish()
+            for fault in (*outcome.faults, *faults):
+                outcome.fail(fault, EXIT_ENVIRONMENT)
+            if self._views is not None:
+                self._views.finish()
+            guardian.finish()
+            # Whoever has ended the run is not made to wait for a reader that does not read.
+            self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
+            outcome.reason = self._as_here(outcome.reason)
+            wall_s = outcome.ended_s - (outcome.started_s or started_s)
+            record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
+            record |= {
+                "backend": self._plan.backend,
+                **self._plan.back_end.record(),
+                "domain_id": self._domain.id,
+                "namespace": self._plan.project.names.namespace,
+                "started": started,
+                **observed,
+            }
+            if recording is not None and recorded is not None:
+                for problem in recording.report(recorded, record):
+                    outcome.fail(problem, EXIT_ENVIRONMENT)
+            self._judge(record, outcome)
+            self._save(record, outcome)
+        self._console.write("\n" + run_table(record) + "\n")
+        for reason in outcome.failures:
+            if reason != outcome.reason:
+                self._console.log("ERROR", reason)
+        if "recording" in record:
+            self._console.log("INFO", summary(record["recording"]))
+        is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
+        self._console.log("INFO" if is_good else "ERROR", outcome.reason)
+        return record
+
+    def _recording(self, guardian: Guardian) -> Recording | None:
+        if self._recording_plan is None:
+            return None
+        return Recording(self._recording_plan, self._run_id, self.folder, self._beside(), guardian)
+
+    def _beside(self) -> dict[str, str]:
+        """What programs beside the nodes get, which know the same messages."""
+        path = {key: os.environ[key] for key in ("PYTHONPATH",) if key in os.environ}
+        messages = self._plan.messages
+        return with_messages({**path, **self._environment()}, messages.paths if messages else ())
+
+    def _judge(self, record: dict[str, Any], outcome: Outcome) -> None:
+        """Hold the run to its budgets."""
+        broken = broken_budgets(
+            record, self._plan.project.budgets, is_partial=self._plan.is_partial
+        )
+        for text in broken:
+            outcome.fail(f"budget broken: {text}", EXIT_BUDGET)
+        record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
+        record["broken_budgets"] = broken
+
+    def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
+        """Write ``run.json``; where there is no room for it, among the temporary files."""
+        try:
+            write_record(record, self.folder)
+        except OSError as error:
+            spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
+            problem = f"{self.folder / 'run.json'} cannot be written ({error.strerror})"
+            outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
+            record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
+            with contextlib.suppress(OSError):
+                spare.mkdir()
+                write_record(record, spare)
+
+    def _observation(self) -> Observation:
+        names = [file.node.name for file in self._files]
+        is_one_process = self._plan.backend == "in-process"
+        return Observation(
+            self._run_id,
+            self.folder,
+            self._plan.project,
+            names,
+            monitors_load=self._monitors_load,
+            is_one_process=is_one_process,
+        )
+
+    def _as_here(self, text: str) -> str:
+        """With the names that paths have on this machine."""
+        return self._plan.back_end.as_here(text, self._files[0].folders)
+
+    def _session(self, started: float) -> Session:
+        """What `neuros ps` shows of it."""
+        return Session(
+            self._run_id,
+            self._plan.project.name,
+            self._plan.backend,
+            tuple(file.node.name for file in self._files),
+            str(self.folder),
+            started,
+            this_process(),
+            self._plan.project.names.namespace,
+        )
+
+    def _supervisor(self, guardian: Guardian) -> Supervisor:
+        return Supervisor(
+            self._files,
+            self._plan.launcher(self._domain.id, guardian),
+            self._environment(),
+            self.folder,
+            self._console,
+            self._signals,
+            wishes=self._wishes,
+            duration_s=self._plan.duration.wall_s,
+            sides=Sides(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
+            waker=self._waker,
+        )
+
+    def _where_to_start(self) -> str:
+        """How nodes elsewhere join this run."""
+        namespace = self._plan.project.names.namespace
+        options = [f"-d {self._domain.id}"]
+        options += [f"--namespace {namespace}"] if namespace else []
+        options += ["--network"] if self._plan.network.is_wide else []
+        return f" (started by -n, with the same nodes and connections, {' and '.join(options)})"
+
+    def _environment(self) -> dict[str, str]:
+        """What every node gets, whatever the shell that NeuROS was started from has sourced."""
+        return {
+            **self._plan.network.environment(os.environ),
+            ELSEWHERE_VARIABLE: ",".join(self._plan.elsewhere),
+            **_without_notebook(os.environ),
+            "NEUROS_RUN_ID": self._run_id,
+            "ROS_DOMAIN_ID": str(self._domain.id),
+            "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # the only one that the wheels bring
+            "ROS_LOG_DIR": str(self.folder),
+        }
+
+
+def _without_notebook(environ: Mapping[str, str]) -> dict[str, str]:
+    """What a notebook has Matplotlib draw with is in the notebook, and in no node."""
+    is_inline = environ.get("MPLBACKEND", "").startswith("module://")
+    return {"MPLBACKEND": ""} if is_inline else {}
+
+
+def run_domain(plan: Plan, request: Request, recording: RecordingPlan | None) -> DomainLock:
+    """The ROS domain of a run; released by closing it.
+
+    Raises:
+        UsageError: if the one that is asked for is none.
+        EnvironmentFault: if none is free.
+    """
+    is_known = plan.needs_known_domain or bool(recording and recording.wanted)
+    return choose_domain(request.domain_id, os.environ, is_known)

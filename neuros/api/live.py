@@ -1,0 +1,175 @@
+"""A run that goes on in the background of a Python program."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import signal
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+from neuros.api.execution import Execution
+from neuros.api.plan import Plan
+from neuros.api.request import Request
+from neuros.api.run import Run
+
+_AT_EXIT_S = 20.0
+
+
+class LiveRun:
+    """A run in a thread of its own; :meth:`wait` gives what comes out.
+
+    As a context manager it is stopped at the end of the block, and waited for::
+
+        with project.start(backend="process") as run:
+            ...
+        print(run.wait())
+
+    It installs no signal handlers: where a program or a notebook is interrupted while it waits,
+    the run is ended as by Ctrl+C, and then ``KeyboardInterrupt`` goes on. A program that ends
+    ends its runs. Several may go on at once.
+
+    Raises:
+        UsageError, EnvironmentFault: if it cannot begin.
+    """
+
+    def __init__(self, plan: Plan, request: Request, *, is_shown: bool) -> None:
+        self._signals: list[int] = []
+        self._wishes: list[str] = []
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._done = threading.Event()
+        self._error: BaseException | None = None
+        try:
+            self._execution = Execution(
+                plan,
+                request,
+                _shown_on() if is_shown else None,
+                self._signals,
+                self._reader,
+                self._wishes,
+            )
+        except BaseException:
+            self._hang_up()
+            raise
+        atexit.register(self._end_with_program)
+        threading.Thread(target=self._execute, name="neuros-run", daemon=True).start()
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self._execution.folder
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has not ended yet."""
+        return not self._done.is_set()
+
+    def stop(self, reason: str = "stopped by the program") -> None:
+        """Ask for its end, as if ``--duration`` were over: drained, with exit code 0."""
+        self._wishes.append(reason)
+        self._wake()
+
+    def interrupt(self) -> None:
+        """Do what Ctrl+C does: end it now, with exit code 130; a second time kills at once."""
+        self._signals.append(signal.SIGINT)
+        self._wake()
+
+    def wait(self, timeout_s: float | None = None) -> Run:
+        """Wait for its end.
+
+        Raises:
+            TimeoutError: if it has not ended after ``timeout_s``; it goes on.
+            EnvironmentFault: if it could not be started.
+            KeyboardInterrupt: if that came while waiting; the run has then been ended in order.
+        """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        interrupted: KeyboardInterrupt | None = None
+        while True:
+            try:
+                left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
+                if not self._done.wait(left_s):
+                    raise TimeoutError(f"not ended after {timeout_s:g} s: {self.folder}")
+                break
+            except KeyboardInterrupt as error:
+                interrupted, deadline_s = error, None
+                self.interrupt()
+        if interrupted is not None:
+            raise KeyboardInterrupt(f"the run was ended; its folder: {self.folder}") from None
+        if self._error is not None:
+            raise self._error
+        return Run(self.folder)
+
+    def join(self) -> None:
+        """Wait for its end, and no more."""
+        self._done.wait()
+
+    def __enter__(self) -> LiveRun:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.stop()
+        else:
+            self.interrupt()
+        self.wait()
+
+    def __repr__(self) -> str:
+        return f"<{'running' if self.is_running else 'ended'} run in {self.folder}>"
+
+    def _execute(self) -> None:
+        try:
+            self._execution.run()
+        except BaseException as error:  # for whoever waits
+            self._error = error
+        finally:
+            self._hang_up()
+            atexit.unregister(self._end_with_program)
+            self._done.set()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # it has ended, or is awake in any case
+            self._writer.send(b"\0")
+
+    def _hang_up(self) -> None:
+        self._reader.close()
+        self._writer.close()
+
+    def _end_with_program(self) -> None:
+        self.interrupt()
+        self._done.wait(_AT_EXIT_S)
+
+
+class _Through:
+    """Writes to whatever ``sys.stdout`` is: a cell of a notebook, or what pytest captures."""
+
+    encoding = "utf-8"
+
+    def write(self, text: str) -> int:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+        return len(text)
+
+    def isatty(self) -> bool:
+        return False
+
+    def flush(self) -> None:
+        sys.stdout.flush()
+
+    def fileno(self) -> int:
+        raise OSError("no file of its own")
+
+
+def _shown_on() -> TextIO | Any:
+    """Standard output, as a file only where it is the program's own."""
+    return sys.stdout if sys.stdout is sys.__stdout__ else _Through()

@@ -1,0 +1,174 @@
+"""A run that is over, for Python programs."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuros.api.frames import frame_of
+from neuros.errors import RunError
+from neuros.observe.past_run import open_run
+from neuros.observe.report import run_table
+
+if TYPE_CHECKING:
+    from neuros.observe.bag.opened import Bag
+
+
+class Run:
+    """What a run has left behind: how it ended, its figures, its packets, its logs.
+
+    Attributes:
+        folder: the run folder.
+        record: the content of ``run.json``, which has all that is here and more.
+
+    Args:
+        folder: of a run that has ended, whoever started it.
+
+    Raises:
+        UsageError: if it is none, or another version of NeuROS wrote it.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder).absolute()
+        self.record: Mapping[str, Any] = open_run(self.folder).record
+
+    @property
+    def project(self) -> str:
+        """The name of the project."""
+        return str(self.record["project"])
+
+    @property
+    def backend(self) -> str:
+        """``docker``, ``process`` or ``in-process``."""
+        return str(self.record["backend"])
+
+    @property
+    def exit_code(self) -> int:
+        """0 ended normally, 1 a node failed or a deadlock, 4 a record was not written, 5 a budget
+        was broken, 130 Ctrl+C, 143 SIGTERM."""
+        return int(self.record["exit_code"])
+
+    @property
+    def reason(self) -> str:
+        """How it ended, in one line."""
+        return str(self.record["reason"])
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether it ended normally."""
+        return self.exit_code == 0
+
+    @property
+    def wall_s(self) -> float:
+        """Wall time from the first hook to the end, in seconds."""
+        return float(self.record["wall_s"])
+
+    @property
+    def sim_s(self) -> float | None:
+        """Simulated time in seconds, ``None`` where no node owns time."""
+        return _number(self.record["sim_s"])
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated time by wall time, without initialisation and ending."""
+        return _number(self.record["real_time_factor"])
+
+    @cached_property
+    def connections(self) -> dict[str, Mapping[str, Any]]:
+        """The figures of each connection, by ``a.out -> b.in``: ``sent``, ``consumed``, ..."""
+        return {each["connection"]: each for each in self.record["connections"]}
+
+    @property
+    def nodes(self) -> Mapping[str, Mapping[str, Any]]:
+        """The figures of each node, by name: ``accounting``, ``hooks``, ..."""
+        found: Mapping[str, Mapping[str, Any]] = self.record["nodes"]
+        return found
+
+    @property
+    def node_results(self) -> dict[str, Mapping[str, Any]]:
+        """What plugins have found out (``node.set_result``), by node and name."""
+        return {name: node.get("results", {}) for name, node in self.nodes.items()}
+
+    def connection_frame(self) -> Any:
+        """A ``pandas.DataFrame`` of the connections, a row each. Raises ``EnvironmentFault``."""
+        return frame_of(map(connection_figures, self.record["connections"]), "connection")
+
+    def node_frame(self) -> Any:
+        """A ``pandas.DataFrame`` of the nodes: seconds by cause. Raises ``EnvironmentFault``."""
+        return frame_of((node_figures(name, node) for name, node in self.nodes.items()), "node")
+
+    @cached_property
+    def bag(self) -> Bag:
+        """The packets of a run that was recorded, as :func:`neuros.bag.open` has them.
+
+        Raises:
+            UsageError: if nothing was recorded.
+            EnvironmentFault: if the bag is damaged.
+        """
+        from neuros.observe.bag.opened import open_bag
+
+        return open_bag(self.folder)
+
+    def log(self, node: str) -> str:
+        """All that a node has logged and printed, empty if it did not.
+
+        Raises:
+            KeyError: if there was no such node.
+        """
+        if node not in self.nodes:
+            raise KeyError(f"{node}: there are {', '.join(self.nodes)}")
+        file = self.folder / node / "node.log"
+        return file.read_text("utf-8", "replace") if file.exists() else ""
+
+    def check(self) -> Run:
+        """This run, if it ended normally.
+
+        Raises:
+            RunError: if it did not.
+        """
+        if not self.is_ok:
+            broken = self.record.get("broken_budgets") or []
+            lines = dict.fromkeys([self.reason, *(f"budget broken: {text}" for text in broken)])
+            raise RunError("\n".join([*lines, f"run folder: {self.folder}"]), self.exit_code)
+        return self
+
+    def __str__(self) -> str:
+        return f"{run_table(self.record)}\n{self.reason}\nrun folder: {self.folder}"
+
+    def __repr__(self) -> str:
+        return f"<Run of {self.project}: exit code {self.exit_code}, {self.reason}; {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def connection_figures(connection: Mapping[str, Any]) -> dict[str, Any]:
+    """A connection in one row: of its latency each figure, without its digests."""
+    latency = connection.get("latency_ms") or {}
+    plain = {k: v for k, v in connection.items() if k not in ("latency_ms", "digests", "index")}
+    return plain | {
+        f"latency_{name}_ms": latency.get(name) for name in ("p50", "p90", "p99", "max")
+    }
+
+
+def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
+    """A node in one row: seconds by cause, executions, simulated time, results."""
+    spent = node.get("accounting") or {}
+    sums = {f"{kind}_s": sum(spent[kind].values()) for kind in _SUMMED if kind in spent}
+    idle = {"idle_s": spent["idle"], "total_s": spent["total"]} if spent else {}
+    hooks = node.get("hooks") or {}
+    executions = sum(hook["executions"] for hook in hooks.values())
+    return {"node": name, **sums, **idle, "executions": executions, **node.get("results", {})}
+
+
+_LATENCIES = ("p50", "p90", "p99", "max")
+_SUMMED = ("executing", "waiting", "blocked")
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -1,0 +1,248 @@
+"""Sweeps: a project run with every combination of values and seeds, one table of what came out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from neuros.api.frames import frame_of
+from neuros.api.grid import Point, points_of, short_names
+from neuros.api.live import LiveRun
+from neuros.api.project import Project
+from neuros.api.run import Run
+from neuros.api.sweep_table import CSV_NAME, failed_row, row_of, table_of, write_csv
+from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
+
+PLAN_NAME = "sweep.json"
+# A run that was interrupted, or could not write what it should, is made again.
+_FINISHED = (0, 1, 5)
+_LOOK_S = 0.05
+
+
+class Sweep:
+    """A sweep that is over, or as far as it has come.
+
+    Attributes:
+        folder: with a folder for each run, and the table, ``sweep.csv``.
+        rows: one for each run: its values, ``seed``, ``exit_code``, ``reason``, times, of each
+            connection how many packets were sent and the share that was delivered, what nodes
+            found out (``node.set_result``), and its ``folder``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.rows: list[dict[str, Any]] = []
+
+    def frame(self) -> Any:
+        """A ``pandas.DataFrame``, one row per run. Raises ``EnvironmentFault``."""
+        return frame_of(self.rows)
+
+    def runs(self) -> list[Run]:
+        """The runs that have begun, in the order of the rows."""
+        folders = [Path(row["folder"]) for row in self.rows]
+        return [Run(folder) for folder in folders if (folder / "run.json").exists()]
+
+    def __str__(self) -> str:
+        return table_of(self.rows)
+
+    def __repr__(self) -> str:
+        return f"<Sweep of {len(self.rows)} runs in {self.folder}>"
+
+
+def sweep(
+    project: Project | str | os.PathLike[str],
+    *,
+    set: Mapping[str, Any] | None = None,
+    seeds: Sequence[int] = (),
+    repeat: int = 1,
+    jobs: int = 1,
+    backend: str | None = None,
+    duration: float | str | None = None,
+    record: bool | Sequence[str] = False,
+    output: str | os.PathLike[str] | None = None,
+    on_row: Callable[[int, int, Mapping[str, Any]], None] | None = None,
+) -> Sweep:
+    """Run a project with every combination of values, seeds and repetitions.
+
+    What has finished in ``output`` already is not run again, so that a sweep can be gone on with.
+    A run that fails is a row like the others. ``KeyboardInterrupt`` ends the runs that go on;
+    what has finished is in the table on the disk.
+
+    Args:
+        project: the project, or its file.
+        set: by path as in ``--set`` a list of values, or a single one.
+        seeds: for every variable with SEED in its name in the ``environment`` of a node.
+        repeat: how often each combination is run.
+        jobs: how many runs go on at once; they take processors from each other.
+        backend, duration, record: of each run, as for :meth:`neuros.Project.run`.
+        output: the folder; else ``runs/<project>/sweep-<utc time>``.
+        on_row: called with the number of a run, of how many, and its row.
+
+    Raises:
+        ProjectError: if the project is not valid with all values; nothing has been run then.
+        UsageError: for arguments that make no sense, or if ``output`` holds another sweep.
+    """
+    if not isinstance(project, Project):
+        project = Project.from_file(project)
+    values = {path: _as_list(given) for path, given in (set or {}).items()}
+    points = points_of(values, list(seeds), repeat)
+    if jobs < 1:
+        raise UsageError(f"jobs {jobs}: give 1 or more")
+    _check_all(project, points)
+    options = {"backend": backend, "duration": duration, "record": record}
+    folder = _folder(project, output, options)
+    return _Sweeping(project, points, short_names(list(values)), folder, options, on_row).run(jobs)
+
+
+class _Sweeping:
+    """A sweep that goes on."""
+
+    def __init__(
+        self,
+        project: Project,
+        points: Sequence[Point],
+        names: Mapping[str, str],
+        folder: Path,
+        options: Mapping[str, Any],
+        on_row: Callable[[int, int, Mapping[str, Any]], None] | None,
+    ) -> None:
+        self._project = project
+        self._names = names
+        self._options = options
+        self._on_row = on_row
+        self._sweep = Sweep(folder)
+        self._points = {point.folder_name(names): point for point in points}
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._live: dict[str, LiveRun] = {}
+
+    def run(self, jobs: int) -> Sweep:
+        waiting = [name for name in self._points if not self._take_finished(name)]
+        try:
+            while waiting or self._live:
+                while waiting and len(self._live) < jobs:
+                    self._start(waiting.pop(0))
+                self._collect()
+        except BaseException:
+            for live in self._live.values():
+                live.interrupt()
+            for live in self._live.values():
+                live.join()
+            raise
+        finally:
+            self._save()
+        return self._sweep
+
+    def _take_finished(self, name: str) -> bool:
+        """Whether this was run before; what is left of one that was cut off is set aside."""
+        folder = self._sweep.folder / name
+        if not folder.exists():
+            return False
+        try:
+            run = Run(folder)
+        except UsageError:
+            run = None
+        if run is None or run.exit_code not in _FINISHED:
+            _set_aside(folder)
+            return False
+        self._rows[name] = row_of(self._points[name].values(self._names), run)
+        return True
+
+    def _start(self, name: str) -> None:
+        point, folder = self._points[name], self._sweep.folder / name
+        try:
+            self._live[name] = self._project.start(
+                set=point.settings, seed=point.seed, output=folder, **self._options
+            )
+        except EnvironmentFault as error:
+            self._note(name, failed_row(point.values(self._names), error, folder))
+
+    def _collect(self) -> None:
+        """Take what has ended, after a moment."""
+        time.sleep(_LOOK_S if self._live else 0.0)
+        for name, live in tuple(self._live.items()):
+            if live.is_running:
+                continue
+            del self._live[name]
+            values = self._points[name].values(self._names)
+            try:
+                self._note(name, row_of(values, live.wait()))
+            except NeurosError as error:
+                self._note(name, failed_row(values, error, live.folder))
+
+    def _note(self, name: str, row: dict[str, Any]) -> None:
+        self._rows[name] = row
+        self._save()
+        if self._on_row is not None:
+            self._on_row(len(self._rows), len(self._points), row)
+
+    def _save(self) -> None:
+        self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
+        write_csv(self._sweep.rows, self._sweep.folder)
+
+
+def _as_list(given: Any) -> list[Any]:
+    is_one = isinstance(given, (str, bytes, Mapping)) or not hasattr(given, "__iter__")
+    return [given] if is_one else list(given)
+
+
+def _check_all(project: Project, points: Sequence[Point]) -> None:
+    """Whether the project is valid with every point. Raises ``ProjectError`` with all problems."""
+    problems: list[Problem] = []
+    for point in points:
+        try:
+            project.check_with(point.settings, point.seed)
+        except ProjectError as error:
+            problems += error.problems
+    if problems:
+        raise ProjectError(problems)
+
+
+def _folder(
+    project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
+) -> Path:
+    """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
+    stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
+    folder = Path(output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
+    plan = {
+        "project": str(project.file),
+        "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
+        **{name: str(options[name]) for name in ("backend", "duration", "record")},
+    }
+    file = folder / PLAN_NAME
+    try:
+        if file.exists():
+            _check_same(json.loads(file.read_text("utf-8")), plan, folder)
+            return folder
+        if folder.exists() and any(folder.iterdir()):
+            raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(plan, indent=2) + "\n", "utf-8")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
+    return folder
+
+
+def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
+    for name, value in now.items():
+        if before.get(name) != value:
+            what = "the project's files" if name == "project_sha256" else f"its {name}"
+            raise UsageError(
+                f"{folder} holds a sweep that is not this one ({what} differ):"
+                " name another folder with -o"
+            )
+
+
+def _set_aside(folder: Path) -> None:
+    number = 1
+    while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
+        number += 1
+    folder.rename(aside)
+
+
+__all__ = ["CSV_NAME", "Sweep", "sweep"]

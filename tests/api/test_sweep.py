@@ -1,0 +1,138 @@
+"""`neuros sweep` and `neuros.sweep`: real runs, one table."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from api_projects import COUNTER, ENDLESS, dice
+
+import neuros
+from neuros.cli.main import main
+from neuros.errors import ProjectError, UsageError
+
+# Whoever runs these tests in the background has them, and all that they start, ignore Ctrl+C.
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from neuros.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+FACES = "nodes.thrower.environment.FACES"
+EYES = "thrower.eyes -> counter.eyes"
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def rows_of(folder: str) -> list[dict[str, str]]:
+    with open(Path(folder, "sweep.csv"), newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_sweep_is_a_table_whatever_becomes_of_its_runs_and_can_be_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dice(tmp_path, COUNTER.replace("== 13", "> 6"))
+    arguments = ["sweep", "dice", "--backend", "in-process", "-o", "table", "--jobs", "2"]
+    assert main([*arguments, "--set", f"{FACES}=1", "--seeds", "1"]) == 0
+    first = rows_of("table")
+    assert first[0]["counter.sum"] == "10"
+    assert main([*arguments, "--set", f"{FACES}=1,999999999", "--seeds", "1"]) == 1
+    rows = rows_of("table")
+    assert rows[0] == first[0], "it was not run again"
+    assert [(row["FACES"], row["seed"], row["exit_code"]) for row in rows] == [
+        ("1", "1", "0"),
+        ("999999999", "1", "1"),
+    ]
+    assert "thirteen eyes" in rows[1]["reason"]
+    assert rows[0][f"{EYES}: delivered"] in (
+        "1.0",
+        "0.9090909090909091",
+    )  # the last one may not be read
+    said = capsys.readouterr().out
+    assert "[1/1] FACES=1, seed=1: counter ended the project: ten were thrown" in said
+    assert "[2/2] FACES=999999999, seed=1: node 'counter' failed" in said
+    assert said.endswith(f"\n{tmp_path}/table/sweep.csv\n")
+
+
+def test_from_python_it_is_a_frame(tmp_path: Path) -> None:
+    made = neuros.sweep(dice(tmp_path), set={FACES: [1]}, seeds=[5], backend="in-process")
+    frame = made.frame()
+    assert frame.loc[0, ["FACES", "seed", "counter.sum"]].to_list() == [1, 5, 10]
+    assert [run.exit_code for run in made.runs()] == [0]
+
+
+def test_a_value_that_is_not_valid_is_said_before_anything_is_run(tmp_path: Path) -> None:
+    dice(tmp_path)
+    limit = "connections.thrower.eyes.counter.eyes.discard_limit"
+    with pytest.raises(ProjectError) as caught:
+        neuros.sweep("dice", set={limit: [0, -1, "x"]}, output="table")
+    assert len(caught.value.problems) == 2
+    assert not Path("table").exists()
+
+
+def test_the_folder_of_another_sweep_is_refused(tmp_path: Path) -> None:
+    project = dice(tmp_path)
+    Path("table").mkdir()
+    Path("table/sweep.json").write_text(json.dumps({"project": "another"}))
+    with pytest.raises(UsageError, match="holds a sweep that is not this one"):
+        neuros.sweep(project, output="table")
+    Path("full").mkdir()
+    Path("full/mine.txt").write_text("")
+    with pytest.raises(UsageError, match="is neither empty nor a sweep"):
+        neuros.sweep(project, output="full")
+
+
+def test_ctrl_c_keeps_what_is_done_and_what_was_cut_off_is_run_again(tmp_path: Path) -> None:
+    endless_with_two = ENDLESS.replace("if len(seen) == 0", "import os\n    if seen[-1] == 1")
+    dice(tmp_path, endless_with_two)
+    arguments = ["sweep", "dice", "--set", f"{FACES}=1,-1", "--backend", "in-process", "-o", "t"]
+    thrower = (tmp_path / "dice/thrower.py").read_text()
+    (tmp_path / "dice/thrower.py").write_text(
+        thrower.replace(
+            "randint(1,",
+            'choice([2]) if os.environ["FACES"] == "-1" else node.get_user_data().randint(1,',
+        )
+    )
+    output = _interrupted_after("[1/2]", arguments, Path("t"))
+    assert "[1/2] FACES=1: counter ended the project" in output
+    assert [row["FACES"] for row in rows_of("t")] == ["1"]
+    (tmp_path / "dice/counter.py").write_text(COUNTER)
+    assert main(arguments) == 0
+    assert [row["FACES"] for row in rows_of("t")] == ["1", "-1"]
+    assert len([*Path("t").glob("*.unfinished-1")]) == 1
+
+
+def _interrupted_after(text: str, arguments: list[str], folder: Path) -> str:
+    """What a sweep prints that gets SIGINT when the run after ``text`` is under way."""
+    process: Any = subprocess.Popen(
+        [sys.executable, "-u", "-c", PROGRAM, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    killer = threading.Timer(60.0, process.kill)
+    killer.start()
+    lines = []
+    with process:
+        for line in process.stdout:
+            lines.append(line)
+            if text in line:
+                while len([*folder.glob("*/project.json")]) < 2:
+                    os.sched_yield()
+                process.send_signal(signal.SIGINT)
+    killer.cancel()
+    assert process.returncode == 130, lines
+    return "".join(lines)
