@@ -62,7 +62,11 @@ class Recording:
     def report(self, recorded: Recorded, record: dict[str, Any]) -> list[str]:
         """Put into the record what was recorded; returns what is missing, a sentence each."""
         topics = self._topics(recorded, record)
-        problems = recorded.problems or _missing(topics)
+        problems = list(recorded.problems)
+        if recorded.counts:  # else the recorder has stopped, and said so
+            problems += _missing(
+                {n: t for n, t in topics.items() if not _is_named(n, recorded.problems)}
+            )
         record["recording"] = {
             "bag": str(self._run / BAG_NAME),
             "storage": self._plan.storage,
@@ -128,6 +132,11 @@ def summary(report: Mapping[str, Any]) -> str:
         of = "?" if None in passed else sum(passed)
         lines.append(f"{seen} of {of} packets on connections without discard limit")
     return "\n".join(lines)
+
+
+def _is_named(topic: str, problems: Sequence[str]) -> bool:
+    """Whether one of the problems is that this topic was left out."""
+    return any(problem.startswith(f"{topic} ") for problem in problems)
 
 
 def _missing(topics: Mapping[str, Mapping[str, Any]]) -> list[str]:
