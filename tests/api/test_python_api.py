@@ -22,6 +22,7 @@ from api_projects import COUNTER, ENDLESS, dice
 import neuros
 from containers import require_containers
 from neuros.errors import EnvironmentFault, ProjectError, RunError, UsageError
+from neuros.launch.sessions import sessions
 
 DEADLINE_S = 30.0
 # Whoever runs these tests in the background has them, and all that they start, ignore Ctrl+C.
@@ -160,7 +161,8 @@ def test_a_block_that_fails_interrupts_its_run(tmp_path: Path) -> None:
 def test_neuros_stop_ends_the_run_and_not_the_program(tmp_path: Path) -> None:
     live = project(tmp_path, ENDLESS).start(backend="in-process")
     _await(lambda: "counting" in _log(live.folder))
-    subprocess.run([sys.executable, "-m", "neuros.cli", "stop", "dice"], check=True, timeout=30)
+    (run,) = [each.run for each in sessions() if each.folder == str(live.folder)]
+    subprocess.run([sys.executable, "-m", "neuros.cli", "stop", run], check=True, timeout=30)
     assert live.wait(DEADLINE_S).reason == "ended by Ctrl+C"
 
 

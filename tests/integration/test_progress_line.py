@@ -72,7 +72,7 @@ def test_on_a_terminal_the_line_stays_below_what_nodes_log(project: Path) -> Non
 
 
 def test_without_a_terminal_there_are_plain_records_and_few_of_them(project: Path) -> None:
-    run = launch(project, "--backend", "in-process", "--duration", "2", cwd=project)
+    run = launch(project, "--backend", "in-process", "--duration", "1", cwd=project)
     assert run.exit_code == 0
     assert "%|" not in run.output
     assert "packets/s" not in run.output, "the first after ten seconds"
