@@ -21,8 +21,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from neuros.project.model import Port
 from neuros.transport.ros_loop import RosLoop
 
-_SETTLED_S = 0.3
-"""What DDS has told of, the graph lists a moment later."""
+_LOOK_S = 0.3
+_MOST_LOOKS = 20
+"""What DDS has told of, the graph lists a moment later; seconds later on a machine under load."""
 
 _ADVICE = 'give both the same, with "qos" in the project'
 
@@ -55,32 +56,37 @@ class Mismatches:
 
     def _look_later(self, event: Any, *, is_input: bool) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        total, looks = event.total_count, 0
 
         def look() -> None:
-            self._ros_node.destroy_timer(timer)
-            self._look(policy, is_input=is_input)
+            nonlocal looks
+            looks += 1
+            self._look(is_input=is_input)
+            if len(self._named) >= total or looks == _MOST_LOOKS:
+                self._ros_node.destroy_timer(timer)
+                if not self._named:
+                    self._warn_of_somebody("input" if is_input else "output", policy)
 
-        timer = self._loop.every(self._ros_node, _SETTLED_S, look)
+        timer = self._loop.every(self._ros_node, _LOOK_S, look)
 
-    def _look(self, policy: str, *, is_input: bool) -> None:
+    def _look(self, *, is_input: bool) -> None:
         if is_input:
             side, list_others = "input", self._ros_node.get_publishers_info_by_topic
         else:
             side, list_others = "output", self._ros_node.get_subscriptions_info_by_topic
-        warned = False
         for other in list_others(self._port.external_topic):  # by the name that rules apply to
             offered, asked = (
                 (other.qos_profile, self._own) if is_input else (self._own, other.qos_profile)
             )
             lacking = list(differences(offered, asked))
             if lacking:
-                warned = True
                 self._warn(side, other, lacking)
-        if not warned and not self._named:
-            self._ros_node.get_logger().warning(
-                f"{side} '{self._port.name}': somebody on {self._topic} cannot be connected: the"
-                f" {policy} that one side offers is not what the other asks for"
-            )
+
+    def _warn_of_somebody(self, side: str, policy: str) -> None:
+        self._ros_node.get_logger().warning(
+            f"{side} '{self._port.name}': somebody on {self._topic} cannot be connected: the"
+            f" {policy} that one side offers is not what the other asks for"
+        )
 
     def _warn(self, side: str, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
         gid = bytes(other.endpoint_gid)

@@ -312,11 +312,11 @@ def test_a_callback_of_a_plugin_that_fails_is_named_with_its_file(bench: Bench) 
     assert finished.output.count('a.py", line') == 1
 
 
-def test_nodes_of_one_process_that_all_fail_at_once_end_at_once(bench: Bench) -> None:
+def test_nodes_that_all_fail_at_once_end_at_once(bench: Bench) -> None:
     fails = "@neuros_initialise()\ndef begin(node):\n    raise ValueError('at once')\n"
     bench.project(a=fails, b=fails)
-    finished = bench.launch("--backend", "in-process")
-    assert_ended(finished, 1, "node 'a' failed: .*: hook 'begin': ValueError: at once")
+    finished = bench.launch()
+    assert_ended(finished, 1, "node '[ab]' failed: .*: hook 'begin': ValueError: at once")
     assert "killed" not in finished.output
 
 

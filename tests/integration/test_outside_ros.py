@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from launching import BACKENDS, Running, start
+from launching import Running, start
 
 from containers import require_containers
 from neuros.launch.domain import choose_domain
@@ -51,7 +51,8 @@ def program(name: str, domain_id: int) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.mark.parametrize(
-    "back_end", [*BACKENDS, pytest.param("docker", marks=pytest.mark.acceptance)]
+    "back_end",
+    ["in-process", *(pytest.param(b, marks=pytest.mark.acceptance) for b in ("process", "docker"))],
 )
 def test_a_node_among_plain_ros_programs(back_end: str, tmp_path: Path) -> None:
     if back_end == "docker":

@@ -44,8 +44,8 @@ def begin(node):
             assert future.result().message == "hello"
 
     async def ask():
-        if greeter.service_is_ready():
-            asking.cancel()
+        # The first answers may be lost: a client finds a service before that has found the client.
+        if greeter.service_is_ready() and not COUNTS["awaited"]:
             answer = await greeter.call_async(Trigger.Request())
             with Alone("awaited"):
                 assert answer.message == "hello"
@@ -64,7 +64,7 @@ def begin(node):
             return response
 
     ros.create_timer(0.001, on_timer)
-    asking = ros.create_timer(0.05, ask)
+    ros.create_timer(0.05, ask)
     ros.create_subscription(Int32, "/sure", on_topic, 10)
     ros.create_service(Trigger, "~/tell", tell)
     assert ros.declare_parameter("described", 1, ParameterDescriptor(description="x")).value == 5
