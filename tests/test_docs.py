@@ -25,6 +25,7 @@ PAGES = sorted(
         ROOT / "CONTRIBUTING.md",
         *(ROOT / "docs").glob("*.md"),
         *(ROOT / "examples").rglob("README.md"),
+        ROOT / "workspace" / "README.md",
     ]
 )
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]

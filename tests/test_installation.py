@@ -22,6 +22,7 @@ from neuros import installation
 from neuros.cli.main import parser
 from neuros.errors import EnvironmentFault
 from neuros.installation.containers import build_arguments, build_containers
+from neuros.installation.documentation import build_documentation
 from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
@@ -330,6 +331,26 @@ class TestContainers:
         assert build_containers(python, parsed) == 4
 
 
+class TestDocumentation:
+    def extras_for(self, *given: str) -> list[str]:
+        return list(
+            installation.parse_options(given, ["mujoco", "nest", "plot", "dev", "docs"]).extras
+        )
+
+    def test_only_who_asks_for_it_gets_what_builds_it(self) -> None:
+        assert self.extras_for() == ["mujoco", "nest", "plot"]
+        assert self.extras_for("--docs") == ["docs", "mujoco", "nest", "plot"]
+        assert self.extras_for("--dev") == ["dev", "docs", "mujoco", "nest", "plot"]
+
+    def test_it_is_built_by_the_one_command_that_is_documented(self, tmp_path: Path) -> None:
+        python = tmp_path / "python"
+        python.write_text(f'#!/bin/sh\necho "$@" >{tmp_path}/asked; exit 1\n')
+        python.chmod(0o755)
+        assert build_documentation(python, ROOT) == 1
+        assert (tmp_path / "asked").read_text() == f"{ROOT / 'docs' / 'make.py'}\n"
+        assert "`docs/make.py`" in (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+
+
 class TestInstallScript:
     def test_help_names_every_exit_code(self, tmp_path: Path) -> None:
         done = run_script(ROOT / "install.py", "--help", cwd=tmp_path)
@@ -339,7 +360,7 @@ class TestInstallScript:
     def test_an_extra_that_does_not_exist_is_wrong_usage(self, tmp_path: Path) -> None:
         done = run_script(ROOT / "install.py", "--extras", "numpy", cwd=tmp_path)
         assert done.returncode == 2
-        assert "no such extra: numpy (there are mujoco, nest," in done.stderr
+        assert "no such extra: numpy (there are mujoco, " in done.stderr
 
     @pytest.mark.parametrize(
         ("arguments", "complaint"),

@@ -16,13 +16,14 @@ from pathlib import Path
 
 from neuros.errors import EnvironmentFault
 from neuros.installation.containers import build_containers, build_messages
+from neuros.installation.documentation import build_documentation
 from neuros.installation.environment import Environment, extras_of
 from neuros.installation.machine import Machine, system_install
 from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
 
 STANDARD_EXTRAS = ("mujoco", "nest", "plot")
-DEVELOPER_EXTRAS = ("dev",)
+DEVELOPER_EXTRAS = ("dev", "docs")
 
 
 def main(arguments: Sequence[str], root: str) -> int:
@@ -44,6 +45,9 @@ def main(arguments: Sequence[str], root: str) -> int:
             return code
         if not options.no_containers and (code := build_containers(environment.python, options)):
             progress.fail("install.py: NeuROS is installed, but not all images were built")
+            return code
+        if options.docs and (code := build_documentation(environment.python, folder)):
+            progress.fail("install.py: NeuROS is installed, but its documentation was not built")
             return code
         if options.test:
             progress.step("installed; running the checks and tests")
@@ -80,13 +84,16 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
     parser.add_argument(
         "--extras", metavar="A,B", default="", help=f"install more: {', '.join(further)}"
     )
-    parser.add_argument("--dev", action="store_true", help="the same as --extras dev")
+    parser.add_argument("--dev", action="store_true", help="the same as --extras dev,docs")
+    parser.add_argument(
+        "--docs", action="store_true", help="install what builds the documentation, and build it"
+    )
     parser.add_argument("--test", action="store_true", help="then run all checks and tests")
     _add_container_options(parser)
     options = parser.parse_args(arguments)
     extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
-    extras.update(DEVELOPER_EXTRAS if options.dev else ())
-    extras.update(("dev",) if options.test else ())
+    extras.update(DEVELOPER_EXTRAS if options.dev or options.test else ())
+    extras.update(("docs",) if options.docs else ())
     if unknown := sorted(extras - set(known)):
         parser.error(f"no such extra: {', '.join(unknown)} (there are {', '.join(known)})")
     options.extras = sorted(extras)

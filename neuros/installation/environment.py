@@ -54,7 +54,7 @@ _PROOFS = {
     "nest": _Proof("NEST", "nest-simulator", "import nest; nest.Create('iaf_psc_alpha')"),
     "plot": _Proof("Matplotlib", "matplotlib", "import matplotlib.figure"),
     "tensorflow": _Proof("TensorFlow", "tensorflow-cpu", "import tensorflow"),
-    "docs": _Proof("Sphinx", "sphinx", "import sphinx, furo"),
+    "docs": _Proof("Sphinx", "sphinx", "import sphinx, furo, myst_parser, sphinx_copybutton"),
     "benchmark": _Proof("psutil", "psutil", "import psutil"),
     "dev": _Proof("pytest", "pytest", "import pytest, xdist, hypothesis, mypy, psutil"),
 }

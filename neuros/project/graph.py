@@ -8,17 +8,19 @@ from neuros.project.model import Connection, Node, Port, Project
 
 
 def graph_text(project: Project) -> str:
-    """The nodes with their outputs, and where these lead, in aligned plain text::
+    """The nodes with their outputs, and where these lead, in aligned plain text.
 
-    clock: 2 nodes, 1 connection
+    ::
 
-    ticker  (neuros_python, ticker.py)
-      out tick  std_msgs/msg/String
-          -> printer.tick   lossless
+        clock: 2 nodes, 1 connection
 
-    printer  (neuros_python, printer.py)
-      in  tick  std_msgs/msg/String
-          <- ticker.tick
+        ticker  (neuros_python, ticker.py)
+          out tick  std_msgs/msg/String
+              -> printer.tick   lossless
+
+        printer  (neuros_python, printer.py)
+          in  tick  std_msgs/msg/String
+              <- ticker.tick
     """
     nodes, connections = len(project.nodes), len(project.connections)
     lines = [f"{project.name}: {_count(nodes, 'node')}, {_count(connections, 'connection')}"]

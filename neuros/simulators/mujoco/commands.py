@@ -1,17 +1,17 @@
 """From ROS messages to MuJoCo's controls.
 
-============================  ==============================================================
-message type                  what it drives
-============================  ==============================================================
-``std_msgs/Float64``          one actuator
-``std_msgs/Float64MultiArray``  any number, in the order of ``actuators``
-``sensor_msgs/JointState``    those of ``actuators`` that it names, by joint or actuator:
-                              position servos take ``position``, velocity servos ``velocity``,
-                              all others ``effort``
-``geometry_msgs/Twist``       two actuators: linear.x, angular.z; three: linear.x, linear.y,
-                              angular.z; six: all. They are passed on, not turned into another
-                              frame
-============================  ==============================================================
+===============================  ===========================================================
+message type                     what it drives
+===============================  ===========================================================
+``std_msgs/Float64``             one actuator
+``std_msgs/Float64MultiArray``   any number, in the order of ``actuators``
+``sensor_msgs/JointState``       those of ``actuators`` that it names, by joint or actuator:
+                                 position servos take ``position``, velocity servos
+                                 ``velocity``, all others ``effort``
+``geometry_msgs/Twist``          two actuators: linear.x, angular.z; three: linear.x,
+                                 linear.y, angular.z; six: all. They are passed on, not
+                                 turned into another frame
+===============================  ===========================================================
 
 MuJoCo clamps a control to the ``ctrlrange`` of its actuator.
 """

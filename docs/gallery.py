@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Makes the pictures of the gallery: graphs of the examples, and their robots in MuJoCo.
+
+::
+
+    .venv/bin/python docs/gallery.py
+
+It needs what the examples need, and Matplotlib. Look at what it has made.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neuros.project.graph_svg import graph_svg
+from neuros.project.load import load_project
+from neuros.simulators.mujoco.opengl import choose_opengl
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures"
+EXAMPLES = ROOT / "examples"
+WIDTH, HEIGHT = 480, 360
+# Model, simulated seconds, joints and where they are; azimuth, elevation, distance of the camera.
+SCENES = {
+    "3_physics_simulation/elevator/elevator.xml": ({"lift": 6.0}, (130, -10, 17.0), (0, 0, 5)),
+    "4_neurorobotics/whiskeye/whiskeye.xml": ({}, (140, -20, 1.6), (0.1, 0, 0.4)),
+}
+
+
+def draw_graphs() -> None:
+    """One SVG per example."""
+    for file in sorted(EXAMPLES.glob("*/*/project.json")):
+        project = load_project(file, workspace=ROOT / "workspace").project
+        (FIGURES / f"gallery_{file.parent.name}.svg").write_text(graph_svg(project), "utf-8")
+
+
+def render_scenes() -> None:
+    """One PNG per model."""
+    choose_opengl()
+    import mujoco
+    from matplotlib.image import imsave
+
+    for name, (joints, (azimuth, elevation, distance), target) in SCENES.items():
+        model = mujoco.MjModel.from_xml_path(str(EXAMPLES / name))
+        data = mujoco.MjData(model)
+        for joint, position in joints.items():
+            data.joint(joint).qpos[0] = position
+        mujoco.mj_forward(model, data)
+        camera = mujoco.MjvCamera()
+        camera.azimuth, camera.elevation, camera.distance = azimuth, elevation, distance
+        camera.lookat[:] = target
+        with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+            renderer.update_scene(data, camera)
+            imsave(FIGURES / f"gallery_{Path(name).stem}.png", renderer.render())
+
+
+if __name__ == "__main__":
+    draw_graphs()
+    render_scenes()

@@ -1,0 +1,37 @@
+#!/usr/bin/env python3
+"""Builds the documentation into docs/build/html/index.html: docs/make.py [BUILDER]
+
+It needs `./install.py --docs`, and no network. A warning is an error, and so is a link to
+a page, module, class or function that leads nowhere. `docs/make.py linkcheck` looks at links into
+the world, too, and does need a network.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+
+
+def main(arguments: list[str]) -> int:
+    """Run Sphinx; returns its exit code."""
+    from sphinx.cmd.build import main as sphinx
+
+    builder, *further = arguments or ["html"]
+    folders = ["-c", str(DOCS), "-d", str(DOCS / "build" / "doctrees"), str(ROOT)]
+    strict = ["--fail-on-warning", "--quiet", "--jobs", "auto"]
+    code = sphinx(["-b", builder, *strict, *further, *folders, str(DOCS / "build" / builder)])
+    if code == 0 and builder == "html":
+        print(f"documentation: {DOCS / 'build' / 'html' / 'index.html'}")
+    return code
+
+
+if __name__ == "__main__":
+    venv = ROOT / ".venv"
+    python = venv / "bin" / "python"
+    if Path(sys.prefix).resolve() != venv.resolve() and python.exists():
+        os.execv(python, [str(python), *sys.argv])
+    sys.exit(main(sys.argv[1:]))

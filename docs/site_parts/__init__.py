@@ -1,0 +1,19 @@
+"""What Sphinx is taught for this site: generated pages, links, diagrams, and the order of pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sphinx.application import Sphinx
+
+from site_parts import contents, diagrams, links, pages
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Called by Sphinx."""
+    app.connect("builder-inited", pages.write)
+    app.connect("source-read", contents.add_toctrees)
+    app.connect("doctree-read", links.lead_to_pages)
+    app.add_directive("mermaid", diagrams.Mermaid)
+    app.connect("html-page-context", diagrams.add_scripts)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

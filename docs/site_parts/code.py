@@ -1,0 +1,70 @@
+"""The reference of the code: a page per package, with every module that lies in it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+from site_parts import uml
+
+
+def packages(root: Path) -> dict[str, list[str]]:
+    """The modules of each package, the package itself first."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for file in sorted((root / "neuros").rglob("*.py")):
+        if (file.parent / "__init__.py").exists():
+            path = file.relative_to(root).with_suffix("")
+            package = ".".join(path.parent.parts)
+            found[package].append(package if path.name == "__init__" else ".".join(path.parts))
+    return {package: sorted(found[package]) for package in sorted(found)}
+
+
+def pages(root: Path) -> Iterator[tuple[str, str]]:
+    """``(name, Markdown)`` of all pages."""
+    found = packages(root)
+    listed = "\n".join(f"code/{package}" for package in found)
+    yield (
+        "code",
+        "# Modules, classes and functions\n\n"
+        "Made from the docstrings. Plugins need `neuros.hooks` and, for their tests, "
+        "`neuros.testing`; [Architecture](../architecture.md) says what the rest is for.\n\n"
+        f"```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
+    )
+    for package, modules in found.items():
+        yield f"code/{package}", _page(root, package, modules)
+    yield "diagrams", _diagrams(root)
+
+
+def _page(root: Path, package: str, modules: list[str]) -> str:
+    parts = [f"# {package}\n"]
+    for module in modules:
+        title = "" if module == package else f"\n## {module.removeprefix(package + '.')}\n"
+        parts.append(f"{title}\n```{{eval-rst}}\n.. automodule:: {module}\n```\n")
+        if module == package:
+            parts.append(_class_diagram(root, package))
+    return "".join(parts)
+
+
+def _class_diagram(root: Path, package: str) -> str:
+    text = uml.class_diagram(sorted((root / package.replace(".", "/")).glob("*.py")))
+    return f"\n## Classes\n\n```mermaid\n{text}\n```\n" if text else ""
+
+
+def _diagrams(root: Path) -> str:
+    """The page with all package diagrams; class diagrams are on the pages of the packages."""
+    parts = [
+        "# Package diagrams\n\nMade from the imports in the code, late ones too. An arrow leads "
+        "from who imports to what is imported; one that follows from other arrows is left out. "
+        "Class diagrams are on the [pages of the packages](code.md).\n",
+        _imports(root, "neuros", 2),
+    ]
+    for package, modules in packages(root).items():
+        if len(modules) > 2 and package != "neuros":
+            parts.append(_imports(root, package, package.count(".") + 2))
+    return "\n".join(parts)
+
+
+def _imports(root: Path, package: str, depth: int) -> str:
+    text = uml.import_diagram(uml.imports_between(root, depth, package))
+    return f"\n## {package}\n\n```mermaid\n{text}\n```\n"

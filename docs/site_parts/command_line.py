@@ -1,0 +1,45 @@
+"""The options of all commands, as the parser knows them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+from site_parts.words import as_text, cell
+
+
+def page() -> str:
+    """Every command with its options, in Markdown."""
+    from neuros.cli.main import parser
+
+    introduction = (
+        "# Options of all commands\n\nMade from the parser, which prints the same with `--help`. "
+        "[Command line](../command_line.md) says what the commands are for.\n"
+    )
+    return introduction + "".join(_section(each) for each in _commands(parser()))
+
+
+def _commands(of: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    yield of
+    for action in of._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                yield from _commands(each)
+
+
+def _section(of: argparse.ArgumentParser) -> str:
+    described = f"{as_text(of.description)}\n" if of.description else ""
+    rows = [_row(of, action) for action in of._actions if action.help != argparse.SUPPRESS]
+    table = "\n".join(["| | |", "| --- | --- |", *(row for row in rows if row)])
+    usage = " ".join(of.format_usage().removeprefix("usage: ").split())
+    return f"\n## {of.prog}\n\n{described}\n```text\n{usage}\n```\n\n{table}\n"
+
+
+def _row(of: argparse.ArgumentParser, action: argparse.Action) -> str:
+    if isinstance(action, argparse._SubParsersAction):
+        names = ", ".join(f"`{name}`" for name in action.choices)
+        return f"| `{action.metavar or 'COMMAND'}` | {names} |"
+    formatter = of._get_formatter()
+    name = formatter._format_action_invocation(action)
+    text = formatter._expand_help(action) if action.help else ""
+    return f"| `{cell(name)}` | {cell(as_text(text))} |"
