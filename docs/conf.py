@@ -59,6 +59,8 @@ autodoc_mock_imports = [
     "trimesh",
 ]
 
+viewcode_follow_imported_members = False
+
 nitpicky = True
 # Types of other projects are not linked, since no network is needed, nor private ones.
 nitpick_ignore_regex = [("py:.*", r"(?!neuros\.).*"), ("py:class", r".*\._\w+")]

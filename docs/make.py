@@ -24,9 +24,16 @@ def main(arguments: list[str]) -> int:
     folders = ["-c", str(DOCS), "-d", str(DOCS / "build" / "doctrees"), str(ROOT)]
     strict = ["--fail-on-warning", "--quiet", "--jobs", "auto"]
     code = sphinx(["-b", builder, *strict, *further, *folders, str(DOCS / "build" / builder)])
-    if code == 0 and builder == "html":
-        print(f"documentation: {DOCS / 'build' / 'html' / 'index.html'}")
-    return code
+    if code or builder != "html":
+        return code
+    from site_parts.finished import dead_links
+
+    site = DOCS / "build" / "html"
+    dead = list(dead_links(site))
+    print(
+        "\n".join([f"dead link: {link}" for link in dead] or [f"documentation: {site}/index.html"])
+    )
+    return 1 if dead else 0
 
 
 if __name__ == "__main__":

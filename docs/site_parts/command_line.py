@@ -23,8 +23,13 @@ def _commands(of: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     yield of
     for action in of._actions:
         if isinstance(action, argparse._SubParsersAction):
-            for each in action.choices.values():
-                yield from _commands(each)
+            for name in _shown(action):
+                yield from _commands(action.choices[name])
+
+
+def _shown(action: argparse._SubParsersAction[argparse.ArgumentParser]) -> list[str]:
+    """The commands for users: the others, which NeuROS starts itself, have no help."""
+    return [each.dest for each in action._choices_actions if each.help != argparse.SUPPRESS]
 
 
 def _section(of: argparse.ArgumentParser) -> str:
@@ -37,7 +42,7 @@ def _section(of: argparse.ArgumentParser) -> str:
 
 def _row(of: argparse.ArgumentParser, action: argparse.Action) -> str:
     if isinstance(action, argparse._SubParsersAction):
-        names = ", ".join(f"`{name}`" for name in action.choices)
+        names = ", ".join(f"`{name}`" for name in _shown(action))
         return f"| `{action.metavar or 'COMMAND'}` | {names} |"
     formatter = of._get_formatter()
     name = formatter._format_action_invocation(action)

@@ -48,7 +48,8 @@ def _to_code(env: BuildEnvironment, module: str, link: nodes.Element) -> addnode
     """A reference to what the link's text names in a module, or to the module."""
     text = link.astext()
     names_a_member = _PUBLIC.fullmatch(text) and not text.endswith(".py")
-    target = f"{module}.{text}" if names_a_member else module
+    member = text if text.startswith("neuros.") else f"{module}.{text}"
+    target = member if names_a_member else module
     reference = addnodes.pending_xref(
         "",
         *link.children,

@@ -80,7 +80,7 @@ def sweep(
         seeds: for every variable with SEED in its name in the ``environment`` of a node.
         repeat: how often each combination is run.
         jobs: how many runs go on at once; they take processors from each other.
-        backend, duration, record: of each run, as for :meth:`neuros.Project.run`.
+        backend, duration, record: of each run, as for :meth:`~neuros.api.project.Project.run`.
         output: the folder; else ``runs/<project>/sweep-<utc time>``.
         on_row: called with the number of a run, of how many, and its row.
 

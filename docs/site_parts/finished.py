@@ -1,0 +1,50 @@
+"""A look at the finished site: every link and picture in it leads somewhere, without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+_LINKS = {("a", "href"), ("img", "src"), ("script", "src"), ("link", "href")}
+_LOADED = {"img", "script", "link"}
+_ELSEWHERE = ("http:", "https:", "mailto:")
+
+
+class _Page(HTMLParser):
+    """What a page links to, by tag, and what can be linked to on it."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self.links: set[tuple[str, str]] = set()
+        self.anchors = {""}
+        self.feed(file.read_text("utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if value and name == "id":
+                self.anchors.add(value)
+            elif value and (tag, name) in _LINKS:
+                self.links.add((tag, value))
+
+
+def dead_links(site: Path) -> Iterator[str]:
+    """``page: link`` for each that leads nowhere, and for each part that comes from elsewhere."""
+    pages = {file: _Page(file) for file in sorted(site.rglob("*.html"))}
+    for file, page in pages.items():
+        for tag, link in sorted(page.links):
+            if link.startswith(_ELSEWHERE):
+                is_dead = tag in _LOADED
+            else:
+                is_dead = not link.startswith("data:") and not _leads_somewhere(pages, file, link)
+            if is_dead:
+                yield f"{file.relative_to(site)}: {link}"
+
+
+def _leads_somewhere(pages: dict[Path, _Page], file: Path, link: str) -> bool:
+    path, _, anchor = link.partition("#")
+    target = (file.parent / unquote(path.partition("?")[0])).resolve() if path else file
+    if target in pages:
+        return unquote(anchor) in pages[target].anchors
+    return target.exists()
