@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from neuros.api.live import LiveRun
 from neuros.api.project import Project
 from neuros.api.run import Run
 from neuros.api.sweep_table import CSV_NAME, failed_row, row_of, table_of, write_csv
+from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 
 PLAN_NAME = "sweep.json"
+_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
 _LOOK_S = 0.05
@@ -86,18 +89,21 @@ def sweep(
 
     Raises:
         ProjectError: if the project is not valid with all values; nothing has been run then.
-        UsageError: for arguments that make no sense, or if ``output`` holds another sweep.
+        UsageError: for arguments that make no sense, or if ``output`` holds another sweep, or one
+            that goes on.
     """
     if not isinstance(project, Project):
         project = Project.from_file(project)
     values = {path: _as_list(given) for path, given in (set or {}).items()}
-    points = points_of(values, list(seeds), repeat)
+    points = points_of(values, [int(seed) for seed in seeds], repeat)
     if jobs < 1:
         raise UsageError(f"jobs {jobs}: give 1 or more")
     _check_all(project, points)
     options = {"backend": backend, "duration": duration, "record": record}
     folder = _folder(project, output, options)
-    return _Sweeping(project, points, short_names(list(values)), folder, options, on_row).run(jobs)
+    names = short_names(list(values))
+    with _alone_in(folder):
+        return _Sweeping(project, points, names, folder, options, on_row).run(jobs)
 
 
 class _Sweeping:
@@ -226,6 +232,21 @@ def _folder(
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
     return folder
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
+    with contextlib.ExitStack() as stack:
+        try:
+            is_alone = stack.enter_context(locked(folder / _LOCK_NAME, wait=False))
+        except OSError as error:
+            raise UsageError(
+                f"{folder} cannot be used ({error}): name another one with -o"
+            ) from error
+        if not is_alone:
+            raise UsageError(f"{folder}: a sweep goes on there; wait for its end, or name another")
+        yield
 
 
 def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:

@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from api_projects import COUNTER, ENDLESS, dice
 
@@ -68,7 +69,8 @@ def test_a_sweep_is_a_table_whatever_becomes_of_its_runs_and_can_be_gone_on_with
 
 
 def test_from_python_it_is_a_frame(tmp_path: Path) -> None:
-    made = neuros.sweep(dice(tmp_path), set={FACES: [1]}, seeds=[5], backend="in-process")
+    seeds = np.array([5])
+    made = neuros.sweep(dice(tmp_path), set={FACES: [1]}, seeds=seeds, backend="in-process")
     frame = made.frame()
     assert frame.loc[0, ["FACES", "seed", "counter.sum"]].to_list() == [1, 5, 10]
     assert [run.exit_code for run in made.runs()] == [0]
@@ -93,6 +95,17 @@ def test_the_folder_of_another_sweep_is_refused(tmp_path: Path) -> None:
     Path("full/mine.txt").write_text("")
     with pytest.raises(UsageError, match="is neither empty nor a sweep"):
         neuros.sweep(project, output="full")
+
+
+def test_a_folder_is_that_of_one_sweep_at_a_time(tmp_path: Path) -> None:
+    project = dice(tmp_path)
+
+    def meanwhile(*_: Any) -> None:
+        with pytest.raises(UsageError, match="a sweep goes on there"):
+            neuros.sweep(project, backend="in-process", output="table")
+
+    neuros.sweep(project, backend="in-process", output="table", on_row=meanwhile)
+    assert not Path("table/.sweep.lock").exists()
 
 
 def test_ctrl_c_keeps_what_is_done_and_what_was_cut_off_is_run_again(tmp_path: Path) -> None:
