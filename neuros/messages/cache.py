@@ -93,6 +93,7 @@ def sweep(cache: Path) -> None:
 
 def _remove_if_older(built: Built, oldest_s: float) -> None:
     if built.is_there and built.folder.stat().st_mtime < oldest_s:
-        shutil.rmtree(built.folder, ignore_errors=True)
+        built.folder.rename(built.draft)  # gone at once: half of it must not count as built
+        shutil.rmtree(built.draft, ignore_errors=True)
     if built.log.exists() and built.log.stat().st_mtime < oldest_s:
         built.log.unlink()
