@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from neuros.errors import Problem
-from neuros.messages.definition import Use, read_definition
+from neuros.messages.definition import Use, package_name_mistake, read_definition
 from neuros.messages.package import MANIFEST, Package, problem_at
 from neuros.messages.workspace import Workspaces
 from neuros.project.suggest import did_you_mean
@@ -22,8 +21,7 @@ def check(packages: Sequence[Package], workspaces: Workspaces) -> list[Problem]:
             text = f"found the name '{package.name}' of a package of ROS, expected another"
             problems.append(problem_at(package.folder / MANIFEST, text))
             continue
-        if package.name in sys.stdlib_module_names:
-            text = f"found the name '{package.name}' of a module of Python, expected another"
+        if text := package_name_mistake(package.name):
             problems.append(problem_at(package.folder / MANIFEST, text))
         problems += _check_package(package, workspaces)
     return problems

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import keyword
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from rosidl_adapter.parser import (
     InvalidValue,
     Type,
     is_valid_message_name,
+    is_valid_package_name,
 )
 
 from neuros.errors import Problem
@@ -34,6 +36,7 @@ _A_TYPE = (
     "bool, byte, char, int8 to int64, uint8 to uint64, float32, float64, string, wstring or"
     " package/Message, and behind it nothing, [], [3] or [<=3]"
 )
+_A_PACKAGE = "a letter, then letters, digits and single '_', all lower case, as 'rover_msgs'"
 _A_FIELD = "a letter, then letters, digits and single '_', all lower case, as 'joint_positions'"
 _A_CONSTANT = "upper case letters, digits and single '_', as 'MAX_SPEED'"
 # Names of fields become names in C, as they are.
@@ -59,6 +62,17 @@ class Definition:
 
     uses: list[Use] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
+
+
+def package_name_mistake(name: str) -> str:
+    """What is wrong with the name of a package, empty if nothing is."""
+    if not is_valid_package_name(name):
+        return f"found the name '{name}', expected {_A_PACKAGE}"
+    if keyword.iskeyword(name):
+        return f"found the name '{name}', expected one that is no keyword of Python"
+    if name in sys.stdlib_module_names:
+        return f"found the name '{name}' of a module of Python, expected another"
+    return ""
 
 
 def read_definition(package: str, file: Path) -> Definition:

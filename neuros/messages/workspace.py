@@ -129,13 +129,20 @@ class Workspaces:
             digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
             digest.update(platform.machine().encode())
             for file in (Path(MANIFEST), *package.files):
-                content = (package.folder / file).read_bytes()
-                digest.update(f"{file.as_posix()}\0{len(content)}\0".encode() + content)
+                digest.update(f"{file.as_posix()}\0".encode() + _content(package.folder / file))
             for name in sorted(package.dependencies):
                 there = keys[name].encode() if name in keys else self.ros.manifest(name)
                 digest.update(f"{name}\0{len(there)}\0".encode() + there)
             keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
         return keys
+
+
+def _content(file: Path) -> bytes:
+    try:
+        content = file.read_bytes()
+    except OSError:
+        return b"unreadable"  # checking says so
+    return f"{len(content)}\0".encode() + content
 
 
 @dataclass(frozen=True)

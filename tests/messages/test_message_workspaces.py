@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -206,13 +207,28 @@ class TestMistakes:
 
         assert "found a message that contains itself: A -> B -> A" in problem
 
+    def test_what_cannot_be_read_is_said(self, bench: Bench) -> None:
+        folder = write_package(bench.own, "a_msgs", POINT)
+        (folder / "msg" / "Lost.msg").symlink_to("nowhere")
+
+        (problem,) = bench.problems()
+
+        assert "a_msgs/msg/Lost.msg:1:1: cannot be read: " in problem
+
     @pytest.mark.parametrize(
-        ("name", "said"), [("std_msgs", "of a package of ROS"), ("random", "of a module of Python")]
+        ("name", "said"),
+        [
+            ("std_msgs", " of a package of ROS"),
+            ("random", " of a module of Python"),
+            ("import", ", expected one that is no keyword"),
+            ("rover-msgs", ", expected a letter, then letters"),
+        ],
     )
     def test_a_name_may_be_taken(self, bench: Bench, name: str, said: str) -> None:
         write_package(bench.own, name, POINT)
 
-        assert any(f"found the name '{name}' {said}" in problem for problem in bench.problems())
+        said = f"found the name '{name}'{said}"
+        assert any(said in problem for problem in bench.problems())
 
     def test_a_manifest_that_is_no_xml_is_said_with_its_line(self, bench: Bench) -> None:
         folder = write_package(bench.own, "a_msgs", POINT)
@@ -262,6 +278,16 @@ class TestCache:
         sweep(old.folder.parent)
 
         assert [path.name for path in old.folder.parent.iterdir()] == [new.folder.name]
+
+    def test_a_half_that_is_left_of_it_does_not_count_as_built(
+        self, bench: Bench, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        old = self.entry(bench, "a_msgs", MONTH_S)
+        monkeypatch.setattr(shutil, "rmtree", lambda *_, **__: None)  # as if it were killed
+
+        sweep(old.folder.parent)
+
+        assert not old.is_there
 
     def test_using_it_keeps_it(self, bench: Bench) -> None:
         old = self.entry(bench, "a_msgs", MONTH_S)
