@@ -11,6 +11,8 @@ from neuros.project.model import Value
 from neuros.project.source import Element
 
 _INT64 = 1 << 63
+# ROS declares these itself, and passes over what is neither true nor false.
+_TRUTH_VALUES = ("use_sim_time", "start_type_description_service")
 
 
 def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
@@ -55,6 +57,8 @@ def _mistakes(group: Element, prefix: str, seen: dict[str, Element]) -> Iterator
             continue
         if seen.setdefault(full, member) is not member:
             yield member.key_problem(f"the parameter '{full}' occurs twice")
+        if full in _TRUTH_VALUES and not isinstance(member.value, bool):
+            yield member.problem("must be true or false, as ROS declares it")
         values = member.value if isinstance(member.value, list) else [member]
         kinds = {_kind(each.value) for each in values}
         if len(kinds) > 1:
