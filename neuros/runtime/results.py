@@ -20,6 +20,7 @@ class Results:
 
     def set(self, name: str, value: Any) -> None:
         """Keep a value. Raises ``TypeError`` or ``ValueError`` for what JSON does not know."""
+        value = _plain(value) if hasattr(value, "tolist") else value
         is_finite = not isinstance(value, float) or math.isfinite(value)
         values = {**self._values, str(name): value if is_finite else None}
         text = json.dumps(values, indent=2, default=_plain, allow_nan=False)

@@ -26,7 +26,7 @@ def test_each_result_is_on_the_disk_at_once_and_a_later_one_takes_its_place(tmp_
     assert [file.name for file in tmp_path.iterdir()] == ["results.json"]
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, np.float64("nan")])
+@pytest.mark.parametrize("value", [math.nan, math.inf, np.float32("nan")])
 def test_what_is_no_finite_number_is_nothing(tmp_path: Path, value: float) -> None:
     Results(tmp_path).set("gain", value)
     assert results_in(tmp_path) == {"gain": None}
