@@ -62,6 +62,13 @@ class Finder:
         hint = f"name its folder with -I, or in {' or '.join(PATH_VARIABLES[:2])}"
         raise NotFound(f"'{uri}' cannot be found", "" if scheme == "file" else hint)
 
+    def find_file(self, uri: str, here: Path) -> Path:
+        """The same where only a file will do."""
+        found = self.find(uri, here)
+        if not found.is_file():
+            raise NotFound(f"'{uri}' is no file")
+        return found
+
     def _by_name(self, rest: str, here: Path, scheme: str) -> Iterator[Path]:
         name, _, inside = rest.partition("/")
         for folder in (*self.folders, *([] if scheme == "model" else self.packages)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from neuros.convert.report import Report
 
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
+_CONVERTERS = ("trimesh", "collada")
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
@@ -46,7 +48,7 @@ class Meshes:
         A solid one has a volume, from which MuJoCo computes its mass.
         """
         try:
-            file = self.finder.find(uri.text, uri.file.parent)
+            file = self.finder.find_file(uri.text, uri.file.parent)
         except NotFound as error:
             if is_needed:
                 self.report.problem(uri, str(error), error.hint)
@@ -57,7 +59,7 @@ class Meshes:
         if key not in self._names:
             self._names[key] = self._new(uri, file, scale, is_solid)
         elif self._names[key] is None:
-            self._note_unreadable(uri, file)
+            self.report.note(uri, why_unread(file))
         return self._names[key]
 
     def blame(self) -> None:
@@ -82,7 +84,7 @@ class Meshes:
         if needs_conversion(file):
             triangles = triangles_of(file)
             if triangles is None:
-                self._note_unreadable(uri, file)
+                self.report.note(uri, why_unread(file))
                 return None
         name, number = file.stem, 1
         while name in self._places:
@@ -99,10 +101,15 @@ class Meshes:
             self.made[name] = triangles
         return name
 
-    def _note_unreadable(self, uri: Element, file: Path) -> None:
-        kind = "STL in text form" if _is_text_stl(file) else f"{file.suffix or 'such'} files"
-        advice = _HOW if file.suffix.lower() in (*_CONVERTED, ".stl") else "convert it to OBJ"
-        self.report.note(uri, f"MuJoCo does not read {kind}: {advice}")
+
+def why_unread(file: Path) -> str:
+    """Why a file that needs conversion has no triangles here, and what to do."""
+    kind = "STL in text form" if _is_text_stl(file) else f"{file.suffix or 'such'} files"
+    if file.suffix.lower() not in (*_CONVERTED, ".stl"):
+        return f"MuJoCo does not read {kind}: convert it to OBJ"
+    if not all(map(find_spec, _CONVERTERS)):
+        return f"MuJoCo does not read {kind}: {_HOW}"
+    return "no triangles can be read from it (is it damaged?): convert it to OBJ"
 
 
 def needs_conversion(file: Path) -> bool:
@@ -137,7 +144,7 @@ def triangles_of(file: Path) -> Triangles | None:
         scene = trimesh.load_scene(str(file))
         mesh = scene.to_geometry()
         unit = float(trimesh.units.unit_conversion(mesh.units or "meters", "meters"))
-    except (ImportError, ValueError, NotImplementedError, AttributeError):
+    except Exception:  # readers of other people's make raise anything for a damaged file
         return None
     if not len(getattr(mesh, "faces", ())):
         return None

@@ -30,6 +30,8 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
     for mesh in spec.meshes:
         if mesh.name in converted.made_meshes:
             file = folder / f"{output.stem}_meshes" / f"{_file_name(mesh.name)}.obj"
+            while file in written:  # names that differ in what no file name has
+                file = file.with_stem(f"{file.stem}_")
             _write_obj(file, converted.made_meshes[mesh.name])
             written.append(file)
             mesh.uservert, mesh.userface, mesh.file = [], [], str(file)

@@ -17,7 +17,7 @@ from neuros.convert.converted import Converted
 from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of
+from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of, why_unread
 from neuros.convert.report import Report
 from neuros.errors import Problem
 
@@ -45,8 +45,7 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     assert isinstance(root, Element)
     if root.tag != "robot":
         report.problem(root, f"a URDF file begins with <robot>, not with <{root.tag}>")
-    # ElementTree writes it again; the elements with places stand in the same order.
-    tree = ElementTree.parse(file)
+    tree = ElementTree.ElementTree(_copy(root))
     converted = _resolve_meshes(tree, root, finder, report)
     report.raise_any()
     _keep_names(tree)
@@ -72,9 +71,9 @@ def _resolve_meshes(
         uri = element.attributes["filename"]
         try:
             try:
-                path = finder.find(uri, root.file.parent)
+                path = finder.find_file(uri, root.file.parent)
             except NotFound:
-                path = finder.find(str(folder / Path(uri).name), root.file.parent)
+                path = finder.find_file(str(folder / Path(uri).name), root.file.parent)
         except NotFound:
             report.problem(
                 element, f"'{uri}' cannot be found", "packages are folders above the file"
@@ -83,9 +82,7 @@ def _resolve_meshes(
         twin.set("filename", str(path))
         if needs_conversion(path):
             if triangles_of(path) is None:
-                report.problem(
-                    element, f"MuJoCo does not read {path.suffix}", "pip install 'neuros[meshes]'"
-                )
+                report.problem(element, why_unread(path))
             converted[str(path)] = path
     return converted
 
@@ -142,6 +139,14 @@ def _mimic(spec: Any, mimic: Element, report: Report) -> None:
         for key, default in (("offset", 0.0), ("multiplier", 1.0))
     )
     follow_joint(spec, joint.name, leader, offset, ratio)
+
+
+def _copy(element: Element) -> ElementTree.Element:
+    """What writes it as XML again, in the same order; prefixes of names may stand for nothing."""
+    copy = ElementTree.Element(element.tag, element.attributes)
+    copy.text = element.text
+    copy.extend(map(_copy, element.children))
+    return copy
 
 
 def _all(element: Element) -> Iterator[Element]:

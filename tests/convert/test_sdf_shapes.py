@@ -112,6 +112,21 @@ def test_what_is_no_mesh_is_a_problem_with_its_line(folder: Folder) -> None:
     assert problem.startswith("4:1: model[robot]/link[base]/collision[hull]/geometry/mesh/uri: ")
 
 
+@pytest.mark.parametrize("name", ["a.dae", "a.gltf", "a.ply", "a.glb"])
+def test_a_damaged_mesh_of_another_kind_is_listed(folder: Folder, name: str) -> None:
+    folder.write(name, "this is no mesh")
+    mesh = f"<geometry><mesh><uri>{name}</uri></mesh></geometry>"
+    notes = folder.notes(link("base", f'<visual name="skin">{mesh}</visual>'))
+    assert "no triangles can be read from it (is it damaged?): convert it to OBJ" in notes.values()
+
+
+def test_a_folder_is_no_mesh(folder: Folder) -> None:
+    (folder.path / "a.stl").mkdir()
+    mesh = "<geometry><mesh><uri>a.stl</uri></mesh></geometry>"
+    (problem,) = folder.problems(link("base", f'<collision name="hull">{mesh}</collision>'))
+    assert problem.endswith("'a.stl' is no file")
+
+
 def test_links_of_one_model_collide_only_if_it_says_so(folder: Folder) -> None:
     shape = f'<collision name="hull">{BOX}</collision>'
     two = link("a", shape) + link("b", shape)

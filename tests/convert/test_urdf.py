@@ -95,6 +95,11 @@ def test_what_mujoco_passes_over_is_listed_and_mimic_is_made(folder: Folder) -> 
     np.testing.assert_allclose(data.efc_pos, 0, atol=1e-12)
 
 
+def test_a_prefix_need_not_be_declared_as_for_others_that_read_urdf(folder: Folder) -> None:
+    extra = "<gazebo><ignition:frame_id>a</ignition:frame_id></gazebo>"
+    assert described(folder, ARM + extra).bodies == described(folder, ARM).bodies
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
