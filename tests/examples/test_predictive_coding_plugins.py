@@ -120,6 +120,7 @@ def test_the_judge_compares_what_belongs_together(tmp_path, view):
             judge.run()
         judge.finalise()
         found = json.loads((judge.run_dir / "heading.json").read_text())
+        assert json.loads((judge.run_dir / "results.json").read_text()) == found
     assert found["views"] == 3
     assert found["rms_deg"] == pytest.approx(math.sqrt(100 / 3))
     assert found["median_deg"] == pytest.approx(6.0)

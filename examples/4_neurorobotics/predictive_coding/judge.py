@@ -41,6 +41,8 @@ def report(node):
         "chance_deg": CHANCE_DEG,
         "image_error": float(np.mean(image_error)),
     }
+    for name, value in found.items():
+        node.set_result(name, value)
     (node.run_dir / "heading.json").write_text(json.dumps(found, indent=2) + os.linesep)
     node.get_logger().info(
         f"heading from {found['views']} views: RMS {found['rms_deg']:.2f} deg, "
