@@ -13,7 +13,7 @@ shutdown    when a plugin calls ``node.shutdown``                     node, reas
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines
 heard       from a node of another launcher; null: it is gone         node, text
-glimpse     in answer to ``look``                                     node, ... (see runtime)
+glimpse     in answer to ``look``                                     node, asker, ...
 =========== ========================================================= =====================
 
 ======= ================================================ =================
@@ -28,7 +28,7 @@ leave   all is said and heard: a node at its end may go
 pause   start no further hook
 resume  go on
 step    while paused, go on by so many steps             count, is_driven
-look    show what you do; what to sample, by node        wanted
+look    show what you do; what to sample, by node        wanted, asker
 ======= ================================================ =================
 
 Onlookers (the dashboard) are on the same channel, and get no more than they ask for:
@@ -37,7 +37,7 @@ Onlookers (the dashboard) are on the same channel, and get no more than they ask
 kind    sent by an onlooker                              fields
 ======= ================================================ =================
 watch   it is there
-look    all nodes are to show what they do, once         wanted
+look    all nodes are to show it what they do, once      wanted
 pause   the run stands still
 resume  the run goes on
 step    while it stands still, let it do so many steps   count
@@ -48,7 +48,7 @@ signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 kind    sent to onlookers                                fields
 ======= ================================================ =================
-glimpse what a node does, passed on                      node, ...
+glimpse what a node does, for the one that asked         node, ...
 phase   where the run is in its life                     phase, is_paused
 log     what the launcher itself tells the user          severity, text
 ended   all nodes have ended                             exit_code, reason

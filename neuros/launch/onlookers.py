@@ -80,12 +80,13 @@ class Onlookers:
         self._pause = pause
         self._is_driven = is_driven
         self._end = end
-        self._lines: list[Lines] = []
+        self._lines: dict[int, Lines] = {}  # by their numbers, which are not given out again
+        self._count = 0
         self._told: tuple[str, bool] | None = None
         self.handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "watch": self._on_watch,
-            "look": lambda _, message: channels.send("look", wanted=message["wanted"]),
-            "glimpse": lambda _, message: self.tell(**message),
+            "look": self._on_look,
+            "glimpse": self._on_glimpse,
             "pause": lambda *_: pause.begin(),
             "resume": lambda *_: pause.end(),
             "step": self._on_step,
@@ -94,7 +95,7 @@ class Onlookers:
 
     def tell(self, kind: str, **fields: Any) -> None:
         """Send to all onlookers."""
-        for lines in self._lines:
+        for lines in self._lines.values():
             self._channels.send_to(lines, kind, **fields)
 
     def look_at(self, phase: Phase) -> None:
@@ -103,7 +104,7 @@ class Onlookers:
             self._pause.forget()
         if not self._lines:
             return
-        self._lines = [lines for lines in self._lines if self._channels.has(lines)]
+        self._lines = {n: lines for n, lines in self._lines.items() if self._channels.has(lines)}
         if not self._lines:
             self._pause.end()
         now = (phase.value, self._pause.is_on)
@@ -116,8 +117,19 @@ class Onlookers:
         self.tell("ended", exit_code=outcome.exit_code, reason=outcome.reason)
 
     def _on_watch(self, lines: Lines, _: Mapping[str, Any]) -> None:
-        self._lines.append(lines)
+        self._count += 1
+        self._lines[self._count] = lines
         self._told = None
+
+    def _on_look(self, asking: Lines, message: Mapping[str, Any]) -> None:
+        for number, lines in self._lines.items():
+            if lines is asking:
+                self._channels.send("look", wanted=message["wanted"], asker=number)
+
+    def _on_glimpse(self, _: Lines, message: Mapping[str, Any]) -> None:
+        lines = self._lines.get(message["asker"])
+        if lines is not None:
+            self._channels.send_to(lines, **message)
 
     def _on_step(self, _: Lines, message: Mapping[str, Any]) -> None:
         self._pause.step(int(message["count"]), is_driven=self._is_driven())

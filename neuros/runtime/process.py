@@ -124,10 +124,10 @@ class NodeProcess:
         for node in self._nodes:
             node.step(count, is_driven=is_driven)
 
-    def look(self, wanted: Mapping[str, Any]) -> None:
-        """Show onlookers what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
+    def look(self, wanted: Mapping[str, Any], asker: int) -> None:
+        """Show an onlooker what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
         for node in tuple(self._nodes):
-            self._tell("glimpse", **node.reports.look(wanted.get(node.name, {})))
+            self._tell("glimpse", **node.reports.look(wanted.get(node.name, {}), asker))
 
     def probe(self, number: int) -> None:
         """Report the state of all nodes at one moment. Loop thread only."""

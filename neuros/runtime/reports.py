@@ -76,18 +76,20 @@ class NodeReports:
             "is_driving": engine is not None and engine.is_driving,
         }
 
-    def look(self, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> dict[str, Any]:
         """What an onlooker is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
             wanted: what to sample for the next time (see :class:`Sampler`).
+            asker: the number of the onlooker.
         """
         engine = self._engine
         return {
             "node": self._file.node.name,
+            "asker": asker,
             "sim_time": self._time.now_s,
             "books": None if engine is None else glimpse(engine, self._clock()),
-            "samples": self._sampler.ask(wanted),
+            "samples": self._sampler.ask(wanted, asker),
         }
 
     def probe(self) -> dict[str, Any]:

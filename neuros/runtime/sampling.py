@@ -1,9 +1,9 @@
 """What onlookers see of the packets that pass a node: as few as they ask for, and none unasked.
 
-An onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled since,
-and a few packets more are looked at, on the thread that sends them, when they pass anyway. So a
-node that nobody asks pays for one look at an empty table per packet, and one that is asked for so
-many packets per question at most, however fast it sends.
+Each onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
+since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
+So a node that nobody asks pays for one look at an empty table per packet, and one that is asked for
+so many packets per question at most, however fast it sends.
 """
 
 from __future__ import annotations
@@ -72,31 +72,40 @@ class Sampler:
     """Looks at packets for onlookers.
 
     Attributes:
-        requests: by port (an output's name, or the topic of an external input), what is wanted;
-            empty as long as nobody looks.
+        requests: by port (an output's name, or the topic of an external input), what is wanted by
+            each onlooker; empty as long as nobody looks.
     """
 
     def __init__(self) -> None:
-        self.requests: dict[str, _Request] = {}
-        self._asked: dict[str, _Request] = {}
+        self.requests: dict[str, list[_Request]] = {}
+        self._asked: dict[int, dict[str, _Request]] = {}
 
     def note(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""
-        request = self.requests.get(port)
-        if request is not None:
-            request.look_at(packet)
-            # Meanwhile the next question may have come.
-            if request.is_met and self.requests.get(port) is request:
-                del self.requests[port]
+        waiting = self.requests  # the next question, which may come meanwhile, brings another one
+        requests = waiting.get(port)
+        if requests is not None:
+            for request in requests:
+                request.look_at(packet)
+            if all(request.is_met for request in requests):
+                del waiting[port]
 
-    def ask(self, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """What was found since the last question; ``wanted`` is the next one. Any other thread.
+    def ask(self, wanted: Mapping[str, Mapping[str, Any]], asker: int = 0) -> dict[str, Any]:
+        """What was found since the ``asker``'s last question; ``wanted`` is its next one.
+
+        One thread only, which need not be that of the hooks.
 
         Of each port: ``fields``, paths like ``pose.position.x`` or ``data[3]``, read of up to
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
         ``most_elements``); ``image``, a small picture of one packet.
         """
-        answers = {port: answer for port, r in self._asked.items() if (answer := r.answer())}
-        self._asked = {port: _Request(each) for port, each in wanted.items()}
-        self.requests = dict(self._asked)
+        asked = self._asked.get(asker, {})
+        answers = {port: answer for port, request in asked.items() if (answer := request.answer())}
+        self._asked[asker] = {port: _Request(each) for port, each in wanted.items()}
+        waiting: dict[str, list[_Request]] = {}
+        for requests in self._asked.values():
+            for port, request in requests.items():
+                if not request.is_met:
+                    waiting.setdefault(port, []).append(request)
+        self.requests = waiting
         return answers

@@ -75,18 +75,26 @@ def test_an_onlooker_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines.close()
 
 
-def test_what_nodes_show_goes_to_onlookers_only(run: Run) -> None:
-    node, onlooker = run.join(), run.join()
-    onlooker.send("watch")
-    run.hear()
-    onlooker.send("look", wanted={"a": {}})
-    run.hear()
-    assert told(node, 1) == [{"kind": "look", "wanted": {"a": {}}}]
-    node.send("glimpse", node="a", books=None)
-    run.hear()
-    assert told(onlooker, 2)[1] == {"kind": "glimpse", "node": "a", "books": None}
-    node.close()
-    onlooker.close()
+def test_what_nodes_show_goes_to_the_onlooker_that_asked(run: Run) -> None:
+    node, first, second = run.join(), run.join(), run.join()
+    for onlooker in (first, second):
+        onlooker.send("watch")
+        run.hear()
+    for onlooker, wanted in ((first, {"a": {"x": {}}}), (second, {})):
+        onlooker.send("look", wanted=wanted)
+        run.hear()
+    looks = told(node, 2)
+    assert [look["wanted"] for look in looks] == [{"a": {"x": {}}}, {}]
+    for look in looks:
+        node.send("glimpse", node="a", asker=look["asker"], samples=look["wanted"].get("a", {}))
+    run.hear(2)
+    for onlooker, samples in ((first, {"x": {}}), (second, {})):
+        run.onlookers.tell("log", severity="INFO", text="that is all")
+        found = [each for each in told(onlooker, 3) if each["kind"] in ("glimpse", "log")]
+        assert [each["kind"] for each in found[:2]] == ["glimpse", "log"]
+        assert found[0]["samples"] == samples
+    for lines in (node, first, second):
+        lines.close()
 
 
 def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> None:

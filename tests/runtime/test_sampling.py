@@ -44,6 +44,34 @@ def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
     assert sampler.ask({}) == {}
 
 
+def test_each_onlooker_gets_what_it_asked_for() -> None:
+    sampler = Sampler()
+    sampler.ask({"imu": {"fields": ["angular_velocity.z"]}}, asker=1)
+    sampler.note("imu", imu(1.0))
+    sampler.ask({"imu": {"all": True}, "camera": {"image": True}}, asker=2)
+    sampler.note("imu", imu(2.0))
+    assert [row[1] for row in sampler.ask({}, asker=1)["imu"]["values"]] == [1.0, 2.0]
+    answers = sampler.ask({}, asker=2)
+    assert list(answers) == ["imu"]
+    assert answers["imu"]["all"]["angular_velocity.z"] == 2.0
+    assert "values" not in answers["imu"]
+
+
+def test_a_question_that_comes_while_a_packet_is_looked_at_counts_from_the_next_one() -> None:
+    class Asking:
+        @property
+        def z(self) -> float:
+            sampler.ask({"camera": {"image": True}})
+            return 1.0
+
+    sampler = Sampler()
+    sampler.ask({"imu": {"all": True, "fields": ["z"]}})
+    for _ in range(MOST_VALUES - 1):
+        sampler.note("imu", Imu())
+    sampler.note("imu", Asking())
+    assert list(sampler.requests) == ["camera"]
+
+
 def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
     sampler = Sampler()
     image = Image(width=2, height=1, step=2, encoding="mono8", data=array("B", b"\x01\x02"))
