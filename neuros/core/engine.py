@@ -150,8 +150,7 @@ class Engine:
         self._wake()
         self._life.drain()
         self._cause = self.rest()
-        if self._gate.is_closed:
-            self.resume()
+        self.resume()
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`, but for initialise hooks and steps.
@@ -164,9 +163,10 @@ class Engine:
         self._cause = self.rest()
 
     def resume(self) -> None:
-        """Go on after a pause."""
-        self._gate.open(self._wake())
-        self._pass()
+        """Go on after a pause; without one it has no effect."""
+        if self._gate.is_closed:
+            self._gate.open(self._wake())
+            self._pass()
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.

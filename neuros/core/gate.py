@@ -52,6 +52,7 @@ class Gate:
         self._life.tick_start_ns += paused_ns
         for hook in self._ticks:
             hook.postpone(paused_ns)
+            hook.is_due = hook.due_ns <= now_ns  # a step may have made it due before its time
 
     def grant(self, steps: int, *, is_driven: bool) -> None:
         """Allow further steps; ``is_driven``: some node of the project has hooks that drive."""

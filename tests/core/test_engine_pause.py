@@ -113,6 +113,33 @@ def test_a_pause_is_no_time_for_ticks():
     assert figures["ticks"]["max_ms"] == 1000.0
 
 
+def test_a_tick_that_a_step_could_not_start_waits_for_its_own_time():
+    bench = Bench(tick("t", 1.0, outputs="o", returns="reading"), connections=[wire(OUT, 0)])
+    bench.pass_time(1.0)
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)  # its receiver is behind
+    bench.clock.advance(0.5)
+    bench.engine.resume()
+    bench.acknowledge_to_node(OUT, 1)
+    assert bench.ran == ["t"]
+    bench.pass_time(1.0)
+    assert bench.ran == ["t", "t"]
+    assert bench.hook("t").missed_ticks == 0
+
+
+def test_a_tick_that_was_due_when_the_pause_began_is_due_when_it_ends():
+    bench = Bench(tick("t", 1.0, outputs="o", returns="reading"), connections=[wire(OUT, 0)])
+    bench.pass_time(1.0)
+    bench.pass_time(1.0)
+    assert bench.ran == ["t"]
+    bench.engine.pause()
+    bench.clock.advance(10.0)
+    bench.acknowledge_to_node(OUT, 1)
+    bench.engine.resume()
+    assert bench.ran == ["t", "t"]
+    assert bench.hook("t").missed_ticks == 0
+
+
 def test_paused_time_has_an_account_of_its_own():
     bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
     bench.clock.advance(1.0)
