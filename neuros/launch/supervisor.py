@@ -76,6 +76,7 @@ class Supervisor:
         self._output = output = Overheard(output, lambda *a, **k: self.onlookers.tell(*a, **k))
         self._wishes = wishes
         self._duration_s = duration_s
+        self._paused_before_s = 0.0  # the first hook
         self._sides = sides or Sides("", (), files)
         names = [file.node.name for file in files]
         self._channels = Channels(run_folder)
@@ -171,6 +172,7 @@ class Supervisor:
     def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
         if self.outcome.started_s is None:
             self.outcome.started_s = time.monotonic()
+            self._paused_before_s = self.pause.total_s
 
     def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
         reason = f": {message['reason']}" if message["reason"] else ""
@@ -210,11 +212,18 @@ class Supervisor:
         """How long nothing needs to be looked at; ``has_shown``: nodes are logging now."""
         if has_shown or self._ending.phase is not Phase.RUNNING:
             return _TICK_S
+        end_s = self._end_s
+        if end_s is None:
+            return _QUIET_TICK_S
+        return min(_QUIET_TICK_S, max(0.0, end_s - time.monotonic()))
+
+    @property
+    def _end_s(self) -> float | None:
+        """When its duration is over, ``None``: never, or not known yet."""
         limit_s, started_s = self._duration_s, self.outcome.started_s
         if limit_s is None or started_s is None:
-            return _QUIET_TICK_S
-        end_s = started_s + limit_s + self.pause.total_s
-        return min(_QUIET_TICK_S, max(0.0, end_s - time.monotonic()))
+            return None
+        return started_s + limit_s + self.pause.total_s - self._paused_before_s
 
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
@@ -231,10 +240,9 @@ class Supervisor:
         if self.pause.is_on:
             self._watch.begin_anew(now_s)
             return
-        started_s, limit_s = self.outcome.started_s, self._duration_s
-        running_s = None if started_s is None else now_s - started_s - self.pause.total_s
-        if limit_s is not None and running_s is not None and running_s >= limit_s:
-            self._ending.drain(f"{limit_s:g} s are over", STOP_S)
+        end_s = self._end_s
+        if end_s is not None and now_s >= end_s:
+            self._ending.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
         for severity, text in (*self._watch.remarks(now_s), *self._sides.remarks(now_s)):
             self._output.log(severity, text)

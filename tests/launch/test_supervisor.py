@@ -177,6 +177,21 @@ def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> N
     assert 0.3 <= outcome.ending_s - outcome.started_s < 0.6
 
 
+def test_a_pause_before_the_first_hook_leaves_the_duration_as_it_is(run: Run) -> None:
+    paused = "host.tell('pause'); time.sleep(1.0); host.tell('resume')"
+    act = f"host.hello(); host.report(); import time; {paused}; host.tell('first_hook')"
+    outcome = run(a=f"{act}; host.serve()", duration_s=0.3)
+    assert outcome.reason == "0.3 s are over"
+    assert 0.3 <= outcome.ending_s - outcome.started_s < 1.0
+
+
+def test_a_pause_is_no_part_of_the_duration(run: Run) -> None:
+    pauses = "host.up(); import time; host.tell('pause'); time.sleep(0.6); host.tell('resume'); "
+    outcome = run(a=f"{pauses} host.serve()", duration_s=0.3)
+    assert outcome.reason == "0.3 s are over"
+    assert outcome.ending_s - outcome.started_s >= 0.85
+
+
 DRAINED_AFTER_A_LONG_HOOK = """
 host.up()
 host.wait_for('drain')
