@@ -47,6 +47,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 napoleon_use_ivar = True
+# The theme makes the whole navigation anew for each of 400 pages; with every function in it, that
+# took four minutes.
+toc_object_entries = False
 # What an installation without further extras has not; no page says anything about these.
 autodoc_mock_imports = [
     "debugpy",

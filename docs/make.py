@@ -9,6 +9,7 @@ the world, too, and does need a network.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -21,6 +22,8 @@ def main(arguments: list[str]) -> int:
     from sphinx.cmd.build import main as sphinx
 
     builder, *further = arguments or ["html"]
+    if "--fresh-env" in further:
+        shutil.rmtree(DOCS / "build", ignore_errors=True)  # Sphinx leaves pages of what is no more
     folders = ["-c", str(DOCS), "-d", str(DOCS / "build" / "doctrees"), str(ROOT)]
     strict = ["--fail-on-warning", "--quiet", "--jobs", "auto"]
     code = sphinx(["-b", builder, *strict, *further, *folders, str(DOCS / "build" / builder)])

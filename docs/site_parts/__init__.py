@@ -16,4 +16,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("doctree-read", links.lead_to_pages)
     app.add_directive("mermaid", diagrams.Mermaid)
     app.connect("html-page-context", diagrams.add_scripts)
+    app.connect("html-page-context", contents.leave_out_of_source, priority=400)  # before the theme
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import posixpath
 import re
+from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 
 _INDEX, _GALLERY = "docs/index", "examples/README"
@@ -37,6 +39,14 @@ def add_toctrees(app: Sphinx, page: str, source: list[str]) -> None:
             )
     elif page == _GALLERY:
         source[0] += _toctree("", [_name("examples", link) for link in _EXAMPLE.findall(source[0])])
+
+
+def leave_out_of_source(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: nodes.document | None
+) -> None:
+    """No navigation beside source code: 350 pages of it, each with all of it, take a minute."""
+    if page.startswith("_modules/"):
+        context["toctree"] = lambda **_: ""
 
 
 def _toctree(title: str, entries: list[str]) -> str:
