@@ -68,6 +68,8 @@ nitpicky = True
 # Types of other projects are not linked, since no network is needed, nor private ones.
 nitpick_ignore_regex = [("py:.*", r"(?!neuros\.).*"), ("py:class", r".*\._\w+")]
 
+smartquotes = False  # options begin with two hyphens
+
 html_theme = "furo"
 html_title = "NeuROS"
 html_static_path = ["_static"]

@@ -1,6 +1,7 @@
 // Draws all diagrams of a page, in the colours that the reader has chosen, and again when these change.
 "use strict";
 
+const SMALLEST = 1.6; // times smaller than drawn
 const preference = window.matchMedia("(prefers-color-scheme: dark)");
 
 function isDark() {
@@ -17,6 +18,10 @@ async function draw() {
   }
   mermaid.initialize({ startOnLoad: false, theme: isDark() ? "dark" : "neutral" });
   await mermaid.run({ nodes: diagrams });
+  // They are made to fit; those that nobody could read then are scrolled instead.
+  for (const svg of document.querySelectorAll("pre.mermaid svg")) {
+    svg.style.minWidth = `${svg.viewBox.baseVal.width / SMALLEST}px`;
+  }
 }
 
 document.addEventListener("DOMContentLoaded", () => {

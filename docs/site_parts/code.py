@@ -48,7 +48,7 @@ def _page(root: Path, package: str, modules: list[str]) -> str:
 
 def _class_diagram(root: Path, package: str) -> str:
     text = uml.class_diagram(sorted((root / package.replace(".", "/")).glob("*.py")))
-    return f"\n## Classes\n\n```mermaid\n{text}\n```\n" if text else ""
+    return f"\n## Class diagram\n\n```mermaid\n{text}\n```\n" if text else ""
 
 
 def _diagrams(root: Path) -> str:

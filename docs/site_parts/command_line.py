@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from collections.abc import Iterator
 
 from site_parts.words import as_text, cell
@@ -36,7 +37,7 @@ def _section(of: argparse.ArgumentParser) -> str:
     described = f"{as_text(of.description)}\n" if of.description else ""
     rows = [_row(of, action) for action in of._actions if action.help != argparse.SUPPRESS]
     table = "\n".join(["| | |", "| --- | --- |", *(row for row in rows if row)])
-    usage = " ".join(of.format_usage().removeprefix("usage: ").split())
+    usage = textwrap.fill(of.format_usage().removeprefix("usage: "), 85, subsequent_indent="    ")
     return f"\n## {of.prog}\n\n{described}\n```text\n{usage}\n```\n\n{table}\n"
 
 

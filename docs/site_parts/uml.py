@@ -51,7 +51,10 @@ def _read(node: ast.ClassDef) -> Class:
             result.attributes.append(part.target.id)
             result.uses |= _names(part.annotation)
         elif isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef):
-            is_property = any("property" in ast.unparse(d) for d in part.decorator_list)
+            marks = [ast.unparse(each) for each in part.decorator_list]
+            if any(mark.endswith(".setter") for mark in marks):
+                continue
+            is_property = any("property" in mark for mark in marks)
             (result.attributes if is_property else result.methods).append(part.name)
             if part.name == "__init__":
                 for argument in (*part.args.args, *part.args.kwonlyargs):
