@@ -17,6 +17,7 @@ from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import describe
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
+from neuros.runtime.wrong_fields import wrong_field
 
 
 class NodeEffects:
@@ -94,9 +95,19 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(connections[0].source_output, packet)
-        data = self._transport.send(connections, packet)
+        try:
+            data = self._transport.send(connections, packet)
+        except Exception:
+            self._blame_plugin(connections[0].source_output, packet)
+            raise
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
+
+    def _blame_plugin(self, output: str, packet: Any) -> None:
+        """Where a packet could not be sent since the plugin has filled it wrongly, say so."""
+        if wrong := wrong_field(packet):
+            where = str(self._handle.description.plugin)
+            raise HookError(f"packet for output '{output}': {wrong}", where=where) from None
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on an external topic."""
@@ -104,7 +115,11 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(port.name, packet)
-        self._transport.send_external(port, packet)
+        try:
+            self._transport.send_external(port, packet)
+        except Exception:
+            self._blame_plugin(port.name, packet)
+            raise
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, port.name, packet)
 

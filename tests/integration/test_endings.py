@@ -234,6 +234,19 @@ def test_a_hook_that_fails_is_named_last_with_its_cause(bench: Bench) -> None:
     assert bench.saved("a", "b")
 
 
+def test_a_packet_that_cannot_be_sent_is_named_with_its_output_and_field(bench: Bench) -> None:
+    fills = "    packet = node.make_packet('o')\n    packet.data = 'three'\n    return packet\n"
+    bench.project(
+        "a.o -> b.x",
+        a=f"@neuros_tick(seconds=0.1, outputs='o')\ndef fill(node):\n{fills}",
+        b=SINK,
+    )
+    finished = bench.launch("--digests")  # in process packets are serialised for these only
+    what = r"packet for output 'o': field 'data' must be int32, but is 'three' \(str\)"
+    assert_ended(finished, 1, f"node 'a' failed: .*a\\.py: {what}")
+    assert "Traceback" not in finished.output
+
+
 @pytest.mark.parametrize(
     ("plugin", "reason"),
     [
