@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeGuard
 
 from neuros.errors import NeurosError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
@@ -38,8 +39,9 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
     except BaseException as error:
         if isinstance(error, ModuleNotFoundError) and error.name in _GONE:
             raise PluginError(f"{path}: there is no {error.name}: {_GONE[error.name]}") from error
+        line = f":{error.lineno}" if _is_syntax_error_in(error, path) else ""
         raise PluginError(
-            f"{path}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
+            f"{path}{line}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
         ) from error
     specs = hook_specs_of(vars(module))
     if not specs:
@@ -48,6 +50,10 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
             " from neuros.hooks"
         )
     return specs
+
+
+def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxError]:
+    return isinstance(error, SyntaxError) and error.filename == str(path)
 
 
 def describe(error: BaseException) -> str:

@@ -47,7 +47,7 @@ def echo(plugin, text: str = "") -> PluginHarness:
     [
         ("import neuros.gazebo", r"there is no neuros.gazebo: MuJoCo stands in for Gazebo"),
         ("import no_such_module", r"cannot be imported: ModuleNotFoundError.*no_such_module"),
-        ("def f(:", r"cannot be imported: SyntaxError"),
+        ("def f(:", r"plugin\.py:2: cannot be imported: SyntaxError"),
         ("raise SystemExit(3)", r"cannot be imported: SystemExit: 3"),
         ("x = 1", r"declares no hooks: mark functions with @neuros_function"),
     ],
