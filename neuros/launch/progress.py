@@ -5,6 +5,7 @@ Standard library and ``tqdm``, which lays out the bar; nothing here writes or wa
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple, Protocol
 
 _WINDOW_S = 5.0
 """Rates are those of the last few reports, not of the whole run."""
+_BESIDE_TEXT = 18
+"""Columns: the percentage, and a bar that can be seen."""
 
 
 class Reported(Protocol):
@@ -70,9 +73,13 @@ class Progress:
         now = self._read()
         if now is None:
             return ""
-        share, text = self._share(now), self.text()
+        share = self._share(now)
+        parts = [self._how_far(now), *self._figures(now)]
         if share is None:
-            return text[: columns - 1]
+            return ", ".join(parts)[: columns - 1]
+        while len(parts) > 2 and len(", ".join(parts)) > columns - _BESIDE_TEXT:
+            del parts[-2]  # the last is the time that is left
+        text = ", ".join(parts)
         # What tqdm makes of n and total is a bar and a percentage; the rest is ours.
         layout = "{percentage:3.0f}%|{bar}| " + text
         line: str = tqdm.format_meter(
@@ -112,7 +119,7 @@ class Progress:
             of = "" if end_s is None or self._wall_s is not None else f" of {end_s:g}"
             return f"{now.sim_s:.1f}{of} s simulated"
         of = "" if self._wall_s is None else f" of {self._wall_s:g}"
-        return f"{self._elapsed_s(now):.0f}{of} s"
+        return f"{min(self._elapsed_s(now), self._wall_s or math.inf):.0f}{of} s"
 
     def _figures(self, now: _Reading) -> list[str]:
         first = self._readings[0]

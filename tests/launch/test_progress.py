@@ -75,6 +75,18 @@ def test_without_an_end_there_is_no_bar_and_nothing_is_said_to_be_left() -> None
     assert progress.bar(80, is_ascii=True) == "1 s, 50 packets/s, 0 discarded"
 
 
+def test_on_a_narrow_terminal_the_bar_and_the_time_that_is_left_stay() -> None:
+    progress = run(Clock(), [report(0.0, 0), report(4.0, 400), report(8.0, 800, 3)], sim_s=20.0)
+    bar = progress.bar(80, is_ascii=True)
+    assert bar.startswith(" 40%|#")
+    assert bar.endswith("| 8.0 of 20 s simulated, 4.00 x real time, 0:03 left")
+
+
+def test_while_packets_under_way_arrive_no_more_time_passes_than_was_asked_for() -> None:
+    progress = run(Clock(), [report(None, n) for n in range(9)], wall_s=7.0)
+    assert progress.text().startswith("7 of 7 s, ")
+
+
 def test_a_bar_shows_the_share_and_never_is_wider_than_the_terminal() -> None:
     progress = run(Clock(), [report(0.0, 0), report(5.0, 10)], sim_s=20.0)
     bar = progress.bar(120, is_ascii=True)
