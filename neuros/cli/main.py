@@ -22,6 +22,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from neuros import __version__
 from neuros.cli.bag import add_bag
@@ -42,6 +43,7 @@ from neuros.cli.sweep import add_sweep
 from neuros.cli.verify import add_verify
 from neuros.cli.views import add_view, add_view_options
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
+from neuros.project.suggest import did_you_mean
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
@@ -58,6 +60,22 @@ exit codes:
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """A mistyped option is refused by the command that was named, with the usage of that one.
+
+    argparse hands it up to the first parser, whose usage has commands only.
+    """
+
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+        """As argparse does, but nothing stays unknown."""
+        options, unknown = super().parse_known_args(*args, **kwargs)
+        if unknown:
+            hint = did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
+            unknown_text = f"unrecognized arguments: {' '.join(unknown)}"
+            self.error(f"{unknown_text} ({hint})" if hint else unknown_text)
+        return options, unknown
+
+
 def console_script() -> None:
     """Entry point of the installed ``neuros`` command."""
     sys.exit(main(sys.argv[1:]))
@@ -66,6 +84,9 @@ def console_script() -> None:
 def main(arguments: Sequence[str]) -> int:
     """Run one command; returns its exit code. Errors are written for the user."""
     _open_standard_streams()
+    if not arguments:
+        parser().print_help(sys.stderr)
+        return EXIT_USAGE
     options = parser().parse_args(arguments)
     try:
         code = int(options.command(options))
@@ -96,7 +117,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The whole grammar of the command line."""
-    result = argparse.ArgumentParser(
+    result: argparse.ArgumentParser = _Parser(
         prog="neuros",
         description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
         epilog=_EXIT_CODES,

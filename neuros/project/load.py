@@ -110,6 +110,9 @@ def _project_file(path: Path) -> Path:
         hint = did_you_mean(file.name, names)
         problem = Problem(display_name(file), 1, 1, "/", "there is no such file", hint)
         raise ProjectError([problem])
+    if file.suffix == ".py":
+        text, hint = "is a plugin, not a project", f"name its {PROJECT_FILE}, or their folder"
+        raise ProjectError([Problem(display_name(file), 1, 1, "/", text, hint)])
     return file
 
 

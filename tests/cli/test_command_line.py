@@ -119,6 +119,34 @@ def test_wrong_options_end_with_2_as_well(arguments: list[str]) -> None:
     assert end.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("option", "hint"),
+    [("--projct", " (did you mean '--project'?)"), ("--durration=3", " (did"), ("x", "")],
+)
+def test_an_unknown_option_is_refused_with_the_usage_of_its_command(
+    option: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["graph", "project.json", option])
+    error = capsys.readouterr().err
+    assert caught.value.code == 2
+    assert error.startswith("usage: neuros graph")
+    assert f"neuros graph: error: unrecognized arguments: {option}{hint}" in error
+
+
+def test_without_a_command_the_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "run a project" in capsys.readouterr().err
+
+
+def test_a_plugin_in_place_of_its_project_is_refused_as_such(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "plugin.py"]) == 3
+    text = "plugin.py:1:1: /: is a plugin, not a project (name its project.json, or their folder)"
+    assert text in capsys.readouterr().err
+
+
 def test_a_folder_that_cannot_be_written_to_is_one_sentence(
     project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
