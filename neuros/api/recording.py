@@ -124,7 +124,8 @@ def summary(report: Mapping[str, Any]) -> str:
     """One or two lines for the end of a run."""
     topics = report["topics"].values()
     count = sum(topic["recorded"] for topic in topics)
-    lines = [f"recorded {count} packets on {len(topics)} topics: {report['bag']}"]
+    noun = "topic" if len(topics) == 1 else "topics"
+    lines = [f"recorded {count} packets on {len(topics)} {noun}: {report['bag']}"]
     lossy = [topic for topic in topics if topic["is_lossy"]]
     if lossy:
         seen = sum(topic["recorded"] for topic in lossy)
