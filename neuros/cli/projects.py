@@ -8,6 +8,7 @@ from pathlib import Path
 
 from neuros.api import loading
 from neuros.errors import UsageError
+from neuros.launch.containers import misspelt
 from neuros.messages.needed import Messages
 from neuros.project.model import Project
 
@@ -42,4 +43,8 @@ def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
     )
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
+    for node in loaded.project.nodes:
+        if meant := misspelt(node.container, loaded.project.folder):
+            text = f"there is no container '{node.container}' (did you mean '{meant}'?)"
+            print(f"warning: node '{node.name}': {text}", file=sys.stderr)
     return loaded.project, messages

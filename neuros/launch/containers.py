@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ FOLDER = "containers"
 OWN_FOLDER = Path(__file__).resolve().parents[2] / FOLDER
 """NeuROS's own; they are part of the source checkout."""
 
+_SLIP = 0.9
+"""Similarity (difflib) of ``neuros_pyton`` and ``neuros_python``; of unlike names it is less."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 
 
@@ -52,3 +55,15 @@ def find_container(name: str, project: Path, own: Path = OWN_FOLDER) -> Containe
     name = bare_name(name)
     folder = folder_of(name, [project / FOLDER, own])
     return ContainerFolder(name, folder, folder.parent == own) if folder else None
+
+
+def misspelt(container: str, project: Path, own: Path = OWN_FOLDER) -> str:
+    """The folder that was probably meant where there is none of this name; empty if none was.
+
+    A name without a folder may be that of an image, so only slips of the pen count.
+    """
+    name = bare_name(container)
+    if not _NAME.fullmatch(name) or find_container(name, project, own) is not None:
+        return ""
+    known = [each.name for place in (project / FOLDER, own) for each in place.glob("*/")]
+    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SLIP)), "")

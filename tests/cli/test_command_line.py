@@ -134,6 +134,18 @@ def test_an_unknown_option_is_refused_with_the_usage_of_its_command(
     assert f"neuros graph: error: unrecognized arguments: {option}{hint}" in error
 
 
+def test_a_misspelt_container_is_a_warning_and_an_image_of_ones_own_is_none(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = project.read_text().replace("neuros_python", "neuros_pyton", 1)
+    project.write_text(text.replace("neuros_python", "my_brain"))
+    assert main(["validate", "project.json"]) == 0
+    warning = (
+        "warning: node 'a': there is no container 'neuros_pyton' (did you mean 'neuros_python'?)"
+    )
+    assert capsys.readouterr().err.splitlines() == [warning]
+
+
 def test_without_a_command_the_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "run a project" in capsys.readouterr().err
