@@ -103,12 +103,6 @@ class NodeEffects:
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
 
-    def _blame_plugin(self, output: str, packet: Any) -> None:
-        """Where a packet could not be sent since the plugin has filled it wrongly, say so."""
-        if wrong := wrong_field(packet):
-            where = str(self._handle.description.plugin)
-            raise HookError(f"packet for output '{output}': {wrong}", where=where) from None
-
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on an external topic."""
         if port.name in self._clock_outputs:
@@ -142,3 +136,9 @@ class NodeEffects:
         if self._keeper is not None:
             self._keeper.keep(Way.TO_ITSELF, str(connection), packet)
         return self._copy(packet)
+
+    def _blame_plugin(self, output: str, packet: Any) -> None:
+        """Where a packet could not be sent since the plugin has filled it wrongly, say so."""
+        if wrong := wrong_field(packet):
+            where = str(self._handle.description.plugin)
+            raise HookError(f"packet for output '{output}': {wrong}", where=where) from None
