@@ -13,6 +13,21 @@ Wanted = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By node and port, what is to be sampled (see :class:`neuros.runtime.sampling.Sampler`)."""
 
 
+def wanted_of(asked: Any) -> Wanted:
+    """What a page asks for, of its right form. Raises ``TypeError``, ``AttributeError`` if not."""
+    return {
+        str(node): {
+            str(port): {
+                "fields": [str(field) for field in each.get("fields", ())],
+                "all": bool(each.get("all")),
+                "image": bool(each.get("image")),
+            }
+            for port, each in ports.items()
+        }
+        for node, ports in asked.items()
+    }
+
+
 class Page:
     """One open page.
 

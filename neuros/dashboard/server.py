@@ -35,19 +35,24 @@ from starlette.staticfiles import StaticFiles
 
 from neuros.dashboard.access import Access
 from neuros.dashboard.link import Link
-from neuros.dashboard.pages import Pages
+from neuros.dashboard.pages import Pages, wanted_of
 
 STATIC = Path(__file__).parent / "static"
 _LOG_S = 0.2
 _LOAD_S = 1.0
 _KEPT_LINES = 1000
 _CLOSING_S = 1
+_MOST_STEPS = 1_000_000
 _HEADERS = {
     "Cache-Control": "no-store",
+    # In a frame of another page, buttons could be clicked by those who do not see them.
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:;"
-    " style-src 'self' 'unsafe-inline'",
+    " style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
 }
+
+
+_NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
 class LogSource(Protocol):
@@ -141,8 +146,12 @@ class Dashboard:
             self._pages.close(name)
 
     async def _want(self, request: Request) -> Response:
-        asked = await request.json()
-        is_there = self._pages.want(str(asked["page"]), asked["wanted"])
+        try:
+            asked = await request.json()
+            name, wanted = str(asked["page"]), wanted_of(asked["wanted"])
+        except _NOT_UNDERSTOOD:
+            return JSONResponse({"error": "this is no question of a page"}, 400)
+        is_there = self._pages.want(name, wanted)
         return Response(status_code=204 if is_there else 410)
 
     async def _do(self, request: Request) -> Response:
@@ -150,7 +159,11 @@ class Dashboard:
         if what in ("pause", "resume"):
             self._link.tell(what)
         elif what == "step":
-            self._link.tell("step", count=int((await request.json())["count"]))
+            try:
+                count = int((await request.json())["count"])
+            except _NOT_UNDERSTOOD:
+                return JSONResponse({"error": "how many steps?"}, 400)
+            self._link.tell("step", count=min(count, _MOST_STEPS))
         elif what == "stop":
             self._link.tell("end", reason="ended from the dashboard")
         else:
