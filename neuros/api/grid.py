@@ -14,6 +14,11 @@ from neuros.api.settings import value_text
 from neuros.errors import UsageError
 
 _MOST_CHARACTERS = 80
+# Columns of the table that are none of a value.
+_TAKEN = {
+    *("seed", "repeat", "exit_code", "reason"),
+    *("wall_s", "sim_s", "real_time_factor", "folder"),
+}
 _OPENING, _CLOSING = "[{", "]}"
 
 
@@ -76,7 +81,8 @@ def short_names(paths: Sequence[str]) -> dict[str, str]:
     """What to call paths: their last steps, as few as tell them apart."""
     names = {}
     for path in paths:
-        steps, count = path.split("."), 1
+        steps = path.split(".")
+        count = 2 if steps[-1] in _TAKEN else 1
         while any(other != path and other.split(".")[-count:] == steps[-count:] for other in paths):
             count += 1
         names[path] = ".".join(steps[-count:])

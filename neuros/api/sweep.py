@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import datetime, timezone
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +13,10 @@ from neuros.api.grid import Point, points_of, short_names
 from neuros.api.live import LiveRun
 from neuros.api.project import Project
 from neuros.api.run import Run
+from neuros.api.sweep_folder import alone_in, set_aside, sweep_folder
 from neuros.api.sweep_table import CSV_NAME, failed_row, row_of, table_of, write_csv
-from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 
-PLAN_NAME = "sweep.json"
-_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
 _LOOK_S = 0.05
@@ -91,6 +85,7 @@ def sweep(
         ProjectError: if the project is not valid with all values; nothing has been run then.
         UsageError: for arguments that make no sense, or if ``output`` holds another sweep, or one
             that goes on.
+        EnvironmentFault: if the table cannot be written.
     """
     if not isinstance(project, Project):
         project = Project.from_file(project)
@@ -100,9 +95,9 @@ def sweep(
         raise UsageError(f"jobs {jobs}: give 1 or more")
     _check_all(project, points)
     options = {"backend": backend, "duration": duration, "record": record}
-    folder = _folder(project, output, options)
+    folder = sweep_folder(project, output, options)
     names = short_names(list(values))
-    with _alone_in(folder):
+    with alone_in(folder):
         return _Sweeping(project, points, names, folder, options, on_row).run(jobs)
 
 
@@ -154,7 +149,7 @@ class _Sweeping:
         except UsageError:
             run = None
         if run is None or run.exit_code not in _FINISHED:
-            _set_aside(folder)
+            set_aside(folder)
             return False
         self._rows[name] = row_of(self._points[name].values(self._names), run)
         return True
@@ -177,9 +172,10 @@ class _Sweeping:
             del self._live[name]
             values = self._points[name].values(self._names)
             try:
-                self._note(name, row_of(values, live.wait()))
+                row = row_of(values, live.wait())
             except NeurosError as error:
-                self._note(name, failed_row(values, error, live.folder))
+                row = failed_row(values, error, live.folder)
+            self._note(name, row)
 
     def _note(self, name: str, row: dict[str, Any]) -> None:
         self._rows[name] = row
@@ -189,7 +185,11 @@ class _Sweeping:
 
     def _save(self) -> None:
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
-        write_csv(self._sweep.rows, self._sweep.folder)
+        try:
+            write_csv(self._sweep.rows, self._sweep.folder)
+        except OSError as error:
+            file = self._sweep.folder / CSV_NAME
+            raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
 
 
 def _as_list(given: Any) -> list[Any]:
@@ -207,63 +207,6 @@ def _check_all(project: Project, points: Sequence[Point]) -> None:
             problems += error.problems
     if problems:
         raise ProjectError(problems)
-
-
-def _folder(
-    project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
-) -> Path:
-    """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
-    stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
-    folder = Path(output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
-    plan = {
-        "project": str(project.file),
-        "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
-        **{name: str(options[name]) for name in ("backend", "duration", "record")},
-    }
-    file = folder / PLAN_NAME
-    try:
-        if file.exists():
-            _check_same(json.loads(file.read_text("utf-8")), plan, folder)
-            return folder
-        if folder.exists() and any(folder.iterdir()):
-            raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
-        folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(plan, indent=2) + "\n", "utf-8")
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
-    return folder
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
-    with contextlib.ExitStack() as stack:
-        try:
-            is_alone = stack.enter_context(locked(folder / _LOCK_NAME, wait=False))
-        except OSError as error:
-            raise UsageError(
-                f"{folder} cannot be used ({error}): name another one with -o"
-            ) from error
-        if not is_alone:
-            raise UsageError(f"{folder}: a sweep goes on there; wait for its end, or name another")
-        yield
-
-
-def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
-    for name, value in now.items():
-        if before.get(name) != value:
-            what = "the project's files" if name == "project_sha256" else f"its {name}"
-            raise UsageError(
-                f"{folder} holds a sweep that is not this one ({what} differ):"
-                " name another folder with -o"
-            )
-
-
-def _set_aside(folder: Path) -> None:
-    number = 1
-    while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
-        number += 1
-    folder.rename(aside)
 
 
 __all__ = ["CSV_NAME", "Sweep", "sweep"]

@@ -100,4 +100,7 @@ def _say(number: int, count: int, row: Mapping[str, Any]) -> None:
 
 
 def _seeds(text: str) -> list[int]:
-    return [int(part) for part in text.split(",")]
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3") from None

@@ -56,4 +56,8 @@ def test_a_grid_with_holes_or_doubles_is_refused(values: dict[str, list[int]], r
 
 def test_columns_have_the_shortest_names_that_tell_paths_apart() -> None:
     paths = ["nodes.a.environment.SEED", "nodes.b.environment.SEED", "budgets.wall_s"]
-    assert [*short_names(paths).values()] == ["a.environment.SEED", "b.environment.SEED", "wall_s"]
+    assert [*short_names(paths).values()] == [
+        "a.environment.SEED",
+        "b.environment.SEED",
+        "budgets.wall_s",
+    ]
