@@ -38,7 +38,8 @@ def apply_remaps(draft: Draft, texts: Sequence[str]) -> list[Problem]:
         else:
             start = len(old) + len(sign)
             pointer = f"/remap/{escape(old)}"
-            rules[old] = Element(new, source, start, len(text), pointer, key_start=0)
+            rule = Element(new, source, start, len(text), pointer, key_start=0)
+            rules.setdefault(old, rule)  # the first one counts
     if rules and isinstance(draft.root.value, dict):
         remap = draft.root.member("remap")
         if remap is None:

@@ -86,7 +86,7 @@ def test_a_namespace_moves_the_topics_of_connections(written: str, tmp_path: Pat
 def test_the_command_line_goes_before_the_project(tmp_path: Path) -> None:
     write(tmp_path, namespace="/left", remap={"e": "project", "f": "kept"})
     names = load_project(
-        tmp_path, workspace=tmp_path, namespace="/", remap=["e:=mine", "g:=/added"]
+        tmp_path, workspace=tmp_path, namespace="/", remap=["e:=mine", "e:=late", "g:=/added"]
     ).project.names
     assert names == Names("", (("e", "mine"), ("g", "/added"), ("f", "kept")))
     assert names.resolve("e", "camera") == "/mine"
