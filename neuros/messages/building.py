@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,11 +35,13 @@ class Step:
 
     Attributes:
         needs: the packages of workspaces that it needs, directly or not, all built before it.
+        is_current: whether its files are still those that ``built`` is named after.
     """
 
     package: Package
     built: Built
     needs: Sequence[Built]
+    is_current: Callable[[], bool]
 
 
 def build(
@@ -102,6 +104,10 @@ def _build(
         )
         _install(package, source, draft)
         shutil.rmtree(source)
+        if not step.is_current():
+            raise EnvironmentFault(
+                f"message package '{package.name}' was changed while it was built: start again"
+            )
         draft.rename(built.folder)
         built.log.unlink(missing_ok=True)
     except CompilationError as error:

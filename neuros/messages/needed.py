@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from graphlib import CycleError
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +39,10 @@ class Messages:
         for built in builds:
             needs = workspaces.closure(workspaces.needs(built.package))
             package = workspaces.packages[built.package]
-            self._steps.append(Step(package, built, [by_name[need.name] for need in needs]))
+            is_current = partial(self._is_current, built)
+            self._steps.append(
+                Step(package, built, [by_name[need.name] for need in needs], is_current)
+            )
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
@@ -89,6 +93,9 @@ class Messages:
             EnvironmentFault: with a sentence for the user.
         """
         build(self._steps, self._workspaces.ros, progress, environment)
+
+    def _is_current(self, built: Built) -> bool:
+        return built in self._workspaces.builds([built.package])
 
     def describe(self) -> list[str]:
         """One line per package."""

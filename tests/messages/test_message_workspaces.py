@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 from collections.abc import Mapping
@@ -10,7 +11,11 @@ from pathlib import Path
 import pytest
 from message_packages import write_package
 
+from neuros.errors import EnvironmentFault
+from neuros.installation.progress import Progress
+from neuros.messages import building
 from neuros.messages.cache import Built, message_cache, sweep
+from neuros.messages.compilation import Compilers
 from neuros.messages.needed import Messages
 from neuros.messages.package import find_packages
 from neuros.messages.workspace import Workspaces
@@ -261,6 +266,26 @@ class TestMistakes:
         built.folder.mkdir(parents=True)
 
         assert bench.problems() == []
+
+
+class TestBuilding:
+    def test_what_is_changed_meanwhile_is_not_kept(
+        self, bench: Bench, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        file = write_package(bench.own, "a_msgs", POINT) / "msg/Point.msg"
+        messages = bench.messages()
+        compilers = Compilers("gcc", "g++", ())
+        monkeypatch.setattr(Compilers, "here", lambda: compilers)
+        monkeypatch.setattr(building, "_generate", lambda *_: file.write_text("float32 x\n"))
+        for part in ("_others", "compile_package", "_install"):
+            monkeypatch.setattr(building, part, lambda *_: None)
+
+        with pytest.raises(EnvironmentFault, match="'a_msgs' was changed while it was built"):
+            messages.make(Progress(io.StringIO()), {})
+
+        assert not messages.is_made
+        bench.messages().make(Progress(io.StringIO()), {})
+        assert bench.messages().is_made
 
 
 class TestCache:
