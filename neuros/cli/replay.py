@@ -65,6 +65,14 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="SECONDS",
         help="before the first packet, so that subscribers find the topics (default: 1)",
     )
+    add(
+        "-w",
+        "--wait-matching-subscriptions",
+        type=int,
+        default=0,
+        metavar="N",
+        help="begin when each topic has that many, as `ros2 topic pub` does (default: 0)",
+    )
     add("-d", "--domain-id", type=int, metavar="ID", help="default: ROS_DOMAIN_ID, else 0")
     replay.set_defaults(command=_replay)
     _add_replayed(commands)
@@ -97,8 +105,8 @@ def _replay(options: argparse.Namespace) -> int:
             "replay: name a node to run once more (--node NAME), or what to publish (--topic NAME,"
             " or --topic '*' for all)"
         )
-    if not options.rate > 0 or options.delay < 0:
-        raise UsageError("replay: --rate must be above 0, and --delay not below")
+    if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
+        raise UsageError("replay: --rate must be above 0, --delay and -w not below")
     from neuros.cli.messages import find_messages_of
     from neuros.observe.bag.opened import open_bag
     from neuros.transport.playing import PlayedTopic, play
@@ -118,6 +126,7 @@ def _replay(options: argparse.Namespace) -> int:
             packets,
             rate=options.rate,
             delay_s=options.delay,
+            subscriptions=options.wait_matching_subscriptions,
             domain_id=options.domain_id,
         )
     print(f"{count} packets on {len(chosen)} topics")

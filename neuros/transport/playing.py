@@ -16,7 +16,8 @@ from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
 
-_LAST_S = 1.0
+_LAST_S = 5.0
+_POLL_S = 0.01
 # A connection's own depth goes with acknowledgements, which nobody sends here.
 _DEPTH = 1000
 
@@ -37,6 +38,7 @@ def play(
     *,
     rate: float,
     delay_s: float,
+    subscriptions: int,
     domain_id: int | None,
 ) -> int:
     """Publish packets; returns how many.
@@ -45,6 +47,7 @@ def play(
         packets: time in nanoseconds, topic and CDR, in the order of time.
         rate: times as fast as they were recorded.
         delay_s: how long subscribers have to find the publishers before the first packet.
+        subscriptions: how many every topic must have before that, however long it takes.
 
     Raises:
         EnvironmentFault: if a message type is not installed here.
@@ -60,6 +63,8 @@ def play(
         for name, topic in topics.items()
     }
     try:
+        while any(each.get_subscription_count() < subscriptions for each in publishers.values()):
+            time.sleep(_POLL_S)
         time.sleep(delay_s)
         count = 0
         start_s, first_ns = time.monotonic(), None

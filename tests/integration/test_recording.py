@@ -175,7 +175,8 @@ def test_replay_publishes_what_was_recorded(
             Float64, "/neuros/relay/total/sink/total/data", totals.append, 1000
         )
         numbers = program.listen(NUMBER, "std_msgs/msg/Int32")
-        options = ["-t", "relay.total", "--rate", "2", "--delay", "3", "-d", str(domain.id)]
+        options = ["-t", "relay.total", "--rate", "2", "--delay", "0", "-w", "1"]
+        options += ["-d", str(domain.id)]
         with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as replay:
             program.spin_until(lambda: len(totals) == 200)
             output, _ = replay.communicate(timeout=TIMEOUT_S)
