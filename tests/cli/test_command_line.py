@@ -112,7 +112,12 @@ def test_wrong_usage_is_one_sentence(
     assert not Path("runs").exists()
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["launch", ".", "-d", "x"], ["launch", "--x"]])
+def test_no_command_at_all_gives_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert capsys.readouterr().err.startswith("usage: neuros")
+
+
+@pytest.mark.parametrize("arguments", [["fly"], ["launch", ".", "-d", "x"], ["launch", "--x"]])
 def test_wrong_options_end_with_2_as_well(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main(arguments)
@@ -121,7 +126,11 @@ def test_wrong_options_end_with_2_as_well(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize(
     ("option", "hint"),
-    [("--projct", " (did you mean '--project'?)"), ("--durration=3", " (did"), ("x", "")],
+    [
+        ("--projct", " (did you mean '--project'?)"),
+        ("--namspace=/a", " (did you mean '--namespace'?)"),
+        ("x", ""),
+    ],
 )
 def test_an_unknown_option_is_refused_with_the_usage_of_its_command(
     option: str, hint: str, capsys: pytest.CaptureFixture[str]

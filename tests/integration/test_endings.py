@@ -251,7 +251,7 @@ def test_a_packet_that_cannot_be_sent_is_named_with_its_output_and_field(bench: 
     ("plugin", "reason"),
     [
         ("import no_such_package", ".*/a.py: cannot be imported: ModuleNotFoundError: .*"),
-        ("def broken(:", ".*/a.py: cannot be imported: SyntaxError: .*"),
+        ("def broken(:", ".*/a.py:\\d+: cannot be imported: SyntaxError: .*"),
         ("raise SystemExit(0)", ".*/a.py: cannot be imported: SystemExit: 0"),
     ],
 )
