@@ -3,39 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from launching import EXAMPLES, start
+from plain_programs import plain_program
 
 from containers import require_containers
 from neuros.launch.domain import choose_domain
-from neuros.launch.wheels import with_libraries
 
 ROVER = EXAMPLES / "6_outside/rover"
 SOON = ("--set", "nodes.rover.parameters.low_battery=0.95")
 LIMIT_S = 60.0
-
-
-@contextmanager
-def program(name: str, domain_id: int) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, str(ROVER / name)],
-        env=with_libraries({**os.environ, "ROS_DOMAIN_ID": str(domain_id)}),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 @pytest.mark.parametrize(
@@ -48,11 +28,11 @@ def test_the_rover_drives_until_it_was_charged_twice(back_end: str, tmp_path: Pa
     with choose_domain(None, {}, False) as domain, contextlib.ExitStack() as stack:
         arguments = ("--backend", back_end, "-d", str(domain.id), *SOON)
         running = stack.enter_context(start(ROVER, *arguments, cwd=tmp_path))
-        driver = stack.enter_context(program("driver.py", domain.id))
+        driver = stack.enter_context(plain_program(ROVER / "driver.py", domain.id))
         assert driver.stdout is not None
         # It is told what it was too late for.
         assert re.fullmatch(r"\d\.\d m: ready\n", driver.stdout.readline())
-        stack.enter_context(program("battery.py", domain.id))
+        stack.enter_context(plain_program(ROVER / "battery.py", domain.id))
         finished = running.finish(LIMIT_S)
         told = driver.stdout.readline()
     assert finished.exit_code == 0, finished.output

@@ -3,51 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from launching import Running, start
+from plain_programs import plain_program
 
 from containers import require_containers
 from neuros.launch.domain import choose_domain
-from neuros.launch.wheels import with_libraries
 
 PROJECT = Path(__file__).parent / "outside_ros"
+PROGRAM = PROJECT / "program.py"
+LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 LIMIT_S = 60.0
 MATCHED = ("fast heard: 1", "sure heard: 1", "latched heard: 1")
 UNMATCHED = (
     "input 'strict': on /strict /program offers best_effort, and this input asks for reliable",
     "output 'loose': on /loose /program asks for reliable, and this output offers best_effort",
 )
-
-
-@contextmanager
-def program(name: str, domain_id: int) -> Iterator[subprocess.Popen[str]]:
-    """One of the programs beside the project; ended at the end."""
-    environment = with_libraries(
-        {
-            **os.environ,
-            "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        }
-    )
-    with subprocess.Popen(
-        [sys.executable, "-u", str(PROJECT / name)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 @pytest.mark.parametrize(
@@ -57,14 +32,17 @@ def program(name: str, domain_id: int) -> Iterator[subprocess.Popen[str]]:
 def test_a_node_among_plain_ros_programs(back_end: str, tmp_path: Path) -> None:
     if back_end == "docker":
         require_containers()
-    with choose_domain(None, {}, False) as domain, program("program.py", domain.id) as there:
+    with (
+        choose_domain(None, {}, False) as domain,
+        plain_program(PROGRAM, domain.id, **LOCAL) as there,
+    ):
         assert there.stdout is not None
         assert there.stdout.readline() == "here\n"
         arguments = ("--backend", back_end, "-d", str(domain.id))
         with start(PROJECT, *arguments, cwd=tmp_path) as running:
             for text in (*MATCHED, *UNMATCHED):
                 running.wait_for(text, LIMIT_S)
-            with program("late.py", domain.id) as late:
+            with plain_program(PROJECT / "late.py", domain.id, **LOCAL) as late:
                 answer, _ = late.communicate(timeout=LIMIT_S)
             check_what_the_late_one_found(json.loads(answer))
             check_the_end(running)
