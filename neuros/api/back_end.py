@@ -18,6 +18,7 @@ from neuros.launch.placement import Cores
 from neuros.launch.process import ProcessLauncher
 from neuros.ports import Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
+from neuros.transport.dds_profile import as_asked
 
 if TYPE_CHECKING:
     from neuros.launch.docker.launcher import Containers
@@ -67,7 +68,7 @@ class BackEnd:
             from neuros.launch.docker.launcher import DockerLauncher
 
             watch = guardian.watch_containers if guardian else None
-            return DockerLauncher(self.containers, options, watch, placement)
+            return DockerLauncher(self.containers, options, watch, placement, as_asked(os.environ))
         on_started = guardian.watch if guardian else None
         if self.name == "in-process":
             return InProcessLauncher([*_COMMAND, *options, "--in-memory"], on_started, placement)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.transport.dds_profile import PEERS_VARIABLE, RANGE_VARIABLE
+from neuros.transport.dds_profile import PEERS_VARIABLE, RANGE_VARIABLE, as_asked
 
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
 _LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
@@ -30,7 +30,7 @@ class Network:
     def environment(self, environ: Mapping[str, str]) -> dict[str, str]:
         """What the nodes get; without a wish, what the launcher's own environment says."""
         if not self.is_wide:
-            return {RANGE_VARIABLE: environ.get(RANGE_VARIABLE) or "LOCALHOST"}
+            return {RANGE_VARIABLE: as_asked(environ).get(RANGE_VARIABLE) or "LOCALHOST"}
         peers = {PEERS_VARIABLE: ";".join(self.peers)} if self.peers else {}
         return {RANGE_VARIABLE: "SUBNET", **peers}
 

@@ -33,14 +33,31 @@ RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PEERS_VARIABLE = "ROS_STATIC_PEERS"
 
 
+_LOCAL = {PROFILES_VARIABLE: str(LOCAL_PROFILES), RANGE_VARIABLE: "SYSTEM_DEFAULT"}
+
+
 def dds_environment(environ: Mapping[str, str]) -> dict[str, str]:
     """What to add to ``environ`` before the first ROS node of a process is created.
 
     Nothing if it names settings of the user's own. A range other than ``LOCALHOST``, and
     ``LOCALHOST`` with peers on other machines, are left to ROS.
     """
-    if environ.get(PROFILES_VARIABLE) not in (None, "", str(PROFILES), str(LOCAL_PROFILES)):
+    asked = as_asked(environ)
+    if asked.get(PROFILES_VARIABLE):
         return {}
-    if environ.get(RANGE_VARIABLE) != "LOCALHOST" or environ.get(PEERS_VARIABLE):
+    if asked.get(RANGE_VARIABLE) != "LOCALHOST" or asked.get(PEERS_VARIABLE):
         return {PROFILES_VARIABLE: str(PROFILES)}
-    return {PROFILES_VARIABLE: str(LOCAL_PROFILES), RANGE_VARIABLE: "SYSTEM_DEFAULT"}
+    return dict(_LOCAL)
+
+
+def as_asked(environ: Mapping[str, str]) -> dict[str, str]:
+    """``environ`` without what :func:`dds_environment` has added.
+
+    What a node starts inherits that; another run among it has to know what the user wants.
+    """
+    asked = dict(environ)
+    if all(asked.get(key) == value for key, value in _LOCAL.items()):
+        asked[RANGE_VARIABLE] = "LOCALHOST"
+    if asked.get(PROFILES_VARIABLE) in (str(PROFILES), str(LOCAL_PROFILES)):
+        del asked[PROFILES_VARIABLE]
+    return asked

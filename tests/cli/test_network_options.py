@@ -6,6 +6,7 @@ import pytest
 
 from neuros.api.network import chosen_network
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES_VARIABLE
 
 RANGE, PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
@@ -14,6 +15,11 @@ def test_nodes_stay_on_this_machine_unless_the_environment_says_otherwise() -> N
     network = chosen_network(False, None)
     assert network.environment({}) == network.environment({RANGE: ""}) == {RANGE: "LOCALHOST"}
     assert network.environment({RANGE: "SUBNET"}) == {RANGE: "SUBNET"}
+
+
+def test_what_a_run_in_a_run_inherits_is_no_wish() -> None:
+    inherited = {RANGE: "SYSTEM_DEFAULT", PROFILES_VARIABLE: str(LOCAL_PROFILES)}
+    assert chosen_network(False, None).environment(inherited) == {RANGE: "LOCALHOST"}
 
 
 def test_network_goes_before_the_environment() -> None:

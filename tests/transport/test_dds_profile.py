@@ -13,6 +13,7 @@ from neuros.transport.dds_profile import (
     PROFILES,
     PROFILES_VARIABLE,
     RANGE_VARIABLE,
+    as_asked,
     dds_environment,
 )
 
@@ -54,6 +55,21 @@ def test_a_file_of_the_users_own_wins() -> None:
 
 def test_a_file_of_neuros_that_was_inherited_is_no_file_of_the_users_own() -> None:
     assert dds_environment({**LOCAL, PROFILES_VARIABLE: str(PROFILES)}) == dds_environment(LOCAL)
+
+
+@pytest.mark.parametrize(
+    "environ",
+    [{}, LOCAL, {RANGE_VARIABLE: "SUBNET"}, {**LOCAL, PROFILES_VARIABLE: "/home/me/dds.xml"}],
+)
+def test_what_a_node_starts_knows_what_was_asked_of_the_node(environ: dict[str, str]) -> None:
+    inherited = {**environ, **dds_environment(environ)}
+    assert as_asked(inherited) == as_asked(environ) == environ
+    assert dds_environment(inherited) == dds_environment(environ)
+
+
+def test_a_wider_range_asked_of_what_a_node_starts_holds() -> None:
+    inherited = {**LOCAL, **dds_environment(LOCAL), RANGE_VARIABLE: "SUBNET"}
+    assert dds_environment(inherited) == {PROFILES_VARIABLE: str(PROFILES)}
 
 
 def test_only_what_stays_on_this_machine_is_repaired_late() -> None:

@@ -19,7 +19,7 @@ from docker import DockerClient
 from launching import Running, start
 from outside_asker import PROGRAM
 
-from containers import nothing_left, require_containers
+from containers import nothing_left, require_containers, wait_until
 from neuros.doctor.delivery import PROJECT as IMAGES
 from neuros.launch.docker.images import image_for
 from neuros.launch.domain import choose_domain
@@ -109,16 +109,34 @@ def test_a_program_in_a_container_of_its_own_hears_and_is_heard(
 def test_on_a_network_of_dockers_it_takes_the_option_network(
     engine: DockerClient, tmp_path: Path
 ) -> None:
+    with used_bridge(engine) as bridge, choose_domain(None, {}, False) as other:
+        with echoing(other.id, tmp_path, *NETWORK):
+            assert ask(engine, other.id, network=bridge) == ""
+        with echoing(other.id, tmp_path) as alone:
+            assert "no answer; 0 listen" in ask(engine, other.id, 1.0, network=bridge)
+            alone.wait_for("a container with a network of its own")
+
+
+@contextlib.contextmanager
+def used_bridge(engine: DockerClient) -> Iterator[str]:
+    """A network of Docker's that has a container: without one it is down, and DDS passes it over.
+
+    Fast DDS looks once, as a node starts, which networks there are.
+    """
     bridge = engine.networks.create(f"neuros-test-{secrets.token_hex(4)}", driver="bridge")
-    try:
-        with choose_domain(None, {}, False) as other:
-            with echoing(other.id, tmp_path, *NETWORK):
-                assert ask(engine, other.id, network=bridge.name) == ""
-            with echoing(other.id, tmp_path) as alone:
-                assert "no answer; 0 listen" in ask(engine, other.id, 1.0, network=bridge.name)
-                alone.wait_for("a container with a network of its own")
-    finally:
-        bridge.remove()
+    with contextlib.ExitStack() as undo:
+        undo.callback(bridge.remove)
+        image = image_for("neuros_python", None, engine)
+        container = engine.containers.run(
+            image.id,
+            entrypoint=[*image.start, "-c", "import signal; signal.pause()"],
+            detach=True,
+            network=bridge.name,
+        )
+        undo.callback(container.remove, force=True)
+        state = Path(f"/sys/class/net/br-{bridge.id[:12]}/operstate")
+        wait_until(lambda: state.read_text().strip() == "up")
+        yield str(bridge.name)
 
 
 # ------------------------------------------------------------------ nodes of two launchers
