@@ -86,7 +86,7 @@ class Transport(Protocol):
         """Give up all endpoints; further calls have no effect."""
 
 
-class Way(Enum):
+class Way(str, Enum):
     """How a packet passes a node that keeps it for the recording."""
 
     SENT = "sent"  # by an output, to other nodes or on its external topic
@@ -96,15 +96,15 @@ class Way(Enum):
 
 
 class Tap(Protocol):
-    """Where a node puts the packets that are recorded.
+    """Where a node puts the packets that are recorded."""
 
-    ``name`` is that of the output or input, or the connection where ``way`` is about one.
-    """
+    def stream(self, way: Way, name: str) -> int | None:
+        """The number by which such packets are kept; ``None``: they are not recorded.
 
-    def wants(self, way: Way, name: str) -> bool:
-        """Whether such packets are recorded."""
+        ``name`` is that of the output or input, or the connection where ``way`` is about one.
+        """
 
-    def keep(self, way: Way, name: str, data: bytes, sim_time_s: float | None) -> None:
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
         """Keep a serialised packet, with the simulated time of the node if it owns one.
 
         Raises ``OSError`` if it cannot be kept, and nothing after it either.

@@ -17,7 +17,6 @@ from neuros.launch.recording import RecorderProcess
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.spool import SpoolWriter
-from neuros.ports import Way
 
 RECORD = ("-r",)
 SIMULATED_S = 100.0
@@ -133,7 +132,7 @@ def live(size: int, seconds: float) -> dict[str, float]:
         start_s = time.perf_counter()
         for number in range(count):
             for sender in senders:
-                sender.keep(Way.SENT, "out", bytes(size), None)
+                sender.keep(0, bytes(size), None)
             ahead_s = number * len(names) / LIVE_RATE - (time.perf_counter() - start_s)
             if ahead_s > PAUSE_S:
                 time.sleep(ahead_s)
@@ -157,7 +156,7 @@ def recorded(size: int, count: int) -> dict[str, float]:
         spool = SpoolWriter(run / "a", plan.streams["a"])
         start_s = time.perf_counter()
         for _ in range(count):
-            spool.keep(Way.SENT, "out", data, None)
+            spool.keep(0, data, None)
         kept_s = time.perf_counter()
         spool.close()
         recorder = Recorder(plan, run, complain=print)

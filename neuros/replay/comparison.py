@@ -40,7 +40,8 @@ class Comparison:
         message: Callable[[bytes, str], Any],
         lacking: Collection[str] = (),
     ) -> None:
-        self._streams = {key: _Stream(each) for key, each in topics.items()}
+        self._streams = [_Stream(each) for each in topics.values()]
+        self._numbers = {key: number for number, key in enumerate(topics)}
         self._message = message
         self._lacking = lacking
         self.difference: str | None = None
@@ -50,41 +51,41 @@ class Comparison:
         """Packets that were compared, once for each connection."""
         return sum(
             min(stream.sent, len(packets))
-            for stream in self._streams.values()
+            for stream in self._streams
             for _, _, packets in stream.topics
         )
 
     @property
     def connections(self) -> int:
         """Connections, and external topics, that there are."""
-        return sum(len(stream.topics) for stream in self._streams.values())
+        return sum(len(stream.topics) for stream in self._streams)
 
-    def wants(self, way: Way, name: str) -> bool:
-        """Whether the run has recorded such packets."""
-        return (way, name) in self._streams
+    def stream(self, way: Way, name: str) -> int | None:
+        """The number of such packets; ``None`` if the run has not recorded them."""
+        return self._numbers.get((way, name))
 
-    def keep(self, way: Way, name: str, data: bytes, sim_time_s: float | None) -> None:
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
         """A packet was sent."""
         if self.difference is not None:
             return
-        stream = self._streams[way, name]
-        stream.sent += 1
-        for topic, type_name, packets in stream.topics:
-            if stream.sent > len(packets) and topic in self._lacking:
+        passed = self._streams[stream]
+        passed.sent += 1
+        for topic, type_name, packets in passed.topics:
+            if passed.sent > len(packets) and topic in self._lacking:
                 continue
-            if stream.sent > len(packets):
+            if passed.sent > len(packets):
                 self.difference = (
-                    f"{topic}: packet {stream.sent} is sent in the replay, and was not in the run"
+                    f"{topic}: packet {passed.sent} is sent in the replay, and was not in the run"
                 )
-            elif packets[stream.sent - 1].data != data:
-                self._compare(topic, type_name, stream.sent, packets[stream.sent - 1].data, data)
+            elif packets[passed.sent - 1].data != data:
+                self._compare(topic, type_name, passed.sent, packets[passed.sent - 1].data, data)
             if self.difference is not None:
-                stream.sent -= 1
+                passed.sent -= 1
                 return
 
     def find_missing(self) -> None:
         """The node will send nothing more."""
-        for stream in self._streams.values():
+        for stream in self._streams:
             for topic, _, packets in stream.topics:
                 if self.difference is None and stream.sent < len(packets):
                     self.difference = (

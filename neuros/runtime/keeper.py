@@ -35,15 +35,15 @@ class Keeper:
         tap = self._tap
         if tap is None:
             return frozenset()
-        return frozenset(c for c in connections if tap.wants(Way.RECEIVED, str(c)))
+        return frozenset(c for c in connections if tap.stream(Way.RECEIVED, str(c)) is not None)
 
     def keep(self, way: Way, name: str, packet: Any, data: bytes | None = None) -> None:
         """Record a packet, where that is wanted; ``data`` is the packet, if serialised already."""
         tap = self._tap
-        if tap is None or not tap.wants(way, name):
+        if tap is None or (stream := tap.stream(way, name)) is None:
             return
         try:
-            tap.keep(way, name, data or self._encode(packet), self._time.now_s)
+            tap.keep(stream, data or self._encode(packet), self._time.now_s)
         except OSError as error:
             self.close()
             self._logger.error(

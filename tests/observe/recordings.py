@@ -7,7 +7,7 @@ from pathlib import Path
 
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic
 from neuros.observe.recording.recorder import Recorder
-from neuros.observe.recording.spool import NO_TIME, Record, SpoolWriter
+from neuros.observe.recording.spool import NO_TIME, SpoolWriter
 
 NUMBER = Topic("/neuros/a/number/b/number/data", "std_msgs/msg/Int32", True, 1, "a.number -> b.n")
 ALSO = Topic("/neuros/a/number/c/number/data", "std_msgs/msg/Int32", False, 1, "a.number -> c.n")
@@ -42,7 +42,7 @@ def spool(run: Path, node: str, packets: Sequence[tuple[int, int | None, bytes]]
     """Packets of stream 0 of a node: wall time, simulated time, content."""
     writer = SpoolWriter(run / node, ())
     for wall_ns, sim_ns, data in packets:
-        writer.append(Record(wall_ns, NO_TIME if sim_ns is None else sim_ns, 0, data))
+        writer.append(wall_ns, NO_TIME if sim_ns is None else sim_ns, 0, data)
     writer.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic, load_plan
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.repair import repair
+from neuros.observe.recording.spool import NO_TIME, SpoolWriter
 from neuros.observe.recording.stored import Stored, stored_messages
 
 
@@ -121,6 +123,31 @@ def test_a_bag_is_readable_before_the_first_packet_and_at_every_checkpoint(tmp_p
         recorder.bag.put(2, 10 + count, 0, bytes(2_000_000))
         recorder.bag.checkpoint()
     recorder.abandon()
+
+
+@pytest.mark.parametrize(("took_s", "pause_s"), [(0.001, 1.0), (0.1, 5.0)])
+def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, pause_s: float
+) -> None:
+    now_s, begun_s = 0.0, []
+    recorder = Recorder(plan(), tmp_path, fail, clock=lambda: now_s)
+
+    def checkpoint() -> None:
+        nonlocal now_s
+        begun_s.append(now_s)
+        now_s += took_s
+
+    monkeypatch.setattr(recorder.bag, "checkpoint", checkpoint)
+    sender = SpoolWriter(tmp_path / "a", ())
+    for place in range(100):
+        sender.append(10 + place, NO_TIME, 0, number(1))
+        recorder.poll()
+        now_s += 0.125
+    sender.close()
+    recorder.abandon()
+    pauses_s = [after - before - took_s for before, after in pairwise(begun_s)]
+    assert pauses_s
+    assert all(-1e-9 < each - pause_s < 0.13 for each in pauses_s)
 
 
 def test_spools_are_gone_when_their_packets_are_in_the_bag(tmp_path: Path) -> None:

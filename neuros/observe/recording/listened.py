@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from neuros.observe.recording.plan import LISTENER, Topic
-from neuros.observe.recording.spool import NO_TIME, Record, SpoolWriter
+from neuros.observe.recording.spool import NO_TIME, SpoolWriter
 
 _LIST = "topics.json"
 
@@ -36,7 +36,7 @@ class ListenedSpool:
 
     def keep(self, number: int, wall_ns: int, data: bytes) -> None:
         """Keep a packet. Raises ``OSError``."""
-        self._spool.append(Record(wall_ns, NO_TIME, number, data))
+        self._spool.append(wall_ns, NO_TIME, number, data)
 
     def close(self) -> None:
         """Keep nothing any more."""

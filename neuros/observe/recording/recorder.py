@@ -21,6 +21,9 @@ _SETTLED_NS = 20_000_000
 _MOST_BYTES = 8 << 20
 _CHECKPOINT_S = 1.0
 _CHECKPOINT_BYTES = 16 << 20
+# A checkpoint writes about every topic and every megabyte, so it takes longer as they become more;
+# the pause after it is this many times as long, for a recorder must not take the nodes' time.
+_CHECKPOINT_PAUSE = 50
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
 _IsNew: TypeAlias = Callable[[int, int], bool]
@@ -33,6 +36,7 @@ class Recorder:
         run: the run folder.
         complain: is told of each problem, in a sentence.
         is_new: asked with the number of a topic and a wall time whether the bag lacks that packet.
+        clock: monotonic, in seconds: when a checkpoint is due.
 
     Raises:
         OSError: if the bag cannot be made.
@@ -44,11 +48,13 @@ class Recorder:
         run: Path,
         complain: Callable[[str], object],
         is_new: _IsNew | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._plan = plan
         self._run = run
         self._complain = complain
         self._is_new = is_new
+        self._clock = clock
         self._definitions = Definitions()
         self.bag = BagWriter(run / BAG_NAME, plan.storage, plan.custom)
         self.topics: dict[Topic, int | None] = {}
@@ -71,7 +77,7 @@ class Recorder:
         self._released_ns = 0
         self._sim_ns = 0
         self.bag.checkpoint()
-        self._checked_s = time.monotonic()
+        self._due_s = self._clock() + _CHECKPOINT_S
         self._written = self._checked = 0
 
     def number_of(self, topic: Topic) -> int | None:
@@ -87,7 +93,7 @@ class Recorder:
     def poll(self) -> bool:
         """Move what there is; returns whether there is more right now. Raises ``OSError``."""
         has_more = self._move(time.time_ns() - _SETTLED_NS)
-        is_due = time.monotonic() - self._checked_s >= _CHECKPOINT_S
+        is_due = self._clock() >= self._due_s
         if self._written > self._checked and (
             is_due or self.bag.pending_bytes >= _CHECKPOINT_BYTES
         ):
@@ -172,8 +178,10 @@ class Recorder:
                 self.bag.put(topic, wall_ns, publish_ns, data)
 
     def _checkpoint(self) -> None:
+        began_s = self._clock()
         self.bag.checkpoint()
-        self._checked_s = time.monotonic()
+        took_s = self._clock() - began_s
+        self._due_s = began_s + took_s + max(_CHECKPOINT_S, _CHECKPOINT_PAUSE * took_s)
         self._checked = self._written
         for source in self._sources:
             source.reader.remove_up_to(self._released_ns)

@@ -28,6 +28,7 @@ NO_TIME = -1
 
 _FOLDER = "spool"
 _HEADER = struct.Struct("<IIqq")
+_SMALL_BYTES = 4096  # up to here a copy costs less than a write in two parts
 
 
 class Record(NamedTuple):
@@ -66,24 +67,28 @@ class SpoolWriter:
         self._size = 0
         self._last_ns = 0
 
-    def wants(self, way: Way, name: str) -> bool:
-        """Whether such packets are kept."""
-        return (way, name) in self._numbers
+    def stream(self, way: Way, name: str) -> int | None:
+        """The number of such packets; ``None``: they are not kept."""
+        return self._numbers.get((way, name))
 
-    def keep(self, way: Way, name: str, data: bytes, sim_time_s: float | None) -> None:
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
         """Keep a packet. Raises ``OSError``, and is not to be called again then."""
+        now_ns = self._clock()
         # No two packets of a spool have the same time, so that a packet can be told by it.
-        self._last_ns = max(self._clock(), self._last_ns + 1)
+        self._last_ns = now_ns = now_ns if now_ns > self._last_ns else self._last_ns + 1
         sim_ns = NO_TIME if sim_time_s is None else max(0, round(sim_time_s * 1e9))
-        self.append(Record(self._last_ns, sim_ns, self._numbers[way, name], data))
+        self.append(now_ns, sim_ns, stream, data)
 
-    def append(self, record: Record) -> None:
-        """Write a record. Raises ``OSError``."""
+    def append(self, wall_ns: int, sim_ns: int, stream: int, data: bytes) -> None:
+        """Write what will be read as a :class:`Record`. Raises ``OSError``."""
         if self._descriptor < 0 or self._size >= self._file_bytes:
             self._begin_file()
-        header = _HEADER.pack(len(record.data), record.stream, record.wall_ns, record.sim_ns)
-        written = os.writev(self._descriptor, (header, record.data))
-        if written < len(header) + len(record.data):
+        header = _HEADER.pack(len(data), stream, wall_ns, sim_ns)
+        if len(data) <= _SMALL_BYTES:
+            written = os.write(self._descriptor, header + data)
+        else:
+            written = os.writev(self._descriptor, (header, data))
+        if written < _HEADER.size + len(data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._size += written
 
