@@ -27,7 +27,7 @@ from neuros.launch.sessions import Session, guardian_environment
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split
-from neuros.transport.dds_profile import LOCAL_PROFILES
+from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES
 
 LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
@@ -135,13 +135,25 @@ def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
     assert json.loads((finished.run_folder / "a/seen.json").read_text())["device"]
 
 
-def test_settings_of_dds_of_the_users_own_hold_inside(bench: ContainerBench) -> None:
+def test_settings_of_dds_of_the_users_own_hold_inside(
+    bench: ContainerBench, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    own = tmp_path_factory.mktemp("home") / "dds.xml"
+    own.write_text(LOCAL_PROFILES.read_text())
     bench.project({"a": LOOKS}, a={"environment": {"FILE": "/neuros/fast_dds.xml"}})
-    finished = bench.launch(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOCAL_PROFILES))
+    finished = bench.launch(FASTRTPS_DEFAULT_PROFILES_FILE=str(own))
     assert finished.run_folder is not None, finished.output
     seen = json.loads((finished.run_folder / "a/seen.json").read_text())
     assert seen["environment"]["FASTRTPS_DEFAULT_PROFILES_FILE"] == "/neuros/fast_dds.xml"
-    assert seen["file"] == LOCAL_PROFILES.read_text()
+    assert seen["file"] == own.read_text()
+
+
+def test_settings_of_dds_that_a_run_inherits_from_a_run_are_none(bench: ContainerBench) -> None:
+    bench.project({"a": LOOKS}, a={"environment": {"FILE": ""}})
+    finished = bench.launch(FASTRTPS_DEFAULT_PROFILES_FILE=str(PROFILES))
+    assert finished.run_folder is not None, finished.output
+    seen = json.loads((finished.run_folder / "a/seen.json").read_text())
+    assert seen["environment"]["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fast_dds_local.xml")
 
 
 def test_a_display_that_is_not_there_is_said(bench: ContainerBench) -> None:
