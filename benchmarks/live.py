@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -11,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -55,6 +58,30 @@ class Live:
         self._wait_until(are_all_there)
         return [texts[name] for name in names]
 
+    def printed(self, pattern: str) -> str:
+        """The group of ``pattern``, once the launcher has printed a match; raises as above."""
+        found: list[str] = []
+
+        def is_there() -> bool:
+            found[:] = re.findall(pattern, self.output.read_text())
+            return bool(found)
+
+        self._wait_until(is_there)
+        return found[0]
+
+    def finished(self) -> dict[str, Any]:
+        """Wait for its own end; returns its ``run.json``.
+
+        Raises:
+            RuntimeError: if it has failed.
+            psutil.TimeoutExpired: if it takes too long.
+        """
+        code = self.launcher.wait(PATIENCE_S)
+        if code:
+            raise RuntimeError(f"exit code {code}:\n{self.output.read_text()}")
+        record: dict[str, Any] = json.loads((self.folder / "run.json").read_text())
+        return record
+
     def check(self) -> None:
         """Raise ``RuntimeError`` if the project has ended."""
         if not self.launcher.is_running() or self.launcher.status() == psutil.STATUS_ZOMBIE:
@@ -80,13 +107,16 @@ class Live:
 
 @contextlib.contextmanager
 def live(
-    project: Path, backend: str, settings: Mapping[str, object] | None = None
+    project: Path,
+    backend: str,
+    settings: Mapping[str, object] | None = None,
+    options: Sequence[str] = (),
 ) -> Iterator[Live]:
-    """Launch a project; it is ended when the block is left."""
+    """Launch a project, with further options; it is ended when the block is left."""
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as name:
         run_folder, output = Path(name) / "run", Path(name) / "output"
         command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
-        command += ["--backend", backend, "-o", str(run_folder)]
+        command += ["--backend", backend, "-o", str(run_folder), *options]
         for key, value in (settings or {}).items():
             command += ["--set", f"{key}={value}"]
         with output.open("w") as file:

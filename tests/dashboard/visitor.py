@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Iterator
 from typing import Any
 
 import requests
 from launching import REPOSITORY, Running
+
+from benchmarks.viewer import events_of
 
 WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
 IMU = "world.imu -> brain.imu"
@@ -55,17 +56,7 @@ class Visitor:
             timeout=TIMEOUT_S,
         ) as answer:
             assert answer.status_code == 200
-            yield _events(answer)
-
-
-def _events(answer: requests.Response) -> Iterator[tuple[str, Any]]:
-    name = ""
-    for line in answer.iter_lines(decode_unicode=True):
-        key, _, value = line.partition(": ")
-        if key == "event":
-            name = value
-        elif key == "data":
-            yield name, json.loads(value)
+            yield events_of(answer.iter_lines(decode_unicode=True))
 
 
 def is_full(figures: Any) -> bool:
