@@ -194,6 +194,13 @@ def test_every_project_shown_is_valid(page: Path, tmp_path: Path) -> None:
 
 
 @pages
+def test_every_code_block_says_its_language(page: Path) -> None:
+    """What does not is coloured as Python by the site."""
+    fences = re.findall(r"^ *```(.*)$", page.read_text("utf-8"), re.MULTILINE)
+    assert "" not in fences[::2]
+
+
+@pages
 def test_every_plugin_shown_is_python(page: Path) -> None:
     for body in blocks(page, "python"):
         indent = len(body) - len(body.lstrip(" "))
