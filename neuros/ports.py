@@ -205,15 +205,22 @@ class NodeContext(Protocol):
     """The ``node`` that hooks receive, as far as simulators need it."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Its name in the project."""
+
     @property
-    def run_dir(self) -> Path: ...
+    def run_dir(self) -> Path:
+        """Its own writable folder in the run folder."""
+
     @property
     def description(self) -> Node:
         """The node as its file declares it (ports, ``mujoco`` keys, environment)."""
 
-    def make_packet(self, output: str) -> Packet: ...
-    def get_logger(self) -> Logger: ...
+    def make_packet(self, output: str) -> Packet:
+        """A new message of the type of an output."""
+
+    def get_logger(self) -> Logger:
+        """What it says ends up in the node's log."""
 
     def resolve_path(self, path: str) -> Path:
         """An existing file, looked up as paths in node files are. Raises ``ModelError``."""
@@ -246,13 +253,26 @@ class Simulator(Protocol):
     def timestep(self) -> float:
         """Simulated seconds per step."""
 
-    def step_synchronous(self, count: int = 1) -> None: ...
-    def step_to_next(self) -> None: ...
-    def read(self, output: str) -> Packet | None: ...
-    def run_asynchronous(self, real_time_factor: float | None = 1.0) -> None: ...
-    def pause(self) -> None: ...
-    def resume(self) -> None: ...
-    def reset(self) -> None: ...
+    def step_synchronous(self, count: int = 1) -> None:
+        """Advance ``count`` timesteps; nothing is sent. Raises ``ModelError``."""
+
+    def step_to_next(self) -> None:
+        """Advance to the next firing of any sensor."""
+
+    def read(self, output: str) -> Packet | None:
+        """The packet of a sensor that has come due since the last read, if there is one."""
+
+    def run_asynchronous(self, real_time_factor: float | None = 1.0) -> None:
+        """Step in a thread of its own, so many simulated seconds per wall second (None: freely)."""
+
+    def pause(self) -> None:
+        """Let no further step begin."""
+
+    def resume(self) -> None:
+        """Go on after :meth:`pause`; the time between is not caught up."""
+
+    def reset(self) -> None:
+        """Back to time zero and the initial state; unread packets are dropped."""
 
 
 class RunningNode(Protocol):

@@ -6,7 +6,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from site_parts import contents, diagrams, links, pages
+from site_parts import contents, diagrams, links, pages, wrapping
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -14,6 +14,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", pages.write)
     app.connect("source-read", contents.add_toctrees)
     app.connect("doctree-read", links.lead_to_pages)
+    app.connect("doctree-read", wrapping.keep_words_whole)
     app.add_directive("mermaid", diagrams.Mermaid)
     app.connect("html-page-context", diagrams.add_scripts)
     app.connect("html-page-context", contents.leave_out_of_source, priority=400)  # before the theme

@@ -37,7 +37,8 @@ def _section(of: argparse.ArgumentParser) -> str:
     described = f"{as_text(of.description)}\n" if of.description else ""
     rows = [_row(of, action) for action in of._actions if action.help != argparse.SUPPRESS]
     table = "\n".join(["| | |", "| --- | --- |", *(row for row in rows if row)])
-    usage = textwrap.fill(of.format_usage().removeprefix("usage: "), 85, subsequent_indent="    ")
+    words = " ".join(of.format_usage().removeprefix("usage: ").split())
+    usage = textwrap.fill(words, 85, subsequent_indent="    ", break_on_hyphens=False)
     return f"\n## {of.prog}\n\n{described}\n```text\n{usage}\n```\n\n{table}\n"
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 _MANY = 25
 """With more classes a diagram shows names alone, and only of those that are related."""
+_MANY_MODULES = 18
 _SIMPLE = {"object", "Protocol", "Generic", "NamedTuple", "Enum"}
 
 
@@ -86,13 +87,15 @@ def _box(each: Class) -> str:
 def import_diagram(imports: Mapping[str, set[str]]) -> str:
     """Mermaid's text for who imports whom; what follows from other arrows is left out."""
     names = sorted({*imports, *(name for used in imports.values() for name in used)})
+    # Rows of more than these are wider than a page; columns are as high as they need be.
+    direction = "LR" if len(names) > _MANY_MODULES else "TD"
     number = {name: f"n{index}" for index, name in enumerate(names)}
     rows = [f'  {number[name]}["{name}"]' for name in names]
     for name in sorted(imports):
         for used in sorted(imports[name]):
             if not _leads_around(imports, name, used):
                 rows.append(f"  {number[name]} --> {number[used]}")
-    return "\n".join(["flowchart TD", *rows])
+    return "\n".join([f"flowchart {direction}", *rows])
 
 
 def _leads_around(imports: Mapping[str, set[str]], start: str, end: str) -> bool:

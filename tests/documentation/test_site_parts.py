@@ -6,7 +6,8 @@ import ast
 import re
 from pathlib import Path
 
-from site_parts import code, command_line, contents, schema, uml
+from docutils import nodes
+from site_parts import code, command_line, contents, schema, uml, wrapping
 from site_parts.finished import dead_links
 
 from neuros.cli.main import parser
@@ -90,6 +91,13 @@ class TestReference:
         assert ":caption: Tutorial\n\n/docs/tutorial\n/examples/README\n```" in source[0]
         for page in DOCS.glob("*.md"):
             assert page.stem == "index" or f"\n/docs/{page.stem}\n" in source[0]
+
+
+def test_options_are_kept_whole_and_long_paths_may_be_broken() -> None:
+    option, path = nodes.literal(text="--node NAME"), nodes.literal(text="/neuros/" + 30 * "x")
+    page = nodes.paragraph("", "", option, path)
+    wrapping.keep_words_whole(None, page)
+    assert (option["classes"], path["classes"]) == (["whole"], [])
 
 
 def test_every_variable_of_neuros_is_on_its_page() -> None:

@@ -57,7 +57,8 @@ def lanes_figure(run: Run) -> Any | None:
     _draw(above, run, colours, start_ns, _SECOND_NS)
     above.set_title("the first second in which all nodes ran", fontsize=10, loc="left")
     _draw(below, run, colours, start_ns, close_ns)
-    below.set_title(f"the first {close_ns / 1e6:.3g} ms of it", fontsize=10, loc="left")
+    close_ms = float(f"{close_ns / 1e6:.3g}")
+    below.set_title(f"the first {close_ms:g} ms of it", fontsize=10, loc="left")
     _legend(figure, run, colours)
     return figure
 
