@@ -122,17 +122,21 @@ class Execution:
         Raises:
             EnvironmentFault: if it could not be started.
         """
-        try:
-            return self._run()
-        finally:
-            self._domain.release()
+        started = time.time()
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._domain.release)
+            environment = guardian_environment(self._session(started))
+            guardian = Guardian.start(self._run_id, self._domain, environment)
+            stack.callback(guardian.finish)
+            guardian.remove_later(self.folder / SOCKET_NAME)
+            return self._run(guardian, started)
 
-    def _run(self) -> dict[str, Any]:
-        started, started_s = time.time(), time.monotonic()
-        guardian = Guardian.start(
-            self._run_id, self._domain, guardian_environment(self._session(started))
-        )
-        guardian.remove_later(self.folder / SOCKET_NAME)
+    def cancel(self) -> None:
+        """Give up what it holds, in the place of :meth:`run`."""
+        self._domain.release()
+
+    def _run(self, guardian: Guardian, started: float) -> dict[str, Any]:
+        started_s = time.monotonic()
         observation = self._observation()
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         recording = None

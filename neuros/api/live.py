@@ -22,7 +22,7 @@ _AT_EXIT_S = 20.0
 
 
 class LiveRun:
-    """A run in a thread of its own; :meth:`wait` gives what comes out.
+    """A run in a thread of its own, from :meth:`begin` on; :meth:`wait` gives what comes out.
 
     As a context manager it is stopped at the end of the block, and waited for::
 
@@ -44,6 +44,7 @@ class LiveRun:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
+        self._claim = threading.Lock()  # of whoever comes first: to execute it, or never to
         self._error: BaseException | None = None
         try:
             self._execution = Execution(
@@ -57,8 +58,15 @@ class LiveRun:
         except BaseException:
             self._hang_up()
             raise
-        atexit.register(self._end_with_program)
-        threading.Thread(target=self._execute, name="neuros-run", daemon=True).start()
+
+    def begin(self) -> None:
+        """Start it; only then is there something that has to be ended."""
+        try:
+            atexit.register(self._end_with_program)
+            threading.Thread(target=self._execute, name="neuros-run", daemon=True).start()
+        except BaseException:
+            self.end()
+            raise
 
     @property
     def folder(self) -> Path:
@@ -105,6 +113,15 @@ class LiveRun:
             raise self._error
         return Run(self.folder)
 
+    def end(self) -> None:
+        """Have it ended as by Ctrl+C, and wait; one that has not begun never does."""
+        if self._claim.acquire(blocking=False):
+            self._execution.cancel()
+            self._finish()
+        elif self.is_running:
+            self.interrupt()
+        self.join()
+
     def join(self) -> None:
         """Wait for its end, and no more."""
         self._done.wait()
@@ -128,14 +145,19 @@ class LiveRun:
         return f"<{'running' if self.is_running else 'ended'} run in {self.folder}>"
 
     def _execute(self) -> None:
+        if not self._claim.acquire(blocking=False):
+            return
         try:
             self._execution.run()
         except BaseException as error:  # for whoever waits
             self._error = error
         finally:
-            self._hang_up()
-            atexit.unregister(self._end_with_program)
-            self._done.set()
+            self._finish()
+
+    def _finish(self) -> None:
+        self._hang_up()
+        atexit.unregister(self._end_with_program)
+        self._done.set()
 
     def _wake(self) -> None:
         with contextlib.suppress(OSError):  # it has ended, or is awake in any case

@@ -165,19 +165,25 @@ class Project:
             EnvironmentFault: if something is missing on this machine.
             RunError: if ``check`` is set and the run did not end normally.
         """
-        run = self.start(
+        live = self._prepared(
+            set,
+            seed,
+            show=show,
             backend=backend,
             duration=duration,
-            set=set,
-            seed=seed,
             record=record,
             output=output,
             nodes=nodes,
             domain_id=domain_id,
             monitor_system_load=monitor_system_load,
             digests=digests,
-            show=show,
-        ).wait()
+        )
+        try:
+            live.begin()
+            run = live.wait()
+        except BaseException:  # Ctrl+C may come between the two
+            live.end()
+            raise
         return run.check() if check else run
 
     def start(
@@ -196,24 +202,35 @@ class Project:
         show: bool = False,
     ) -> LiveRun:
         """Start it and go on: the arguments and errors of :meth:`run`."""
-        request = Request(
-            backend=backend or default_back_end(os.environ),
-            nodes=tuple(nodes),
-            duration=parse_duration(None if duration is None else str(duration)),
+        live = self._prepared(
+            set,
+            seed,
+            show=show,
+            backend=backend,
+            duration=duration,
+            record=record,
+            output=output,
+            nodes=nodes,
             domain_id=domain_id,
-            output=None if output is None else os.fspath(output),
-            has_digests=digests,
-            monitors_load=monitor_system_load,
-            recording=_recording(record),
+            monitor_system_load=monitor_system_load,
+            digests=digests,
         )
-        project, messages = self._load_for_run(set or {}, seed)
-        plan = make_plan(project, messages, request)
-        make_environments(plan.pythons, messages, sys.stderr)
-        return LiveRun(plan, request, is_shown=show)
+        live.begin()
+        return live
 
     def __repr__(self) -> str:
         counts = f"{len(self.nodes)} nodes, {len(self.connections)} connections"
         return f"<Project {self.name}: {counts}; {self.file}>"
+
+    def _prepared(
+        self, set: Mapping[str, Any] | None, seed: int | None, *, show: bool, **options: Any
+    ) -> LiveRun:
+        """A run that has yet to begin."""
+        request = _request(**options)
+        project, messages = self._load_for_run(set or {}, seed)
+        plan = make_plan(project, messages, request)
+        make_environments(plan.pythons, messages, sys.stderr)
+        return LiveRun(plan, request, is_shown=show)
 
     def _load(self) -> Loaded:
         return load_with_messages(self._path, override_texts(self.settings))[0]
@@ -227,6 +244,29 @@ class Project:
             seeds = seed_texts(loaded.project, seed)
             loaded, messages = load_with_messages(self._path, [*texts, *seeds])
         return loaded.project, messages
+
+
+def _request(
+    *,
+    backend: str | None,
+    duration: float | str | None,
+    record: bool | Sequence[str],
+    output: str | os.PathLike[str] | None,
+    nodes: Sequence[str],
+    domain_id: int | None,
+    monitor_system_load: bool,
+    digests: bool,
+) -> Request:
+    return Request(
+        backend=backend or default_back_end(os.environ),
+        nodes=tuple(nodes),
+        duration=parse_duration(None if duration is None else str(duration)),
+        domain_id=domain_id,
+        output=None if output is None else os.fspath(output),
+        has_digests=digests,
+        monitors_load=monitor_system_load,
+        recording=_recording(record),
+    )
 
 
 def _recording(record: bool | Sequence[str]) -> RecordingRequest | None:

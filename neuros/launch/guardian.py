@@ -91,7 +91,11 @@ class Guardian:
         finally:
             os.close(read_end)
         guardian = cls(run_id, process, write_end)
-        guardian._await_ready()
+        try:
+            guardian._await_ready()
+        except BaseException:
+            guardian._kill()
+            raise
         if lock and lock.path and descriptor is not None:
             guardian._tell("lock", [descriptor, str(lock.path)])
         return guardian
@@ -154,12 +158,14 @@ class Guardian:
             ready, _, _ = select.select([answer], [], [], _START_DEADLINE_S)
             if ready and answer.read(len(READY)) == READY:
                 return
+        raise EnvironmentFault(
+            f"the guardian process did not start ({sys.executable}): nothing was started, since "
+            "without it a killed launcher would leave nodes behind"
+        )
+
+    def _kill(self) -> None:
         self._process.kill()
         self._process.wait()
         if self._pipe is not None:
             os.close(self._pipe)
             self._pipe = None
-        raise EnvironmentFault(
-            f"the guardian process did not start ({sys.executable}): nothing was started, since "
-            "without it a killed launcher would leave nodes behind"
-        )

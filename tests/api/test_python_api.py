@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -11,7 +12,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import nbclient
@@ -179,6 +182,37 @@ except KeyboardInterrupt as interrupt:
     assert f"caught: the run was ended; its folder: {tmp_path / 'run'} 130" in output
 
 
+@pytest.mark.parametrize(
+    ("file", "function"),
+    [("neuros/api/live.py", "begin"), ("threading.py", "start"), ("neuros/api/live.py", "wait")],
+    ids=["before it begins", "as its thread begins", "before it is waited for"],
+)
+def test_ctrl_c_between_start_and_wait_leaves_nothing_running(
+    tmp_path: Path, file: str, function: str
+) -> None:
+    made = project(tmp_path, ENDLESS)
+    threads = set(threading.enumerate())
+    with interrupted_at(file, function), pytest.raises(KeyboardInterrupt):
+        made.run(backend="in-process", output="run")
+    assert set(threading.enumerate()) == threads
+    assert str(tmp_path / "run") not in {each.folder for each in sessions()}
+    assert not [each for each in open_files() if "neuros-domain-" in each]
+
+
+def test_a_run_that_cannot_be_observed_leaves_no_guardian(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = project(tmp_path)
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("neuros.observe.provenance.GitState.__init__", fail)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        made.run(backend="in-process", output="run")
+    assert str(tmp_path / "run") not in {each.folder for each in sessions()}
+
+
 @ACCEPTANCE
 def test_a_program_that_ends_ends_its_run(tmp_path: Path) -> None:
     dice(tmp_path, ENDLESS)
@@ -248,6 +282,38 @@ def test_a_project_is_looked_at_without_running_it(tmp_path: Path) -> None:
 def _log(folder: Path) -> str:
     file = folder / "counter/node.log"
     return file.read_text() if file.exists() else ""
+
+
+@contextlib.contextmanager
+def interrupted_at(file: str, function: str) -> Iterator[None]:
+    """Ctrl+C, once, as this thread enters a function that has to do with a run."""
+
+    places = []
+
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event != "call" or code.co_name != function or not code.co_filename.endswith(file):
+            return
+        if getattr(frame.f_locals["self"], "name", "neuros-run") == "neuros-run":
+            sys.setprofile(None)
+            places.append(function)
+            raise KeyboardInterrupt
+
+    sys.setprofile(profile)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+    assert places, f"{function} was not called"
+
+
+def open_files() -> list[str]:
+    """What this process has open."""
+    found = []
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            found.append(os.readlink(link))
+    return found
 
 
 def _await(condition: Any) -> None:
