@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterator
+from http.client import HTTPConnection
 from typing import Any
 
 import requests
@@ -38,6 +39,13 @@ class Visitor:
 
     def post(self, path: str, token: str | None = None, **headers: str) -> int:
         return self._status("POST", path, token, headers)
+
+    def get_as_it_is(self, path: str) -> int:
+        """The status of an answer to a path that ``requests`` would tidy up beforehand."""
+        connection = HTTPConnection(self._origin.partition("//")[2], timeout=TIMEOUT_S)
+        with contextlib.closing(connection):
+            connection.request("GET", path, headers={"Cookie": f"{self._cookie}={self._token}"})
+            return connection.getresponse().status
 
     def _status(self, method: str, path: str, token: str | None, headers: dict[str, str]) -> int:
         cookies = {self._cookie: self._token if token is None else token}

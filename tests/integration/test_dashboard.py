@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import psutil
 from dashboard.browser import browser_page
 from dashboard.visitor import IMU, WATCHED, Visitor, address, is_full
 from launching import Running, start
+
+from neuros.dashboard.server import STATIC
 
 
 def start_watched(tmp_path: Path, *arguments: str) -> Running:
@@ -108,7 +110,11 @@ def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -
         assert visitor.post("/do/stop", Origin=f"http://{netloc.replace(':', ':1')}") == 403
         assert visitor.get("/", Host="neuros.example.org") == 403
         assert visitor.get("/", Host=netloc.replace("127.0.0.1", "localhost")) == 200
-        assert visitor.get("/static/../../launch.py") == 404
+        assert visitor.get_as_it_is("/static/vendor/../main.js") == 200
+        for up in ("..", "%2e%2e", "..%2f..%2fdashboard", "vendor/../.."):
+            assert (STATIC / unquote(up) / "server.py").is_file()
+            assert visitor.get_as_it_is(f"/static/{up}/server.py") == 404, up
+        assert visitor.get_as_it_is("/static//etc/passwd") == 404
         assert visitor.post("/do/something") == 404
 
         taken = str(urlsplit(url).port)
