@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,13 @@ while time.monotonic() < deadline_s and not (heard and heard[-1].hash):
 (info,) = node.get_publishers_info_by_topic("/told")
 print(list(heard[-1].joints.angles), heard[-1].hash, info.topic_type_hash)
 """
+
+
+@pytest.fixture
+def domain() -> Iterator[str]:
+    """A ROS domain where nobody else is."""
+    with choose_domain(None, {}, False) as chosen:
+        yield str(chosen.id)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +227,7 @@ print(result.result().result.done, [each.so_far for each in heard])
 
 
 @pytest.mark.acceptance
-def test_actions_are_built_too(tmp_path: Path) -> None:
+def test_actions_are_built_too(domain: str, tmp_path: Path) -> None:
     action = "int32 times\n---\nbool done\n---\nint32 so_far\n"
     write_package(
         tmp_path / "workspace", "nod_msgs", {"action/Nod.action": action}, ["action_msgs"]
@@ -230,7 +238,7 @@ def test_actions_are_built_too(tmp_path: Path) -> None:
 
     program = subprocess.run(
         [sys.executable, "-c", ACTION],
-        env={**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": "93"},
+        env={**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": domain},
         capture_output=True,
         text=True,
         check=False,
@@ -270,9 +278,9 @@ def test_packages_of_ros_get_the_hashes_that_they_are_shipped_with(
 class TestRuns:
     @pytest.mark.parametrize("back_end", BACKENDS)
     def test_nodes_exchange_them_in_the_run_in_its_bag_and_in_its_replay(
-        self, custom_messages: CustomMessages, back_end: str, tmp_path: Path
+        self, custom_messages: CustomMessages, back_end: str, domain: str, tmp_path: Path
     ) -> None:
-        arguments = ("--backend", back_end, "-d", "90", "-t", "body.joints")
+        arguments = ("--backend", back_end, "-d", domain, "-t", "body.joints")
         run = launch(
             custom_messages.project,
             *arguments,
@@ -311,21 +319,19 @@ class TestRuns:
         assert done.stdout.startswith("[] 1.0 ['neck'] on Python"), done.stderr
 
     def test_a_plain_ros_program_understands_them(
-        self, custom_messages: CustomMessages, tmp_path: Path
+        self, custom_messages: CustomMessages, domain: str, tmp_path: Path
     ) -> None:
-        with choose_domain(None, {}, False) as domain:
-            id_ = str(domain.id)
-            with (
-                python(custom_messages, LISTENER, ROS_DOMAIN_ID=id_) as listener,
-                start(
-                    custom_messages.project,
-                    *("-d", id_, "--set", "nodes.body.environment.WAIT_FOR_LISTENER_S=30"),
-                    cwd=tmp_path,
-                    **custom_messages.environment,
-                ) as running,
-            ):
-                heard = listener.communicate(timeout=60)[0]
-                assert running.finish(60.0).exit_code == 0
+        with (
+            python(custom_messages, LISTENER, ROS_DOMAIN_ID=domain) as listener,
+            start(
+                custom_messages.project,
+                *("-d", domain, "--set", "nodes.body.environment.WAIT_FOR_LISTENER_S=30"),
+                cwd=tmp_path,
+                **custom_messages.environment,
+            ) as running,
+        ):
+            heard = listener.communicate(timeout=60)[0]
+            assert running.finish(60.0).exit_code == 0
         angles, hash_told, hash_seen = heard.splitlines()[-1].rsplit(" ", 2)
         assert angles == "[1.0, 1.5]"
         assert hash_told == described_hash(custom_messages, "demo_msgs/msg/Joints")
@@ -411,12 +417,14 @@ def copied(messages: CustomMessages, folder: Path, container: str) -> Path:
     return project
 
 
-def test_nodes_in_containers_find_them(custom_messages: CustomMessages, tmp_path: Path) -> None:
+def test_nodes_in_containers_find_them(
+    custom_messages: CustomMessages, domain: str, tmp_path: Path
+) -> None:
     require_containers("neuros_python")
 
     run = launch(
         custom_messages.project,
-        *("--backend", "docker", "-d", "91", "-r"),
+        *("--backend", "docker", "-d", domain, "-r"),
         cwd=tmp_path,
         timeout_s=60.0,
         **custom_messages.environment,
@@ -431,7 +439,7 @@ def test_nodes_in_containers_find_them(custom_messages: CustomMessages, tmp_path
 @pytest.mark.acceptance
 @pytest.mark.parametrize("back_end", ["docker", "process"])
 def test_a_node_with_another_python_finds_the_same_build(
-    custom_messages: CustomMessages, back_end: str, tmp_path: Path
+    custom_messages: CustomMessages, back_end: str, domain: str, tmp_path: Path
 ) -> None:
     """In a container with Debian 13; as a process in an environment that takes a minute to make."""
     if back_end == "docker":
@@ -445,7 +453,7 @@ def test_a_node_with_another_python_finds_the_same_build(
 
     run = launch(
         project,
-        *("--backend", back_end, "-d", "91"),
+        *("--backend", back_end, "-d", domain),
         cwd=tmp_path,
         timeout_s=400.0,
         **custom_messages.environment,

@@ -16,6 +16,7 @@ from launching import start
 
 from containers import connected, require_containers, wait_until
 from neuros.launch.docker.tool import IMAGE
+from neuros.launch.domain import choose_domain
 
 # A stand-in for the tools of a ROS distribution, which no test machine has the gigabytes for.
 TOOL = '#!/bin/sh\necho "$ROS_DOMAIN_ID $DISPLAY"; head -n 1 "$2"; exec sleep 60\n'
@@ -72,10 +73,15 @@ def test_a_tool_in_a_container_sees_the_run_and_goes_with_a_killed_launcher(
             each.id for each in found if each.labels["neuros.run_folder"].startswith(str(tmp_path))
         ]
 
-    arguments = ("-z", "-d", "83", "--backend", "process")
-    with start(WATCHED, *arguments, cwd=tmp_path, DISPLAY=":7", PATH="/usr/bin:/bin") as running:
-        running.wait_for("rviz2: a window on this display")
-        (tool,) = containers()
-        wait_until(lambda: engine.containers.get(tool).logs() == b"83 :7\n{\n")
-        running.signal(signal.SIGKILL)
-        wait_until(lambda: not containers(), GONE_WITHIN_S)
+    with choose_domain(None, {}, False) as domain:
+        arguments = ("-z", "-d", str(domain.id), "--backend", "process")
+        with start(
+            WATCHED, *arguments, cwd=tmp_path, DISPLAY=":7", PATH="/usr/bin:/bin"
+        ) as running:
+            running.wait_for("rviz2: a window on this display")
+            (tool,) = containers()
+            wait_until(
+                lambda: engine.containers.get(tool).logs() == f"{domain.id} :7\n{{\n".encode()
+            )
+            running.signal(signal.SIGKILL)
+            wait_until(lambda: not containers(), GONE_WITHIN_S)
