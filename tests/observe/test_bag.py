@@ -216,6 +216,7 @@ def test_what_has_gone_since_the_run_ended_is_said(
 
 
 def test_a_run_that_was_not_recorded_and_one_of_another_version_are_said(tmp_path: Path) -> None:
+    (tmp_path / "run.json").touch()
     with pytest.raises(UsageError, match="was not recorded"):
         neuros.bag.open(tmp_path)
     (tmp_path / "recording.json").write_text('{"version": 99}')
@@ -231,3 +232,37 @@ def test_a_bag_that_is_not_one_is_said(tmp_path: Path) -> None:
     (tmp_path / "bag" / "metadata.yaml").write_text("nonsense: 1")
     with pytest.raises(EnvironmentFault, match="cannot be read"):
         neuros.bag.open(tmp_path)
+
+
+def lay_out(folder: Path, *files: str) -> None:
+    for name in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("[")
+
+
+@pytest.mark.parametrize(
+    ("path", "said", "exit_code"),
+    [
+        ("nowhere", "nowhere: there is no such file or folder", 2),
+        ("loose/a.mcap", "loose/a.mcap is a file: give the folder of a run, or of a bag", 2),
+        ("loose", "loose has a.mcap, but no metadata.yaml: `ros2 bag reindex` writes it anew", 2),
+        ("empty", "empty is the folder of neither a run nor a bag: it has no run.json, no meta", 2),
+        ("run", "run was not recorded: launch the project with -r, or name topics with -t", 2),
+        ("killed", "killed was not recorded: launch the project with -r, or name topics", 2),
+        ("torn", "torn cannot be read: it is damaged (Could not load YAML from ", 4),
+    ],
+)
+def test_a_path_without_a_bag_gets_one_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    path: str,
+    said: str,
+    exit_code: int,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    lay_out(tmp_path, "loose/a.mcap", "run/run.json", "killed/a/node.json", "torn/metadata.yaml")
+    assert main(["bag", "info", path]) == exit_code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"neuros: {said}")

@@ -145,10 +145,8 @@ class Bag:
                 self.duration_s = reader.duration / 1e9
                 found = {c.topic: c for c in reader.connections}
         except ReaderError as error:
-            raise EnvironmentFault(
-                f"{folder} cannot be read: {error} (neuros bag repair RUN completes the bag of a"
-                " run that was killed)"
-            ) from error
+            why = " ".join(str(error).split())
+            raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
         self.store = _store_of(found.values())
         self.topics = {
             name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()

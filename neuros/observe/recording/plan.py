@@ -95,9 +95,23 @@ def load_plan(run: Path) -> RecordingPlan:
         for key in ("listen", "wanted"):
             content[key] = tuple(content[key])
         return RecordingPlan(**content)
-    except FileNotFoundError as error:
-        raise UsageError(f"{run} was not recorded: it has no {PLAN_NAME}") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise UsageError(_why_no_plan(run)) from error
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path} is damaged: {error}") from error
+
+
+def _why_no_plan(run: Path) -> str:
+    """What a path is that is no folder of a run that was recorded."""
+    if not run.exists():
+        return f"{run}: there is no such file or folder"
+    if not run.is_dir():
+        return f"{run} is a file: give the folder of a run, or of a bag (with metadata.yaml)"
+    if (run / "run.json").exists() or any(run.glob("*/node.json")):
+        return f"{run} was not recorded: launch the project with -r, or name topics with -t"
+    files = sorted(each.name for pattern in ("*.mcap", "*.db3") for each in run.glob(pattern))
+    if files:
+        return f"{run} has {files[0]}, but no metadata.yaml: `ros2 bag reindex` writes it anew"
+    return f"{run} is the folder of neither a run nor a bag: it has no run.json, no metadata.yaml"
