@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -17,6 +19,8 @@ from observe.recordings import ANSWER, NUMBER, answer, fail, number, plan, recor
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from neuros.observe.recording import recorder as recording
+from neuros.observe.recording.bag_writer import BagWriter
 from neuros.observe.recording.plan import RecordingPlan, Stream, Topic, load_plan
 from neuros.observe.recording.recorder import Recorder
 from neuros.observe.recording.repair import repair
@@ -172,6 +176,38 @@ def test_a_type_without_definition_is_said_and_the_others_are_recorded(tmp_path:
     assert recorder.counts() == {"/odd": 0, "/answer": 0}
 
 
+def test_packets_do_not_pile_up_where_somebody_sets_the_clock_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    now_ns = time.time_ns()
+    spool(tmp_path, "b", [(now_ns - 50_000_000, None, answer())])
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns - 3600 * 10**9)
+    recorder.poll()
+    assert recorder.counts()[ANSWER.name] == 1
+    recorder.abandon()
+
+
+def test_a_spool_stays_while_a_packet_of_it_is_held_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "_CHECKPOINT_S", 0.0)
+    monkeypatch.setattr(recording, "_CHECKPOINT_PAUSE", 0)
+    monkeypatch.setattr(recording, "_MOST_BYTES", 72)  # two packets of a node at a time
+    recorder = Recorder(plan(), tmp_path, fail)
+    recorder.poll()
+    spool(tmp_path, "a", [(wall_ns, None, number(0)) for wall_ns in (110, 150, 160, 170, 180)])
+    late = SpoolWriter(tmp_path / "b", (), file_bytes=1)
+    for wall_ns in (100, 200, 300):
+        late.append(wall_ns, NO_TIME, 0, answer())
+    late.close()
+    recorder.poll()
+    recorder.poll()  # a has more to tell up to 180, so 200 has to wait
+    assert recorder.counts()[ANSWER.name] == 1
+    assert sorted(os.listdir(tmp_path / "b" / "spool")) == ["00000001", "00000002"]
+    recorder.abandon()
+
+
 def test_a_full_disk_leaves_the_bag_of_the_last_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,6 +302,31 @@ def test_a_repair_that_was_cut_off_is_repeated(tmp_path: Path) -> None:
     assert counts is not None
     assert counts[NUMBER.name] == 1
     assert not (tmp_path / "bag.damaged").exists()
+
+
+def test_a_bag_larger_than_memory_can_be_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    plan().save(tmp_path)
+    for k in range(40):
+        recorder.bag.put(1, k + 1, k + 1, bytes(1 << 20))
+    recorder.bag.checkpoint()
+    recorder.abandon()
+    os.truncate(bag_file(tmp_path), bag_file(tmp_path).stat().st_size - 10)
+    most_bytes = 0
+    put = BagWriter.put
+
+    def watched(bag: BagWriter, *arguments: Any) -> None:
+        nonlocal most_bytes
+        put(bag, *arguments)
+        most_bytes = max(most_bytes, bag.pending_bytes)
+
+    monkeypatch.setattr(BagWriter, "put", watched)
+    counts = repair(tmp_path, fail)
+    assert counts is not None
+    assert counts[NUMBER.name] == 40
+    assert most_bytes < 20 << 20
 
 
 def test_a_plan_survives_its_file(tmp_path: Path) -> None:

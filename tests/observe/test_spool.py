@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from itertools import count
 from pathlib import Path
 
@@ -58,6 +59,18 @@ def test_times_of_a_spool_differ_even_where_the_clock_stands_still(tmp_path: Pat
     for _ in range(3):
         spool.keep(IMU, b"x", None)
     assert [r.wall_ns for r in read_all(SpoolReader(tmp_path))] == [7, 8, 9]
+
+
+def test_times_go_on_where_somebody_sets_the_clock_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walls_s, monotonics_s = [1000, 1001, 402, 403], [50, 51, 52, 53]
+    monkeypatch.setattr(time, "time_ns", lambda: walls_s.pop(0) * 10**9)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: monotonics_s.pop(0) * 10**9)
+    spool = SpoolWriter(tmp_path, STREAMS)
+    for _ in range(3):
+        spool.keep(IMU, b"a", None)
+    assert [r.wall_ns // 10**9 for r in read_all(SpoolReader(tmp_path))] == [1001, 1002, 1003]
 
 
 @settings(deadline=None)

@@ -13,7 +13,8 @@ from neuros.observe.recording.bag_writer import BagWriter
 from neuros.observe.recording.definitions import Definitions
 from neuros.observe.recording.listened import forget_listened, listened_topics
 from neuros.observe.recording.plan import BAG_NAME, LISTENER, RecordingPlan, Topic
-from neuros.observe.recording.spool import NO_TIME, SpoolReader
+from neuros.observe.recording.spool import NO_TIME, ForwardClock, SpoolReader
+from neuros.observe.recording.stored import Stored
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
 # running. Readers of bags sort, so a packet that comes later is only less convenient.
@@ -24,6 +25,7 @@ _CHECKPOINT_BYTES = 16 << 20
 # A checkpoint writes about every topic and every megabyte, so it takes longer as they become more;
 # the pause after it is this many times as long, for a recorder must not take the nodes' time.
 _CHECKPOINT_PAUSE = 50
+_ALL_NS = (1 << 63) - 1
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
 _IsNew: TypeAlias = Callable[[int, int], bool]
@@ -74,7 +76,7 @@ class Recorder:
         self._listener = _Source(SpoolReader(run / LISTENER), [], owns_time=False)
         self._sources.append(self._listener)
         self._held: list[_Kept] = []
-        self._released_ns = 0
+        self._wall_clock = ForwardClock()
         self._sim_ns = 0
         self.bag.checkpoint()
         self._due_s = self._clock() + _CHECKPOINT_S
@@ -92,7 +94,7 @@ class Recorder:
 
     def poll(self) -> bool:
         """Move what there is; returns whether there is more right now. Raises ``OSError``."""
-        has_more = self._move(time.time_ns() - _SETTLED_NS)
+        has_more = self._move(self._wall_clock() - _SETTLED_NS)
         is_due = self._clock() >= self._due_s
         if self._written > self._checked and (
             is_due or self.bag.pending_bytes >= _CHECKPOINT_BYTES
@@ -105,11 +107,19 @@ class Recorder:
         """Whether a process still has a spool open for writing."""
         return any(source.reader.is_fed for source in self._sources)
 
+    def copy(self, topic: Topic, message: Stored) -> int | None:
+        """Put a message of another bag into this one; returns the number of its topic, as
+        :meth:`number_of`. Raises ``OSError``."""
+        number = self.number_of(topic)
+        if number is not None:
+            self.bag.put(number, message.log_ns, message.publish_ns, message.data)
+            self._write_out()
+        return number
+
     def complete(self) -> None:
         """Move all that is left, and close the bag. Raises ``OSError``."""
         while self._move(None):
-            if self.bag.pending_bytes >= _CHECKPOINT_BYTES:
-                self.bag.checkpoint()
+            self._write_out()
         self.bag.close()
 
     def clean_up(self) -> None:
@@ -160,7 +170,6 @@ class Recorder:
             written += 1
         del self._held[:written]
         self._written += written
-        self._released_ns = max(self._released_ns, horizon_ns or 0)
         return has_more
 
     def _write(
@@ -177,14 +186,21 @@ class Recorder:
             if self._is_new is None or self._is_new(topic, wall_ns):
                 self.bag.put(topic, wall_ns, publish_ns, data)
 
+    def _write_out(self) -> None:
+        """Bags may be larger than memory."""
+        if self.bag.pending_bytes >= _CHECKPOINT_BYTES:
+            self.bag.checkpoint()
+
     def _checkpoint(self) -> None:
         began_s = self._clock()
         self.bag.checkpoint()
         took_s = self._clock() - began_s
         self._due_s = began_s + took_s + max(_CHECKPOINT_S, _CHECKPOINT_PAUSE * took_s)
         self._checked = self._written
+        # Whatever was read and is not held is in the bag.
+        safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
         for source in self._sources:
-            source.reader.remove_up_to(self._released_ns)
+            source.reader.remove_up_to(safe_ns)
 
     def _numbers(self, topics: Any) -> tuple[int, ...]:
         numbers = (self.number_of(topic) for topic in topics)

@@ -115,7 +115,6 @@ def _copy(
 ) -> None:
     for message in stored_messages(damaged):
         topic = topics.get(message.topic)
-        number = None if topic is None else recorder.number_of(topic)
+        number = None if topic is None else recorder.copy(topic, message)
         if number is not None:
-            recorder.bag.put(number, message.log_ns, message.publish_ns, message.data)
             present.add((number, message.log_ns))

@@ -40,6 +40,19 @@ class Record(NamedTuple):
     data: bytes
 
 
+class ForwardClock:
+    """Wall time in nanoseconds that goes on evenly where somebody sets the clock back."""
+
+    def __init__(self) -> None:
+        self._ahead_ns = time.time_ns() - time.monotonic_ns()
+
+    def __call__(self) -> int:
+        # In this order, a pause between the two can only make the difference smaller.
+        wall_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        self._ahead_ns = max(self._ahead_ns, wall_ns - monotonic_ns)
+        return monotonic_ns + self._ahead_ns
+
+
 class SpoolWriter:
     """Keeps the packets of one node (:class:`neuros.ports.Tap`).
 
@@ -54,14 +67,14 @@ class SpoolWriter:
         streams: Sequence[Stream],
         *,
         file_bytes: int = FILE_BYTES,
-        clock: Callable[[], int] = time.time_ns,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         self._folder = folder / _FOLDER
         self._numbers: Mapping[tuple[Way, str], int] = {
             (Way(stream.way), stream.name): number for number, stream in enumerate(streams)
         }
         self._file_bytes = file_bytes
-        self._clock = clock
+        self._clock = clock or ForwardClock()
         self._descriptor = -1
         self._files = 0
         self._size = 0
