@@ -89,7 +89,7 @@ class Execution:
         self._views = views
         self._run_id = os.urandom(8).hex()
         check_observation(monitors_load=request.monitors_load)
-        self._recording_plan = recording_of(plan, request.domain_id, os.environ)
+        self._recording_plan = recording_of(plan, request, os.environ)
         self._domain = run_domain(plan, request, self._recording_plan)
         try:
             self.folder = make_run_folder(request.output, plan.project.name)

@@ -15,6 +15,8 @@ from typing import Any
 
 from neuros import __version__
 from neuros.api.plan import Plan
+from neuros.api.request import Request
+from neuros.api.run_folder import run_folder_path
 from neuros.errors import UsageError
 from neuros.launch.guardian import Guardian
 from neuros.launch.recording import Recorded, RecorderProcess
@@ -30,7 +32,7 @@ class Recording:
     """What is recorded of one run, and the process that does it.
 
     Raises:
-        UsageError: if something is to be recorded that does not exist.
+        UsageError: if the run folder cannot be written to.
         EnvironmentFault: if the recorder cannot be started.
     """
 
@@ -92,20 +94,17 @@ class Recording:
         return topics
 
 
-def recording_of(
-    plan: Plan, domain_id: int | None, environ: Mapping[str, str]
-) -> RecordingPlan | None:
+def recording_of(plan: Plan, request: Request, environ: Mapping[str, str]) -> RecordingPlan | None:
     """What is recorded of a run, ``None``: nothing.
 
-    Args:
-        domain_id: the domain that was asked for.
-
     Raises:
-        UsageError: if something is to be recorded that does not exist.
+        UsageError: if something is to be recorded that is not there, or not in that folder.
     """
     if plan.recording is None:
         return None
-    is_open = plan.needs_known_domain or domain_id is not None
+    run = run_folder_path(request.output, plan.project.name)
+    _check_folder(plan.recording.storage, run)
+    is_open = plan.needs_known_domain or request.domain_id is not None
     return plan_recording(
         plan.project,
         plan.names,
@@ -113,6 +112,16 @@ def recording_of(
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
         custom=_custom_data(plan.project),
     )
+
+
+def _check_folder(storage: str, run: Path) -> None:
+    """Raise ``UsageError`` where the bag would be written elsewhere: SQLite is given an address."""
+    odd = [character for character in "#?%" if character in str(run)]
+    if storage == "sqlite3" and odd:
+        raise UsageError(
+            f"--storage sqlite3 cannot write to {run}, which has {' and '.join(odd)} in its name:"
+            " name another folder with -o, or record as mcap"
+        )
 
 
 def log_of(run: Path) -> Path:

@@ -56,7 +56,7 @@ def _request(options: argparse.Namespace) -> Request:
 
 
 def _dry_run(plan: Plan, request: Request) -> int:
-    recording = recording_of(plan, request.domain_id, os.environ)
+    recording = recording_of(plan, request, os.environ)
     folder = run_folder_path(request.output, plan.project.name, "<utc time>")
     with run_domain(plan, request, recording) as domain:
         print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")

@@ -218,12 +218,13 @@ def test_only_what_is_named_is_recorded(tmp_path: Path) -> None:
         (("-r", "--exclude", "source.nmber"), "--exclude source.nmber: the project has no such"),
         (("--exclude", "/clock"), "--exclude: nothing is recorded; add -r"),
         (("--storage", "sqlite3"), "--storage: nothing is recorded; add -r"),
+        (("-r", "--storage", "sqlite3"), "which has # in its name"),
     ],
 )
 def test_what_cannot_be_recorded_is_said_before_the_start(
     options: tuple[str, ...], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
+    run = tmp_path / "run #1"
     assert main(["launch", str(PROJECTS / "pipeline"), "-o", str(run), *options]) == 2
     assert text in capsys.readouterr().err
     assert not run.exists()
