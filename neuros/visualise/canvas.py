@@ -35,8 +35,9 @@ class Canvas:
         self._figure, self.is_window, self.remark = _figure(title, environ)
         self._figure.canvas.mpl_connect("close_event", self._on_closed)
 
-    def draw(self, panels: Sequence[Panel]) -> None:
-        """Draw all of them."""
+    def draw(self, panels: Sequence[Panel]) -> list[str]:
+        """Draw all of them; returns a sentence for each that cannot be drawn."""
+        faults = []
         self._figure.clear()
         if not self.is_window:
             self._figure.set_size_inches(_WIDTH_INCHES, max(2, len(panels)) * _PANEL_INCHES)
@@ -49,8 +50,15 @@ class Canvas:
                 self._figure.add_subplot(places[column], projection=projection)
                 for column, projection in enumerate(panel.projections)
             ]
-            panel.draw(axes, end_s)
+            try:
+                panel.draw(axes, end_s)
+            except Exception as error:  # whatever Matplotlib thinks of what a plugin has given
+                faults.append(f"'{panel.title}' cannot be drawn: {error}")
+                for each in axes:
+                    each.clear()
+                axes[0].set_title(f"{panel.title}: cannot be drawn", loc="left", fontsize="small")
         self._figure.canvas.draw()
+        return faults
 
     def save(self, path: Path) -> None:
         """Write what was drawn last; whoever looks never finds half of it."""

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from neuros.errors import EnvironmentFault
@@ -34,6 +35,10 @@ _ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 class Feed:
     """The drawing process of one figure, and the way to it.
 
+    Args:
+        first: the first message.
+        file: where the figure is saved.
+
     Attributes:
         dropped: messages that were left out.
 
@@ -41,7 +46,8 @@ class Feed:
         EnvironmentFault: if it cannot be started.
     """
 
-    def __init__(self, first: Sequence[Any]) -> None:
+    def __init__(self, first: Sequence[Any], file: Path) -> None:
+        self.file = file
         self.dropped = 0
         self._sent = 0
         self._unsent = bytearray()
@@ -133,6 +139,11 @@ class Feed:
 
 
 _OPEN: list[Feed] = []
+
+
+def is_drawn(file: Path) -> bool:
+    """Whether a figure of this process is saved there."""
+    return any(feed.file == file for feed in _OPEN)
 
 
 def _close(feeds: Sequence[Feed], patience_s: float) -> None:

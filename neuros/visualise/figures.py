@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -14,16 +15,17 @@ import numpy as np
 
 from neuros.errors import EnvironmentFault
 from neuros.visualise.angles import wrapped, yaw_of
-from neuros.visualise.feed import Feed
+from neuros.visualise.feed import Feed, is_drawn
+from neuros.visualise.pixels import small_pixels
 
-_LARGEST_SIDE = 320
+_LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
 
 
 class _Figure:
     """What all figures have.
 
     Args:
-        title: of the figure; its file is named after it.
+        title: of the figure; its file is named after it, with a number where that is taken.
         duration: how many seconds are shown, the latest ones; ``None``: all.
         below: another figure, whose window and file this one shares, underneath.
         save_every: seconds of wall time between two times that it is saved.
@@ -50,9 +52,8 @@ class _Figure:
         if below is None:
             if find_spec("matplotlib") is None:
                 raise EnvironmentFault("figures need Matplotlib: pip install 'neuros[plot]'")
-            folder = Path(os.environ.get("NEUROS_RUN_DIR") or ".").absolute()
-            self.file = folder / f"{re.sub(r'[^A-Za-z0-9]+', '_', title).strip('_').lower()}.png"
-            self._feed = Feed(("figure", title, str(self.file), float(save_every)))
+            self.file = _file_for(title)
+            self._feed = Feed(("figure", title, str(self.file), float(save_every)), self.file)
             self._panels = [self]
         else:
             self.file, self._feed, self._panels = below.file, below._feed, below._panels
@@ -169,7 +170,8 @@ class VisualiseRotations(_Figure):
                 it.
             timestamp: in seconds.
         """
-        kind = self._kinds.get(line_name)
+        self._check(line_name)
+        kind = self._kinds[line_name]
         if kind == "quaternion":
             angle_rad = yaw_of(orientation)
         else:
@@ -204,10 +206,7 @@ class VisualiseImages(_Figure):
             ValueError: for another encoding or shape.
         """
         self._check(name)
-        pixels = _pixels(image)
-        step = max(1, math.ceil(max(pixels.shape[:2]) / _LARGEST_SIDE))
-        small = np.ascontiguousarray(pixels[::step, ::step])
-        message = ("data", self._number, name, timestamp, small)
+        message = ("data", self._number, name, timestamp, small_pixels(image))
         self._feed.send_latest(f"{self._number} {name}", message)
 
 
@@ -256,19 +255,10 @@ class VisualiseRing(_Figure):
         self._send(name, float(timestamp), np.asarray(activity, np.float64).ravel())
 
 
-def _pixels(image: Any) -> Any:
-    encoding = getattr(image, "encoding", None)
-    if encoding is None:
-        pixels = np.asarray(image)
-        if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3):
-            return pixels
-        raise ValueError(
-            f"an image has shape (height, width) or (height, width, 3): {pixels.shape}"
-        )
-    if encoding not in ("rgb8", "bgr8", "mono8"):
-        raise ValueError(f"images with encoding {encoding} cannot be drawn: rgb8, bgr8, mono8 can")
-    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
-    if encoding == "mono8":
-        return rows[:, : image.width]
-    pixels = rows[:, : 3 * image.width].reshape(image.height, image.width, 3)
-    return pixels if encoding == "rgb8" else pixels[..., ::-1]
+def _file_for(title: str) -> Path:
+    """Where no other figure of this process is saved."""
+    folder = Path(os.environ.get("NEUROS_RUN_DIR") or ".").absolute()
+    stem = re.sub(r"[\W_]+", "_", title).strip("_").lower()[:_LONGEST_STEM] or "figure"
+    numbered = (f"{stem}_{number}" for number in itertools.count(2))
+    names = itertools.chain([stem], numbered)
+    return next(file for name in names if not is_drawn(file := folder / f"{name}.png"))

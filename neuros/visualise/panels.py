@@ -24,6 +24,8 @@ class Series:
         self.values: list[Any] = []
 
     def add(self, time_s: float, value: Any) -> None:
+        if not math.isfinite(time_s):
+            return  # there is no place for it
         self.times.append(time_s)
         self.values.append(value)
         if len(self.times) > _MOST_POINTS:

@@ -59,7 +59,9 @@ class Drawing:
         if self._canvas.remark:
             print(f"{title}: {self._canvas.remark}", file=sys.stderr, flush=True)
         self._file = Path(file)
+        self._title = title
         self._panels: list[Panel] = []
+        self._faults: set[str] = set()
         self._is_new = False
         self._save_every_s = save_every_s
         self._next_draw_s = time.monotonic()
@@ -84,21 +86,40 @@ class Drawing:
         if self._is_new and (
             is_saved_now or (self._canvas.is_window and now_s >= self._next_draw_s)
         ):
-            self._canvas.draw(self._panels)
+            self._draw()
             self._is_new = False
             # What takes long is not done all the time.
             took_s = time.monotonic() - now_s
             self._next_draw_s = time.monotonic() + max(_REDRAW_S, took_s)
             if is_saved_now:
-                self._canvas.save(self._file)
+                self._save()
                 self._next_save_s = time.monotonic() + self._save_every_s
         self._canvas.heed_user()
         return _HEED_S if self._canvas.is_window else self._save_every_s
 
     def finish(self) -> None:
         """Save what there is."""
-        self._canvas.draw(self._panels)
-        self._canvas.save(self._file)
+        self._draw()
+        self._save()
+
+    def _draw(self) -> None:
+        try:
+            for fault in self._canvas.draw(self._panels):
+                self._complain(fault)
+        except Exception as error:  # of Matplotlib, about a text that a plugin has given
+            self._complain(f"it cannot be drawn: {error}")
+
+    def _save(self) -> None:
+        try:
+            self._canvas.save(self._file)
+        except Exception as error:  # there may be room for it, or something else to draw, later
+            self._complain(f"{self._file} cannot be saved: {error}")
+
+    def _complain(self, text: str) -> None:
+        """Say it once: the figure is drawn again and again."""
+        if text not in self._faults:
+            self._faults.add(text)
+            print(f"{self._title}: {text}", file=sys.stderr, flush=True)
 
 
 def main() -> None:

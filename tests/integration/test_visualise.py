@@ -27,6 +27,7 @@ from neuros.visualise import (
     VisualiseRotations,
     VisualiseSpikes,
 )
+from neuros.visualise import figures as figure_files
 
 DEADLINE_S = 30.0
 HAS_TOOLKIT = importlib.util.find_spec("_tkinter") is not None
@@ -104,16 +105,67 @@ def test_every_kind_of_figure_is_saved_and_parts_may_share_one(tmp_path: Path) -
 def test_ros_images_are_shown_in_their_colours() -> None:
     data = np.zeros((4, 4, 3), np.uint8)
     data[...] = (255, 0, 0)  # blue, as OpenCV has it
-    message = SimpleNamespace(encoding="bgr8", height=4, width=4, step=12, data=data.tobytes())
+    message = SimpleNamespace(encoding="bgr8", height=4, width=4, step=0, data=data.tobytes())
     figure = VisualiseImages("camera")
     figure.add_image("eye")
     figure.plot("eye", message)
     with pytest.raises(ValueError, match="encoding 32FC1 cannot be drawn"):
         figure.plot("eye", SimpleNamespace(encoding="32FC1"))
+    message.height = 0
+    with pytest.raises(ValueError, match="48 bytes are no image of 4 x 0, 12 per row"):
+        figure.plot("eye", message)
     with pytest.raises(ValueError, match="'ear' was not added to the figure; there are eye"):
         figure.plot("ear", message)
     figure.close()
     assert coloured(figure.file, (0, 0, 1))[0].size > 1000
+
+
+def test_what_cannot_be_drawn_is_said_once_and_the_rest_of_the_figure_is_saved(capfd: Any) -> None:
+    wrong = VisualiseLines("wrong", save_every=0.0)
+    wrong.add_line("height", "infrared")
+    right = VisualiseLines("right", below=wrong)
+    right.add_line("height", "red")
+    for step in range(10):
+        wrong.plot("height", step, step)
+        right.plot("height", step, step)
+    right.plot("height", 0.0, float("nan"))  # at no time
+    wrong.close()
+    said = capfd.readouterr().err
+    assert said.count("wrong: 'wrong' cannot be drawn: 'infrared' is not a valid") == 1
+    assert "Traceback" not in said
+    assert coloured(wrong.file, (1, 0, 0))[0].size > 100
+
+
+def test_a_folder_that_is_gone_costs_the_file_and_not_the_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    monkeypatch.setenv("NEUROS_RUN_DIR", str(tmp_path / "gone"))
+    figure = VisualiseLines("lost")
+    figure.close()
+    said = capfd.readouterr().err
+    assert said.startswith(f"lost: {figure.file} cannot be saved: [Errno 2]")
+    assert "Traceback" not in said
+
+
+def test_figures_of_any_titles_have_files_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files: list[Path] = []
+    monkeypatch.setattr(figure_files, "is_drawn", files.__contains__)
+    for title in ("Größe", "大きさ", "left eye", "Left-Eye", "???", "!", "x" * 300):
+        files.append(figure_files._file_for(title))
+    assert [file.parent for file in files] == [tmp_path] * len(files)
+    assert [file.stem for file in files] == [
+        "größe", "大きさ", "left_eye", "left_eye_2", "figure", "figure_2", "x" * 60
+    ]  # fmt: skip
+
+
+def test_a_line_that_was_not_added_is_said_whatever_it_is_fed_with() -> None:
+    figure = VisualiseRotations("angles")
+    figure.add_quaternion("truth")
+    with pytest.raises(ValueError, match="'turth' was not added to the figure; there are truth"):
+        figure.plot("turth", SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), 0.0)
+    figure.close()
 
 
 def test_a_hook_never_waits_and_what_is_left_out_is_counted(capfd: Any) -> None:
