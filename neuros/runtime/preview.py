@@ -84,7 +84,7 @@ def preview(packet: Any) -> Preview:
         raise ValueError(f"images with encoding '{packet.encoding}' are not shown")
     width, height, step = packet.width, packet.height, packet.step or packet.width * size
     pixels = memoryview(packet.data).cast("B")
-    if not width or step < width * size or len(pixels) < step * height:
+    if not (width and height) or step < width * size or len(pixels) < step * height:
         raise ValueError(f"{len(pixels)} bytes are no image of {width} x {height}, {step} per row")
     stride = max(1, -(-width // WIDTH), -(-height // HEIGHT))
     rows = tuple(

@@ -40,6 +40,7 @@ _NUMBERS: dict[str, list[str]] = {
     ],
 }
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_NOT_FINITE = ("nan", "inf", "-inf")  # as a sample tells them; the next may be a number
 _SCAN = "sensor_msgs/msg/LaserScan"
 
 
@@ -148,7 +149,7 @@ def _vector(
 def _numbers_of(fields: Mapping[str, Any]) -> Iterator[str]:
     count = 0
     for path, value in fields.items():
-        is_number = isinstance(value, int | float)
+        is_number = isinstance(value, int | float) or value in _NOT_FINITE
         is_about_it = path.startswith("header.") or path.endswith(".length") or "covariance" in path
         if is_number and not is_about_it:
             yield path

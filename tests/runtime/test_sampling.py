@@ -91,6 +91,14 @@ def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:
     assert "encoding 'yuv422' are not shown" in sampler.ask({})["camera"]["fault"]
 
 
+@pytest.mark.parametrize(("width", "height"), [(0, 0), (4, 0), (0, 4)])
+def test_an_image_without_pixels_is_told(width: int, height: int) -> None:
+    sampler = Sampler()
+    sampler.ask({"camera": {"image": True}})
+    sampler.note("camera", Image(width=width, height=height, step=4 * width, encoding="rgba8"))
+    assert f"are no image of {width} x {height}" in sampler.ask({})["camera"]["fault"]
+
+
 @pytest.mark.parametrize(
     ("path", "number"),
     [

@@ -84,6 +84,14 @@ def test_of_an_unknown_type_numbers_are_found_and_then_shown() -> None:
     assert numbers.values == {"data": 2.0}
 
 
+def test_what_is_not_measured_in_the_first_packet_is_shown_once_it_is() -> None:
+    source = Source("std_msgs/msg/Float64")
+    assert seen(source, Float64(data=math.nan)) == []
+    (numbers,) = seen(source, Float64(data=2.0))
+    assert isinstance(numbers, Numbers)
+    assert numbers.values == {"data": 2.0}
+
+
 def test_of_what_has_no_numbers_nothing_is_asked_twice() -> None:
     source = Source("std_msgs/msg/String")
     assert seen(source, String(data="words")) == []
