@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,8 +26,8 @@ class LoadTable:
         self._groups = tuple(groups)
         self._cores = cores
         self._last: tuple[float, MachineLoad, Mapping[str, GroupLoad]] | None = None
-        self._figures: dict[str, list[tuple[float, int, int]]] = {name: [] for name in groups}
-        self._machine: list[tuple[float, int]] = []
+        self._figures = {name: _Extremes() for name in groups}
+        self._machine = _Extremes()
 
     @property
     def header(self) -> list[str]:
@@ -53,7 +54,7 @@ class LoadTable:
         assert self._last is not None
         last_s, before, groups_before = self._last
         self._last = (time_s, machine, groups)
-        self._machine.append((sum(machine.core_percent), machine.memory_used_bytes))
+        self._machine.note(sum(machine.core_percent), machine.memory_used_bytes)
         cells = [f"{percent:.1f}" for percent in machine.core_percent[: self._cores]]
         cells += [""] * (self._cores - len(cells))  # a core that has been taken offline
         cells += [
@@ -69,38 +70,55 @@ class LoadTable:
                 continue
             spent_s = load.cpu_s - (groups_before[name].cpu_s if name in groups_before else 0.0)
             percent = max(0.0, 100 * spent_s / max(time_s - last_s, 1e-9))
-            self._figures[name].append((percent, load.memory_bytes, load.threads))
+            self._figures[name].note(percent, load.memory_bytes, load.threads)
             cells += [f"{percent:.1f}", str(load.memory_bytes), str(load.threads)]
         return cells
 
     def summary(self) -> dict[str, Any]:
         """Means and maxima, ready for JSON; a group that was never seen has ``None``."""
         machine = None
-        if self._machine:
-            percents, used = zip(*self._machine, strict=True)
+        if self._machine.count:
             machine = {
                 "cores": self._cores,
-                "cpu_percent_mean": sum(percents) / len(percents),
-                "cpu_percent_max": max(percents),
-                "memory_used_bytes_max": max(used),
+                **self._machine.cpu(),
+                "memory_used_bytes_max": self._machine.memory_bytes,
             }
         return {
             "file": FILE_NAME,
-            "samples": len(self._machine),
+            "samples": self._machine.count,
             "machine": machine,
-            "processes": {name: _summary(rows) for name, rows in self._figures.items()},
+            "processes": {name: _summary(found) for name, found in self._figures.items()},
         }
 
 
-def _summary(rows: Sequence[tuple[float, int, int]]) -> dict[str, float] | None:
-    if not rows:
+@dataclass
+class _Extremes:
+    """What a summary needs of any number of readings."""
+
+    count: int = 0
+    percent_sum: float = 0.0
+    percent: float = 0.0
+    memory_bytes: int = 0
+    threads: int = 0
+
+    def note(self, percent: float, memory_bytes: int, threads: int = 0) -> None:
+        self.count += 1
+        self.percent_sum += percent
+        self.percent = max(self.percent, percent)
+        self.memory_bytes = max(self.memory_bytes, memory_bytes)
+        self.threads = max(self.threads, threads)
+
+    def cpu(self) -> dict[str, float]:
+        return {"cpu_percent_mean": self.percent_sum / self.count, "cpu_percent_max": self.percent}
+
+
+def _summary(found: _Extremes) -> dict[str, float] | None:
+    if not found.count:
         return None
-    percents, memories, threads = zip(*rows, strict=True)
     return {
-        "cpu_percent_mean": sum(percents) / len(percents),
-        "cpu_percent_max": max(percents),
-        "memory_bytes_max": max(memories),
-        "threads_max": max(threads),
+        **found.cpu(),
+        "memory_bytes_max": found.memory_bytes,
+        "threads_max": found.threads,
     }
 
 

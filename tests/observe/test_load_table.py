@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 from neuros.observe.load import GroupLoad, MachineLoad
 from neuros.observe.load_table import LoadTable, load_table
 
@@ -69,6 +71,19 @@ def test_the_summary_has_means_and_maxima() -> None:
     assert summary["processes"]["snn"]["memory_bytes_max"] == 3_000_000
     assert summary["processes"]["snn"]["threads_max"] == 5
     assert summary["processes"]["robot"] is None
+
+
+def test_a_long_run_takes_no_more_memory_than_a_short_one() -> None:
+    load = table("snn")
+    tracemalloc.start()
+    try:
+        for second in range(2000):
+            load.row(6.0 + second, machine(), {"snn": GroupLoad(1.1 + second, 10**6 + second, 3)})
+        grown_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert load.summary()["samples"] == 2000
+    assert grown_bytes < 20_000
 
 
 def test_the_text_shows_the_summary_and_where_the_rest_is() -> None:
