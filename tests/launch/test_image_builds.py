@@ -186,6 +186,16 @@ def test_the_context_holds_the_folder_and_the_dockerfile_that_is_meant(tmp_path:
     assert (entries["data/x"].mode, entries["data/x"].uid) == (0o644, 0)
 
 
+def test_a_link_in_a_folder_is_sent_as_the_file_that_it_leads_to(tmp_path: Path) -> None:
+    (tmp_path / "requirements.txt").write_text("numpy")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "requirements.txt").symlink_to("../requirements.txt")
+    with tarfile.open(fileobj=context_of(tmp_path / "mine", "FROM b")) as archive:
+        sent = archive.extractfile("requirements.txt")
+        assert sent is not None
+        assert sent.read() == b"numpy"
+
+
 class TestWheelhouse:
     def test_wheels_can_be_had_while_it_is_served(self, tmp_path: Path) -> None:
         (tmp_path / "x-1-py3-none-any.whl").write_bytes(b"wheel")

@@ -82,9 +82,12 @@ def surroundings(
 def context_of(
     folder: Path | None, dockerfile: str, further: Mapping[str, bytes] = _NO_FILES
 ) -> io.BytesIO:
-    """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files."""
+    """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files.
+
+    A link becomes the file that it leads to, which may be outside.
+    """
     archive = io.BytesIO()
-    with tarfile.open(fileobj=archive, mode="w") as tar:
+    with tarfile.open(fileobj=archive, mode="w", dereference=True) as tar:
         for file in files_of(folder) if folder else ():
             if file.name != "Dockerfile" or file.parent != folder:
                 tar.add(file, str(file.relative_to(folder or file)), filter=_anonymous)
