@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import shlex
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape
@@ -164,7 +165,7 @@ def _provenance(run: Run) -> str:
             for node, found in (record.get("seeds") or {}).items()
             for name, value in found.items()
         ),
-        "command": " ".join(record.get("command", ())),
+        "command": shlex.join(record.get("command", ())),
     }
     rows = [[key, str(value)] for key, value in cells.items() if value]
     return table_part("Where it comes from", ["", ""], rows, "words")

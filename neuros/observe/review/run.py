@@ -85,8 +85,8 @@ def open_for_review(folder: Path) -> Run:
     Raises:
         UsageError: if no run has left it behind, the run goes on, or a newer version wrote it.
     """
-    record, missing = _read_record(folder)
     try:
+        record, missing = _read_record(folder)
         connections = {each["connection"]: each for each in record.get("connections", ())}
         nodes = {name: dict(node) for name, node in record.get("nodes", {}).items()}
         run = Run(folder, record, connections, nodes, ())

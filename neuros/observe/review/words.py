@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -60,6 +61,8 @@ def _headline(found: Bottleneck, spending: Mapping[str, Spending], running_s: fl
     last = found.steps[-1]
     if found.root is not None and not (last.state == "idle" and not found.loop):
         hook, busy_s = spending[found.root].busiest_hook
+        if not hook:
+            return "Nothing limits the speed: no hook has executed."
         text = f"{found.root}.{hook} limits the speed: it executes {busy_s / running_s:.0%} of the"
         text += " time"
         if found.root != found.pacing:
@@ -74,7 +77,10 @@ def _headline(found: Bottleneck, spending: Mapping[str, Spending], running_s: fl
     if found.loop:
         shares = ", ".join(f"{n} {spending[n].own_s / running_s:.0%}" for n in found.loop)
         rest = 1 - sum(spending[n].own_s for n in found.loop) / running_s
-        text = f"No single hook limits the speed: {' and '.join(found.loop)} wait for each other"
+        waits = f"{' and '.join(found.loop)} wait for each other"
+        if len(found.loop) == 1:
+            waits = f"{found.loop[0]} waits for its own packets"
+        text = f"No single hook limits the speed: {waits}"
         text += f" (their hooks execute {shares} of the time)."
         if rest > 0:
             text += (
@@ -145,8 +151,8 @@ def _trial(gain: Gain, run: Run) -> str:
     for name in gain.connections:
         c = run.ends[name]
         ends = f"{c.source_node}.{c.source_output}.{c.destination_node}.{c.destination_input}"
-        settings.append(f"--set connections.{ends}.discard_limit=")
-    return " ".join(["neuros launch", str(run.record.get("file", "PROJECT")), *settings])
+        settings += ["--set", f"connections.{ends}.discard_limit="]
+    return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
 
 
 def _in_process(run: Run, spending: Mapping[str, Spending], running_s: float) -> Findings:

@@ -40,6 +40,25 @@ def test_the_prediction_can_be_tested_by_a_command(tmp_path: Path) -> None:
     )
 
 
+def test_the_command_can_be_pasted_wherever_the_project_is(tmp_path: Path) -> None:
+    trial = findings(tmp_path, file="/my lab/project.json").trial
+    assert trial is not None
+    assert trial.startswith("neuros launch '/my lab/project.json' --set connections.fast.")
+
+
+def test_where_no_hook_has_executed_none_is_named(tmp_path: Path) -> None:
+    run = open_for_review(run_folder(tmp_path, {}, {"a": accounting()}))
+    assert findings_of(run).headline == "Nothing limits the speed: no hook has executed."
+
+
+def test_a_node_that_waits_for_itself_is_told_as_such(tmp_path: Path) -> None:
+    nodes = {"a": accounting(waiting={"in": 9.0})}
+    run = open_for_review(run_folder(tmp_path, {"a.out -> a.in": 0}, nodes))
+    assert (
+        "No single hook limits the speed: a waits for its own packets" in findings_of(run).headline
+    )
+
+
 def test_a_busy_machine_is_mentioned(tmp_path: Path) -> None:
     reasons = findings(tmp_path, machine={"cores": 1}).reasons
     assert reasons[-1].startswith("The processor was 100% busy")

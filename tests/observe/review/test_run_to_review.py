@@ -60,6 +60,7 @@ def test_an_older_run_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
         ('{"format": 2, "connections": 7}', "is broken"),
         ('{"format": 2, "connections": [{"connection": "a"}]}', "is broken"),
         ('{"format": 2, "nodes": {"a": 1}}', "is broken"),
+        ('{"format": 1, "connections": [7]}', "is broken"),
     ],
 )
 def test_what_is_no_run_is_refused(tmp_path: Path, content: str | None, reason: str) -> None:
