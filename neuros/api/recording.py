@@ -134,7 +134,8 @@ def summary(report: Mapping[str, Any]) -> str:
     topics = report["topics"].values()
     count = sum(topic["recorded"] for topic in topics)
     noun = "topic" if len(topics) == 1 else "topics"
-    lines = [f"recorded {count} packets on {len(topics)} {noun}: {report['bag']}"]
+    packets = "packet" if count == 1 else "packets"
+    lines = [f"recorded {count} {packets} on {len(topics)} {noun}: {report['bag']}"]
     lossy = [topic for topic in topics if topic["is_lossy"]]
     if lossy:
         seen = sum(topic["recorded"] for topic in lossy)

@@ -62,7 +62,7 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
         missing = [
             run.folder
             for run, packets in zip((a, b), (in_a, in_b), strict=True)
-            if run.connections[name]["sent"] and not len(packets.sent)
+            if _lacks_digests(run.connections[name]["sent"], packets)
         ]
         if missing:
             where = " and ".join(dict.fromkeys(map(str, missing)))
@@ -91,6 +91,13 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
     return Verdict(text, tuple(remarks), compared)
 
 
+def _lacks_digests(sent: int | None, packets: Packets) -> bool:
+    """Whether packets have passed, or may have, of which nothing is known here."""
+    if sent is None:  # by a node of another launcher, or one that never reported
+        return not len(packets.sent) and not len(packets.received)
+    return sent > 0 and not len(packets.sent)
+
+
 def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     place = _first_difference(in_a.sent, in_b.sent)
     if place == len(in_a.sent) == len(in_b.sent):
@@ -117,7 +124,7 @@ def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     place = _first_difference(a, b)
     if place == len(a) == len(b):
         return None
-    at_ns = float(in_a.taken_ns[place]) if place < len(in_a.taken_ns) else np.inf
+    at_ns = float(in_a.consumed_ns[place]) if place < len(a) else np.inf
     if place in (len(a), len(b)):
         what = f"hooks took {len(a)} packets in run A, and {len(b)} in run B"
     else:

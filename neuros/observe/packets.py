@@ -48,6 +48,13 @@ class Packets:
         found: Numbers = self.received[places[places <= len(self.received)] - 1]
         return found
 
+    @property
+    def consumed_ns(self) -> Numbers:
+        """When the first hook has started on each packet of :attr:`consumed`."""
+        places, firsts = np.unique(self.taken, return_index=True)
+        found: Numbers = self.taken_ns[firsts[places <= len(self.received)]]
+        return found
+
     def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
         """Nanoseconds from when a packet was sent to each start of a hook on it.
 

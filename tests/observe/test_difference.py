@@ -37,7 +37,7 @@ def run(
         lists: list[tuple[str, str, Any]] = [
             (source, "sent_ns", times),
             (destination, "taken", np.array(places, np.int64)),
-            (destination, "taken_ns", times[: len(places)] + 5),
+            (destination, "taken_ns", np.array([times[place - 1] + 5 for place in places])),
         ]
         if has_digests:
             lists += [(end, "digests", np.array(digests, "u8")) for end in (source, destination)]
@@ -108,6 +108,28 @@ def test_a_lossless_connection_must_have_been_read_alike(folders: tuple[Path, Pa
     b = run(folders[1], {FIRST: [1, 2]}, taken={FIRST: [1]})
     difference = verdict(a, b).difference
     assert difference == f"{FIRST}: hooks took 2 packets in run A, and 1 in run B"
+
+
+def test_hooks_that_share_an_input_do_not_make_its_packets_early(
+    folders: tuple[Path, Path],
+) -> None:
+    sent = {FIRST: [1, 2, 3, 4, 5, 6], SECOND: [7, 8, 9, 10, 11, 12]}
+    twice = [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]  # two hooks on each
+    a = run(folders[0], sent, taken={FIRST: [*twice, 6, 6], SECOND: [1, 2, 3, 4, 5, 6]})
+    b = run(folders[1], sent, taken={FIRST: twice, SECOND: [1, 2, 3, 5, 6]})
+    found = verdict(a, b).difference
+    assert found == f"{SECOND}: the packet that hooks took as number 4 is another one"
+
+
+def test_what_a_node_that_never_reported_has_sent_is_not_said_to_be_identical(
+    folders: tuple[Path, Path],
+) -> None:
+    runs = [run(folder, {FIRST: [1, 2]}, has_digests=False) for folder in folders]
+    for each in runs:
+        each.connections[FIRST]["sent"] = None  # type: ignore[index]
+    found = verdict(*runs)
+    assert found.compared == 0
+    assert "not compared" in found.remarks[0]
 
 
 def test_one_that_may_lose_packets_may_have_lost_others(folders: tuple[Path, Path]) -> None:
