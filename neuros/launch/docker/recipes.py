@@ -56,11 +56,6 @@ class Recipe:
         """Whether it is one of NeuROS's."""
         return self.folder.parent == OWN_FOLDER
 
-    @property
-    def has_dockerfile(self) -> bool:
-        """Whether its author wrote the Dockerfile."""
-        return (self.folder / "Dockerfile").is_file()
-
     def parents_on(self, base: str | None) -> list[Recipe]:
         """The parents that are left where ``base`` replaces the default of ``BASE_IMAGE``."""
         if base is None:
