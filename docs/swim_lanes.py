@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Makes the swim lanes of the orchestration guide: WhiskEye in four orchestrations, as it ran.
+
+::
+
+    .venv/bin/python docs/swim_lanes.py [NAME ...]
+
+It needs what WhiskEye needs. Run it where nothing else runs, and look at what it has made.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import neuros
+from neuros.observe.review.lanes import lanes_figure
+from neuros.observe.review.page import png
+from neuros.observe.review.run import open_for_review
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures"
+WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye"
+# By project file: how long the physics goes on, in simulated seconds, and what else is set. Strict
+# as it is lets 50 packets wait for the figure; with room for one, the first second shows who waits
+# for whom. Without limits the physics would be over before the network has started.
+RUNS: dict[str, tuple[int, dict[str, int]]] = {
+    "strict": (
+        6,
+        {
+            "connections.robot.pose.visualiser.truth.queue_size": 1,
+            "connections.snn.estimate.visualiser.estimate.queue_size": 1,
+        },
+    ),
+    "project": (6, {}),
+    "no_discard_limit": (90, {}),
+    "asynchronous": (6, {}),
+}
+
+
+def draw(name: str, folder: Path) -> None:
+    """Run one of them, and write its figure."""
+    simulated_s, settings = RUNS[name]
+    neuros.Project.from_file(WHISKEYE / f"{name}.json").run(
+        set={"nodes.robot.environment.DURATION": simulated_s, **settings},
+        backend="process",
+        output=folder,
+        check=True,
+    )
+    figure = lanes_figure(open_for_review(folder))
+    assert figure is not None
+    (FIGURES / f"swim_lanes_{name}.png").write_bytes(png(figure))
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as folder:
+        for name in sys.argv[1:] or RUNS:
+            draw(name, Path(folder) / name)
