@@ -45,6 +45,7 @@ suppress_warnings = ["ref.python"]
 autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+autodoc_preserve_defaults = True  # else the paths of this machine are shown
 autodoc_typehints_format = "short"
 napoleon_use_ivar = True
 # The theme makes the whole navigation anew for each of 400 pages; with every function in it, that

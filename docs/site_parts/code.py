@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
 
 from site_parts import uml
+from site_parts.words import as_text, cell
+
+_ROLE = re.compile(r":\w+:`~?")
 
 
 def packages(root: Path) -> dict[str, list[str]]:
@@ -24,16 +32,35 @@ def pages(root: Path) -> Iterator[tuple[str, str]]:
     """``(name, Markdown)`` of all pages."""
     found = packages(root)
     listed = "\n".join(f"code/{package}" for package in found)
+    rows = "\n".join(
+        f"| [{package}](code/{package}.md) | {_first_line(root, package)} |" for package in found
+    )
     yield (
         "code",
         "# Modules, classes and functions\n\n"
         "Made from the docstrings. Plugins need `neuros.hooks` and, for their tests, "
         "`neuros.testing`; [Architecture](../architecture.md) says what the rest is for.\n\n"
-        f"```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
+        f"| package | what it is |\n| --- | --- |\n{rows}\n\n"
+        f"```{{toctree}}\n:hidden:\n\n{listed}\n```\n",
     )
     for package, modules in found.items():
         yield f"code/{package}", _page(root, package, modules)
     yield "diagrams", _diagrams(root)
+
+
+def leave_out_aliases(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
+) -> None:
+    """Fields of named tuples have a docstring by themselves, which says nothing."""
+    if lines and lines[0].startswith("Alias for field number"):
+        lines.clear()
+
+
+def _first_line(root: Path, package: str) -> str:
+    file = root / package.replace(".", "/") / "__init__.py"
+    text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
+    plain = _ROLE.sub("`", text.partition("\n")[0])
+    return cell(as_text(plain).removesuffix("."))
 
 
 def _page(root: Path, package: str, modules: list[str]) -> str:

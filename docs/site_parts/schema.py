@@ -20,7 +20,7 @@ def page(root: Path, name: str) -> str:
     )
     for title, part in _objects(schema):
         parts.append(f"\n## {title}\n\n{as_text(part.get('description', ''))}\n\n")
-        parts.append(_table(part))
+        parts.append(_table(part, schema.get("$defs", {})))
         for example in part.get("examples", []):
             parts.append(f"\n```json\n{json.dumps(example, indent=2)}\n```\n")
     return "".join(parts)
@@ -34,15 +34,24 @@ def _objects(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             yield f"{part.get('title', name)} (`{name}`)", part
 
 
-def _table(part: dict[str, Any]) -> str:
-    rows = ["| key | type | needed | meaning | example |", "| --- | --- | --- | --- | --- |"]
-    for key, value in part["properties"].items():
+def _table(part: dict[str, Any], definitions: dict[str, Any]) -> str:
+    rows = ["| key | type | needed | meaning |", "| --- | --- | --- | --- |"]
+    for key, entry in part["properties"].items():
+        value = _defined(entry, definitions)
         needed = "yes" if key in part.get("required", []) else ""
         example = value["examples"][0] if value.get("examples") else None
-        shown = f"`{cell(json.dumps(example))}`" if example is not None else ""
+        shown = f" Example: `{cell(json.dumps(example))}`" if example is not None else ""
         meaning = cell(as_text(value.get("description", "")))
-        rows.append(f"| `{key}` | {cell(_type(value))} | {needed} | {meaning} | {shown} |")
+        rows.append(f"| `{key}` | {cell(_type(value))} | {needed} | {meaning}{shown} |")
     return "\n".join(rows) + "\n"
+
+
+def _defined(value: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """A key with what its definition says; one that has a table of its own is named as the type."""
+    found = definitions.get(value.get("$ref", "").removeprefix("#/$defs/"), {})
+    if "properties" in found:
+        return {"description": found["description"], **value}
+    return {**found, **{key: each for key, each in value.items() if key != "$ref" or not found}}
 
 
 def _type(value: dict[str, Any]) -> str:

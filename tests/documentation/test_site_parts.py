@@ -85,6 +85,16 @@ class TestReference:
         assert "\n| `discard_limit` | integer (≥ 0) |  |" in schema.page(ROOT, "node")
         assert "\n| `nodes` | array" in schema.page(ROOT, "project")
 
+    def test_a_key_that_is_defined_elsewhere_has_its_type_and_meaning(self) -> None:
+        page = schema.page(ROOT, "node")
+        assert "\n| `environment` | object |  | Environment variables of the node." in page
+        assert "\n| `qos` | qos |  | Quality of service" in page
+
+    def test_every_package_says_in_the_list_what_it_is(self) -> None:
+        listed = dict(code.pages(ROOT))["code"]
+        assert "| [neuros.core](code/neuros.core.md) | The engine of a node" in listed
+        assert ") |  |" not in listed
+
     def test_the_navigation_has_the_pages_of_each_table_of_the_index(self) -> None:
         source = [(DOCS / "index.md").read_text("utf-8")]
         contents.add_toctrees(None, "docs/index", source)
