@@ -264,7 +264,7 @@ class Engine:
             return Rest(State.EXECUTING, executing.name)
         if not self._life.has_begun:
             return REGISTERING
-        if self._gate.is_closed and not self.is_stopped:
+        if self._gate.is_closed:
             return PAUSED
         cause = cause_of_rest(self._schedule.order)
         return IDLE if self.is_stopped and cause is SCHEDULING else cause

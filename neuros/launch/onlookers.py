@@ -34,6 +34,11 @@ class Pause:
         return self._since_s is not None
 
     @property
+    def since_s(self) -> float | None:
+        """Since when it stands still, on the clock."""
+        return self._since_s
+
+    @property
     def total_s(self) -> float:
         """How long it has stood still so far."""
         since_s = self._since_s

@@ -48,7 +48,10 @@ class Outcome:
         timelines: by node, points of simulated against wall time; each report brings further ones.
         elsewhere: what nodes that other launchers started counted on connections to here.
         started_s: when the first hook started, ``None`` if none did.
-        ending_s: when the end was asked for first: what comes after is draining and finalising.
+        ending_s: when the end was asked for first: what comes after is draining and finalising. A
+            run that is stopped while it stands still has ended when that pause began.
+        paused_s: how long it has stood still since the first hook.
+        is_paused: whether it stands still now.
         ended_s: when all processes had ended.
         is_signalled: whether the user has asked for the end by a signal, be it after another cause.
         faults: what could not be recorded, though the run went on.
@@ -67,6 +70,8 @@ class Outcome:
     failures: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     is_signalled: bool = False
+    paused_s: float = 0.0
+    is_paused: bool = False
 
     def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""

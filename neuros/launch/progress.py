@@ -24,9 +24,15 @@ class Reported(Protocol):
     def reports(self) -> Mapping[str, Mapping[str, Any]]: ...
     @property
     def started_s(self) -> float | None: ...
+    @property
+    def paused_s(self) -> float: ...
+    @property
+    def is_paused(self) -> bool: ...
 
 
 class _Reading(NamedTuple):
+    """``wall_s`` is without pauses."""
+
     wall_s: float
     sim_s: float | None
     sent: int
@@ -102,7 +108,7 @@ class Progress:
         times = [r["sim_time"] for r in reports if r["sim_time"] is not None]
         ledgers = [r["ledger"] for r in reports if r["ledger"] is not None]
         reading = _Reading(
-            self._clock(),
+            self._clock() - self._outcome.paused_s,
             max(times, default=None),
             sum(c["sent"] for ledger in ledgers for c in ledger["outgoing"].values()),
             sum(c["discarded"] for ledger in ledgers for c in ledger["incoming"].values()),
@@ -131,6 +137,8 @@ class Progress:
                 factor = (now.sim_s - first.sim_s) / passed_s
                 figures.append(f"{factor:.2f} x real time")
             figures.append(f"{(now.sent - first.sent) / passed_s:.0f} packets/s")
+        if self._outcome.is_paused:
+            figures = ["paused"]
         figures.append(f"{now.discarded} discarded")
         left_s = self._left_s(now, factor)
         return figures if left_s is None else [*figures, f"{_duration(left_s)} left"]

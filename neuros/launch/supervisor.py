@@ -229,9 +229,19 @@ class Supervisor:
         now_s = time.monotonic()
         self._ending.heed_sides()
         self._ending.look(now_s)
+        self._keep_pause()
         self.onlookers.look_at(self._ending.phase)
         if self._ending.phase is Phase.RUNNING:
             self._look_at_run(now_s)
+
+    def _keep_pause(self) -> None:
+        """Note how long the run has stood still; nodes that are stopped meanwhile do not go on."""
+        outcome = self.outcome
+        outcome.is_paused = self.pause.is_on
+        if outcome.started_s is not None:
+            outcome.paused_s = self.pause.total_s - self._paused_before_s
+        if self._ending.phase is Phase.STOPPING and outcome.is_paused:
+            outcome.ending_s = self.pause.since_s
 
     def _look_at_run(self, now_s: float) -> None:
         if self._wishes:

@@ -29,6 +29,7 @@ class Ended(Protocol):
     elsewhere: Mapping[str, Mapping[str, Any]]
     ending_s: float | None
     ended_s: float
+    paused_s: float
 
 
 def run_record(
@@ -52,6 +53,7 @@ def run_record(
         "wall_s": wall_s,
         "sim_s": sim_s,
         "running_s": running_s,
+        "paused_s": ended.paused_s,
         "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
@@ -92,7 +94,7 @@ def run_table(record: Mapping[str, Any]) -> str:
 
 
 def _running_s(ended: Ended) -> float | None:
-    """Wall time in which simulated time went on: without initialisation, draining and the end.
+    """Wall time in which simulated time went on: not initialisation, pauses, draining and the end.
 
     It counts from when every node had initialised, or, if that was not before the end, from when
     the node that owns simulated time had.
@@ -206,6 +208,8 @@ def _shares(node: Mapping[str, Any]) -> list[str]:
 
 def _times(record: Mapping[str, Any]) -> str:
     wall = f"wall time {record['wall_s']:.2f} s"
+    if record.get("paused_s"):  # records of earlier versions do not say
+        wall += f" ({record['paused_s']:.2f} s of it paused)"
     if record["sim_s"] is None:
         return wall
     return (

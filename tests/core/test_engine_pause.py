@@ -153,6 +153,15 @@ def test_paused_time_has_an_account_of_its_own():
     assert (spent["waiting"], spent["paused"]) == ({"x": 3.0}, 5.0)
 
 
+def test_a_node_that_is_stopped_while_paused_was_paused_until_then():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.clock.advance(5.0)
+    bench.engine.stop_hooks()
+    spent = snapshot(bench.engine, bench.clock.now_ns)["accounting"]
+    assert (spent["idle"], spent["paused"]) == (0.0, 5.0)
+
+
 def test_draining_ends_a_pause():
     bench = Bench(function("f", "x"), tick("t", 1.0), connections=[wire(IN, 0)])
     bench.engine.pause()

@@ -51,6 +51,34 @@ def test_simulated_time_has_its_speed_and_the_time_that_is_left() -> None:
     )
 
 
+def paused_run(clock: Clock, **end: float) -> tuple[Outcome, Progress]:
+    """Four simulated seconds in one of wall time, and then a pause of a minute."""
+    outcome = Outcome(started_s=clock())
+    progress = Progress(outcome, **end, clock=clock)
+    for sim_s in (0.0, 4.0):
+        outcome.reports["a"] = report(sim_s, 0)
+        progress.text()
+        clock.now_s += sim_s / 4
+    clock.now_s += 60.0
+    outcome.paused_s, outcome.is_paused = 60.0, True
+    return outcome, progress
+
+
+def test_a_pause_is_said_and_takes_nothing_from_the_time_that_is_left() -> None:
+    _, progress = paused_run(Clock(), wall_s=10.0)
+    assert progress.text() == "4.0 s simulated, paused, 0 discarded, 0:09 left"
+
+
+def test_after_a_pause_the_speed_is_that_of_the_time_it_has_run() -> None:
+    clock = Clock()
+    outcome, progress = paused_run(clock, sim_s=20.0)
+    outcome.is_paused = False
+    clock.now_s += 1.0
+    outcome.reports["a"] = report(12.0, 0)
+    text = "12.0 of 20 s simulated, 6.00 x real time, 0 packets/s, 0 discarded, 0:01 left"
+    assert progress.text() == text
+
+
 def test_an_experiment_that_knows_its_end_tells_it() -> None:
     progress = run(Clock(), [report(0.0, 0, expected=40.0), report(10.0, 100, expected=40.0)])
     assert progress.has_end

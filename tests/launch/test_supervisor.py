@@ -190,6 +190,15 @@ def test_a_pause_is_no_part_of_the_duration(run: Run) -> None:
     outcome = run(a=f"{pauses} host.serve()", duration_s=0.3)
     assert outcome.reason == "0.3 s are over"
     assert outcome.ending_s - outcome.started_s >= 0.85
+    assert 0.55 <= outcome.paused_s <= outcome.ending_s - outcome.started_s - 0.3
+
+
+def test_a_run_that_is_stopped_while_paused_ended_when_the_pause_began(run: Run) -> None:
+    pauses = "host.up(); import time; host.tell('pause'); time.sleep(0.6); host.tell('signal')"
+    outcome = run(a=f"{pauses}; host.serve()")
+    assert outcome.exit_code == 130
+    assert outcome.paused_s >= 0.55
+    assert outcome.ending_s + 0.55 <= outcome.ended_s
 
 
 DRAINED_AFTER_A_LONG_HOOK = """
