@@ -7,6 +7,7 @@ from typing import Any
 
 from neuros.project.graph import guarantee
 from neuros.project.model import Connection, Node, Port, Project
+from neuros.project.names import Names
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
@@ -21,9 +22,12 @@ def plan(project: Project, names: Sequence[str]) -> dict[str, Any]:
         "project": project.name,
         "nodes": [_node(node, is_here=node.name in names) for node in project.nodes],
         "connections": [_connection(c) for c in project.connections],
-        "topics": list(_topics(project.nodes)),
+        "topics": list(_topics(project)),
         "sources": [
-            source for node in project.nodes if node.name in names for source in _sources(node)
+            source
+            for node in project.nodes
+            if node.name in names
+            for source in _sources(node, project.names)
         ],
     }
 
@@ -52,33 +56,44 @@ def _connection(connection: Connection) -> dict[str, Any]:
     }
 
 
-def _topics(nodes: Iterable[Node]) -> Iterable[dict[str, Any]]:
-    for node in nodes:
-        for port in node.inputs:
+def _topics(project: Project) -> Iterable[dict[str, Any]]:
+    """External topics: ``name`` is as in the project file, ``title`` as on the ROS graph."""
+    for node in project.nodes:
+        for port in (*node.inputs, *node.outputs):
             if port.external_topic is not None:
-                name = f"{port.external_topic} -> {node.name}.{port.name}"
-                yield {"name": name, "topic": port.external_topic, "node": node.name, "is_in": True}
-        for port in node.outputs:
-            if port.external_topic is not None:
-                name = f"{node.name}.{port.name} -> {port.external_topic}"
-                topic = port.external_topic
-                yield {"name": name, "topic": topic, "node": node.name, "is_in": False}
+                is_in = port in node.inputs
+                end = f"{node.name}.{port.name}"
+                full = project.names.resolve(port.external_topic, node.name)
+                name, title = (
+                    f"{topic} -> {end}" if is_in else f"{end} -> {topic}"
+                    for topic in (port.external_topic, full)
+                )
+                yield {
+                    "name": name,
+                    "title": title,
+                    "topic": port.external_topic,
+                    "full": full,
+                    "node": node.name,
+                    "is_in": is_in,
+                }
 
 
-def _sources(node: Node) -> Iterable[dict[str, Any]]:
+def _sources(node: Node, names: Names) -> Iterable[dict[str, Any]]:
     """What packets of this node can be sampled: those of its outputs and external inputs."""
     for port in node.outputs:
-        yield _source(node, port, port.name)
+        yield _source(node, port, port.name, port.name)
     for port in node.inputs:
         if port.external_topic is not None:
-            yield _source(node, port, port.external_topic)
+            full = names.resolve(port.external_topic, node.name)
+            yield _source(node, port, port.external_topic, full)
 
 
-def _source(node: Node, port: Port, key: str) -> dict[str, Any]:
+def _source(node: Node, port: Port, key: str, title: str) -> dict[str, Any]:
     return {
         "node": node.name,
         "port": key,
         "name": f"{node.name}.{key}",
+        "title": f"{node.name}.{title}",
         "type": port.type,
         "is_image": port.type in IMAGES,
     }

@@ -18,7 +18,7 @@ export class Details {
     this.source = kind === "node" ? null : this.sourceOf(kind, name);
     this.rows = new Map();
     this.body = element("tbody");
-    this.title.textContent = name;
+    this.title.textContent = this.plan.topics.find((each) => each.name === name)?.title ?? name;
     const type = this.source ? this.source.type : "";
     this.box.replaceChildren(element("p", {}, type), element("table", {}, this.body));
     wantAllOf(this.source ? this.source.name : null);

@@ -95,11 +95,11 @@ function elementsOf(plan) {
       classes: c.discard_limit === 0 ? "lossless" : c.discard_limit === null ? "best-effort" : "",
     });
   }
-  for (const topic of new Set(plan.topics.map((each) => each.topic))) {
+  for (const topic of new Set(plan.topics.map((each) => each.full))) {
     elements.push({data: {id: `topic ${topic}`, label: topic}, classes: "topic"});
   }
   for (const each of plan.topics) {
-    const ends = [`topic ${each.topic}`, `node ${each.node}`];
+    const ends = [`topic ${each.full}`, `node ${each.node}`];
     if (!each.is_in) ends.reverse();
     elements.push({
       data: {id: `connection ${each.name}`, kind: "topic", name: each.name, title: "", label: "",

@@ -16,9 +16,9 @@ export class Images {
       switched.checked = place < SHOWN_AT_FIRST;
       switched.addEventListener("change", () => this.switch(source.name, switched.checked));
       const size = element("span");
-      const image = element("img", {alt: source.name});
+      const image = element("img", {alt: source.title});
       box.append(element("div", {class: "picture", "data-source": source.name},
-        element("h3", {}, element("label", {}, switched, ` ${source.name}`), size), image));
+        element("h3", {}, element("label", {}, switched, ` ${source.title}`), size), image));
       this.pictures.set(source.name, {image, size});
       this.switch(source.name, switched.checked);
     });

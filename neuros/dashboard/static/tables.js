@@ -16,7 +16,7 @@ export class Tables {
     this.nodes = new Map(plan.nodes.filter((node) => node.is_here).map((node) => [node.name,
       selectable(new Row(nodes, node.name, ["", "", "number", "number", "number"]),
         () => onSelect("node", node.name))]));
-    for (const [name, {plan: c, row}] of this.connections) row.show(name, c.guarantee);
+    for (const [name, {plan: c, row}] of this.connections) row.show(c.title ?? name, c.guarantee);
     for (const [name, row] of this.nodes) row.show(name, "loading");
   }
 
@@ -27,7 +27,7 @@ export class Tables {
       // A sender elsewhere does not say, and one of best effort does not count.
       const out = plan.discard_limit === null || c.outstanding === undefined
         ? "–" : `${c.outstanding} of ${plan.window}`;
-      row.show(name, plan.guarantee, number(c.sent ?? c.received), rate(c.rate_hz),
+      row.show(plan.title ?? name, plan.guarantee, number(c.sent ?? c.received), rate(c.rate_hz),
         milliseconds(c.latency_ms), out, number(c.unread), number(c.discarded));
     }
     for (const [name, row] of this.nodes) {
