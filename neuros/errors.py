@@ -30,8 +30,8 @@ class NeurosError(Exception):
 class Problem:
     """One thing wrong in a project file, or a file of a message package.
 
-    ``line`` and ``column`` count from 1; ``pointer`` is a JSON pointer (RFC 6901), empty where the
-    file is not JSON.
+    ``line`` and ``column`` count from 1, and are 0 where there is no file; ``pointer`` is a JSON
+    pointer (RFC 6901), empty where the file is not JSON.
     """
 
     file: str
@@ -44,7 +44,8 @@ class Problem:
     def __str__(self) -> str:
         hint = f" ({self.hint})" if self.hint else ""
         pointer = f"{self.pointer}: " if self.pointer else ""
-        return f"{self.file}:{self.line}:{self.column}: {pointer}{self.text}{hint}"
+        place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        return f"{place}: {pointer}{self.text}{hint}"
 
 
 class ProjectError(NeurosError):
@@ -92,7 +93,7 @@ class NodeError(NeurosError):
 class HookError(NodeError):
     """A hook is declared wrongly, failed, or returned what it must not return.
 
-    ``where`` is ``file:line`` of the hook in the plugin.
+    ``where`` is ``file:line`` in the plugin: of the hook, or, if that failed, of what it did last.
     """
 
     def __init__(self, text: str, *, hook: str = "", where: str = "") -> None:

@@ -59,7 +59,7 @@ def _build(options: argparse.Namespace) -> int:
     if ended := build_messages(messages):
         return ended
     for built in messages.built:
-        print(f"{built.package}: {built.folder}")
+        print(f"messages of {built.package} are built: {built.folder}")
     if not messages.built:
         folder = project if project.is_dir() else project.parent
         print(f"no message packages in {folder / 'workspace'} and {WORKSPACE}")

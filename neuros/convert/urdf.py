@@ -75,9 +75,8 @@ def _resolve_meshes(
             except NotFound:
                 path = finder.find_file(str(folder / Path(uri).name), root.file.parent)
         except NotFound:
-            report.problem(
-                element, f"'{uri}' cannot be found", "packages are folders above the file"
-            )
+            hint = "name the folder of the package with -I, or in ROS_PACKAGE_PATH"
+            report.problem(element, f"'{uri}' cannot be found", hint)
             continue
         twin.set("filename", str(path))
         if needs_conversion(path):

@@ -102,13 +102,13 @@ def _project_file(path: Path) -> Path:
             text = f"the folder '{path}' has no {PROJECT_FILE}"
             others = sorted(other.name for other in path.glob("*.json"))
             hint = f"it has {', '.join(others)}" if others else ""
-            raise ProjectError([Problem(display_name(file), 1, 1, "/", text, hint)])
+            raise ProjectError([Problem(display_name(file), 0, 0, "", text, hint)])
         return file
     file = path.parent.resolve() / path.name
     if not file.exists():
         names = (entry.name for entry in file.parent.glob("*"))
         hint = did_you_mean(file.name, names)
-        problem = Problem(display_name(file), 1, 1, "/", "there is no such file", hint)
+        problem = Problem(display_name(file), 0, 0, "", "there is no such file", hint)
         raise ProjectError([problem])
     if file.suffix == ".py":
         text, hint = "is a plugin, not a project", f"name its {PROJECT_FILE}, or their folder"

@@ -14,7 +14,7 @@ from neuros.project.model import Connection, Port
 from neuros.runtime.failures import Failures
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.keeper import Keeper
-from neuros.runtime.plugin import describe
+from neuros.runtime.plugin import describe, last_line
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
 from neuros.runtime.wrong_fields import wrong_field
@@ -87,7 +87,8 @@ class NodeEffects:
         except HookError:
             raise
         except BaseException as error:
-            raise HookError(describe(error), hook=spec.name, where=spec.where) from error
+            where = last_line(error, spec.where)
+            raise HookError(describe(error), hook=spec.name, where=where) from error
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         """Send on connections to other nodes."""

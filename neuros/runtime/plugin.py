@@ -63,6 +63,13 @@ def describe(error: BaseException) -> str:
     return next(line for line in lines if line and not line.startswith(" ")).strip()
 
 
+def last_line(error: BaseException, where: str) -> str:
+    """``file:line`` of the innermost call in the file of ``where``, else ``where`` itself."""
+    file = where.rpartition(":")[0]
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+    return f"{file}:{lines[-1]}" if lines else where
+
+
 def plugin_traceback(error: BaseException, plugin: Path) -> str:
     """The traceback from the first frame inside the plugin on; all of it if there is none.
 

@@ -68,6 +68,7 @@ def test_all_missing_meshes_are_named(folder: Folder) -> None:
     first, second = map(str, caught.value.problems)
     assert "arm.urdf:2:" in first
     assert "'package://arm/x.obj' cannot be found" in first
+    assert "-I" in first
     assert "arm.urdf:3:" in second
     assert "robot[arm]/link[b]/collision/geometry/mesh" not in second  # the root has no part in it
     assert "link[b]/collision/geometry/mesh" in second

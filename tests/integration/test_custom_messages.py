@@ -162,7 +162,7 @@ class TestBuilding:
         done = build("-p", str(custom_messages.project), "demo_msgs", **custom_messages.environment)
 
         folder = custom_messages.pythons["demo_msgs"].parent
-        assert (done.returncode, done.stdout) == (0, f"demo_msgs: {folder}\n")
+        assert (done.returncode, done.stdout) == (0, f"messages of demo_msgs are built: {folder}\n")
 
     def test_values_survive_and_all_of_ros_takes_the_types(
         self, custom_messages: CustomMessages
