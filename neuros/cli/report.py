@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 
 if TYPE_CHECKING:
     from neuros.observe.review.run import Run
 
+EXIT_LEFT_OUT = 2
 _PAGE = "report.html"
 
 
@@ -30,7 +33,8 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     compare = commands.add_parser(
         "compare",
         help="runs side by side",
-        description="Print the figures of several runs side by side.",
+        description="Print the figures of several runs side by side. What is no run is named and"
+        " left out (exit code 2).",
     )
     compare.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     compare.add_argument(
@@ -73,9 +77,8 @@ def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
 
 def _compare(options: argparse.Namespace) -> int:
     from neuros.observe.review.comparison import comparison_rows, comparison_table, labels_of
-    from neuros.observe.review.run import open_for_review
 
-    runs = [open_for_review(folder) for folder in options.runs]
+    runs, refused = _readable(options.runs)
     header, rows = comparison_rows(runs)
     print(comparison_table(header, rows))
     for run, label in zip(runs, labels_of(runs), strict=True):
@@ -84,7 +87,24 @@ def _compare(options: argparse.Namespace) -> int:
     if options.output is not None:
         _write(options.output.parent, {options.output.name: _comparison(runs, header, rows)})
         print(options.output)
-    return 0
+    for error in refused:
+        print(f"neuros: left out: {error}", file=sys.stderr)
+    return EXIT_LEFT_OUT if refused else 0
+
+
+def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
+    """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
+    from neuros.observe.review.run import open_for_review
+
+    runs, refused = [], []
+    for folder in folders:
+        try:
+            runs.append(open_for_review(folder))
+        except UsageError as error:
+            refused.append(error)
+    if not runs:
+        raise UsageError("\n".join(map(str, refused)))
+    return runs, refused
 
 
 def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> bytes:

@@ -144,3 +144,21 @@ def test_runs_without_figures_are_compared_all_the_same(tmp_path: Path) -> None:
     page = tmp_path / "out.html"
     assert main(["compare", str(tmp_path), str(tmp_path), "-o", str(page)]) == 0
     assert "<img" not in page.read_text("utf-8")
+
+
+def test_what_a_killed_sweep_has_left_is_named_and_the_rest_is_compared(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun, torn, cut_off = (tmp_path / name for name in ("begun", "torn", "cut_off"))
+    for folder in (begun, torn, cut_off):
+        folder.mkdir()
+    (torn / "run.json").write_text('{"format": 2, "conn')
+    (cut_off / "project.json").write_text('{"nodes": [{"name": "a"}], "connections": []}')
+    assert main(["compare", *map(str, (begun, run, torn, cut_off))]) == 2
+    shown = capsys.readouterr()
+    assert re.search(r"^ +run +cut_off +ratio$", shown.out, re.MULTILINE)
+    assert "wall time / s" in shown.out
+    assert "missing in cut_off: run.json: the run goes on, or its launcher was killed" in shown.out
+    first, second = shown.err.splitlines()
+    assert first.startswith(f"neuros: left out: {begun} has no run.json")
+    assert second.startswith(f"neuros: left out: {torn / 'run.json'} is broken")
