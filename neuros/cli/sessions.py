@@ -1,8 +1,9 @@
-"""``neuros ps`` and ``neuros stop``: the runs of this user."""
+"""``neuros ps`` and ``neuros stop``: the runs of this user; root sees those of others, too."""
 
 from __future__ import annotations
 
 import argparse
+import pwd
 import time
 from collections.abc import Sequence
 from datetime import datetime
@@ -22,13 +23,15 @@ def add_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ps = commands.add_parser(
         "ps",
         help="show the runs of this user",
-        description="Show the nodes of all runs of this user on this machine.",
+        description="Show the nodes of all runs of this user on this machine; for root, of all"
+        " users.",
     )
     ps.set_defaults(command=_ps)
     stop = commands.add_parser(
         "stop",
         help="stop a run, as Ctrl+C does",
-        description="Stop runs of this user, as Ctrl+C in their terminal does, and wait for it.",
+        description="Stop runs of this user, as Ctrl+C in their terminal does, and wait for it."
+        " Root stops a run of another user by its id alone.",
     )
     stop.add_argument(
         "runs",
@@ -48,14 +51,17 @@ def _ps(_: argparse.Namespace) -> int:
         return 0
     from tabulate import tabulate
 
-    rows = [row for session in found for row in _rows(session)]
-    print(tabulate(rows, headers=["run", "project", "node", "back end", "since", "state"]))
+    shows_users = not all(session.is_own for session in found)
+    users = ["user"] if shows_users else []
+    rows = [row for session in found for row in _rows(session, shows_users=shows_users)]
+    print(tabulate(rows, headers=["run", *users, "project", "node", "back end", "since", "state"]))
     return 0
 
 
-def _rows(session: Session) -> list[list[str]]:
+def _rows(session: Session, *, shows_users: bool) -> list[list[str]]:
     since = datetime.fromtimestamp(session.since).strftime("%Y-%m-%d %H:%M:%S")
-    head = [session.run[:_SHOWN], session.project]
+    users = [_user_name(session.user)] if shows_users else []
+    head = [session.run[:_SHOWN], *users, session.project]
     prefix = f"{session.namespace}/" if session.namespace else ""
     return [
         [*head, prefix + node, session.backend, since, state]
@@ -63,10 +69,18 @@ def _rows(session: Session) -> list[list[str]]:
     ]
 
 
+def _user_name(user: int) -> str:
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return str(user)
+
+
 def _stop(options: argparse.Namespace) -> int:
-    chosen = _chosen(options.runs, sessions(), is_all=options.all)
+    found = sessions()
+    chosen = _chosen(options.runs, found, is_all=options.all)
     if not chosen:
-        print("nothing is running")
+        print("no run of yours goes on" if found else "nothing is running")
     for session in chosen:
         session.interrupt()
     _await_end(chosen)
@@ -78,9 +92,10 @@ def _stop(options: argparse.Namespace) -> int:
 
 
 def _chosen(names: Sequence[str], found: Sequence[Session], *, is_all: bool) -> Sequence[Session]:
-    if is_all or (not names and len(found) <= 1):
-        return found
-    shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in found)
+    own = [session for session in found if session.is_own]
+    if is_all or (not names and len(own) <= 1):
+        return own
+    shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in own)
     if not names:
         raise UsageError(f"several runs: name one of {shown}, or give --all")
     for name in names:
@@ -90,7 +105,8 @@ def _chosen(names: Sequence[str], found: Sequence[Session], *, is_all: bool) -> 
 
 
 def _is_named(session: Session, name: str) -> bool:
-    return session.project == name or (bool(name) and session.run.startswith(name))
+    is_project = session.project == name and session.is_own
+    return is_project or (bool(name) and session.run.startswith(name))
 
 
 def _await_end(chosen: Sequence[Session]) -> None:

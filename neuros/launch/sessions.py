@@ -1,4 +1,4 @@
-"""The runs of this user on this machine, on whatever back end.
+"""The runs on this machine whose user this process may see: its own, or all if it is root's.
 
 Each run has a guardian from before its first process until after its last: where a guardian is,
 there is a run. So nothing is written down that could be out of date; what the guardian guards
@@ -12,7 +12,7 @@ import json
 import os
 import signal
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class Session:
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
+        user: number of the user whose run it is: that of its guardian, whatever that says.
     """
 
     run: str
@@ -43,12 +44,18 @@ class Session:
     since: float
     launcher: tuple[int, int]
     namespace: str = ""
+    user: int = field(default_factory=os.getuid)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is a run of the user who asks."""
+        return self.user == os.getuid()
 
     @property
     def is_led(self) -> bool:
         """Whether its launcher is there; if not, the guardian is about to end it."""
         pid, start = self.launcher
-        return started_at(pid) == start
+        return started_at(pid) == start and _user_of(pid) == self.user
 
     def states(self) -> Mapping[str, str]:
         """How each node is: running, ending (its launcher has gone), or not running."""
@@ -88,7 +95,7 @@ def this_process() -> tuple[int, int]:
 
 
 def sessions() -> list[Session]:
-    """All runs of this user, oldest first."""
+    """All runs of this user, for root also those of others; oldest first."""
     return sorted(_found(), key=lambda session: session.since)
 
 
@@ -97,12 +104,21 @@ def _found() -> Iterator[Session]:
     for name in filter(str.isdigit, os.listdir("/proc")):
         for variable in environ_of(int(name)):
             if variable.startswith(mark):
+                described = json.loads(variable.removeprefix(mark))
                 with contextlib.suppress(KeyError):  # of another version of NeuROS
-                    yield _session(json.loads(variable.removeprefix(mark)))
+                    yield _session({**described, "user": _user_of(int(name))})
+
+
+def _user_of(pid: int) -> int | None:
+    """The number of the user of a process, ``None`` if it has gone."""
+    try:
+        return os.stat(f"/proc/{pid}").st_uid
+    except FileNotFoundError:
+        return None
 
 
 def _session(described: Mapping[str, Any]) -> Session:
     """What a guardian's environment describes; raises ``KeyError`` if something lacks."""
-    known = {field.name: described[field.name] for field in fields(Session)}
+    known = {each.name: described[each.name] for each in fields(Session)}
     known |= {name: tuple(described[name]) for name in ("nodes", "launcher")}
     return Session(**known)

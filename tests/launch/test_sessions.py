@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,19 @@ def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) ->
         guardian.finish()
     assert newer["run"] in runs
     assert older["run"] not in runs
+
+
+def test_a_run_is_its_guardians_users_whatever_that_says(session: Session) -> None:
+    ((variable, text),) = guardian_environment(session).items()
+    forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}
+    guardian = Guardian.start(forged["run"], None, {variable: json.dumps(forged)})
+    users = {each.run: each.user for each in sessions()}
+    guardian.finish()
+    assert users[forged["run"]] == os.getuid()
+
+
+def test_a_launcher_of_another_user_is_none(session: Session) -> None:
+    assert not replace(session, user=os.getuid() + 1).is_led
 
 
 @pytest.fixture
