@@ -5,11 +5,51 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+
+KEY_LENGTH = 12
+"""Digits of the digest in the name of what is kept."""
 
 UNUSED_S = 30 * 24 * 3600.0
 """What no run has used for so long is removed."""
+
+_NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A folder ``<name>-<key>`` that is made once, or will be, with files beside it.
+
+    Attributes:
+        folder: what is kept; the others are called like it, with a suffix.
+    """
+
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        """What was written while it was made."""
+        return self.beside(".log")
+
+    def beside(self, suffix: str) -> Path:
+        """The file or folder of its name with a suffix."""
+        return self.folder.with_name(self.folder.name + suffix)
+
+    def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
+        """Be the only one who makes or removes it. Raises ``OSError``.
+
+        The context is False if somebody else is, and ``wait`` is false.
+        """
+        return locked(self.beside(".lock"), wait=wait)
+
+
+def kept_in(cache: Path) -> list[Path]:
+    """The folders that are kept in a cache, also those of which only files beside are left."""
+    names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
+    return [cache / name for name in sorted(names)]
 
 
 def cache_root(environ: Mapping[str, str]) -> Path:

@@ -19,17 +19,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuros.caching import UNUSED_S, cache_root, locked
-
-KEY_LENGTH = 12
-_NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
+from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 
 
 def message_cache(environ: Mapping[str, str]) -> Path:
@@ -38,11 +34,13 @@ def message_cache(environ: Mapping[str, str]) -> Path:
 
 
 @dataclass(frozen=True)
-class Built:
-    """One package, built or not."""
+class Built(Kept):
+    """One package, built or not; the log has what the generators and the compiler wrote."""
 
-    package: str
-    folder: Path
+    @property
+    def package(self) -> str:
+        """The name of the package."""
+        return self.folder.name[: -KEY_LENGTH - 1]
 
     @property
     def python(self) -> Path:
@@ -56,35 +54,22 @@ class Built:
     @property
     def draft(self) -> Path:
         """Where it is built."""
-        return self._beside(".draft")
-
-    @property
-    def log(self) -> Path:
-        return self._beside(".log")
+        return self.beside(".draft")
 
     @property
     def is_there(self) -> bool:
         return self.folder.is_dir()
-
-    def _beside(self, suffix: str) -> Path:
-        return self.folder.with_name(self.folder.name + suffix)
 
     def note_use(self) -> None:
         """Keep it from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)
 
-    def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
-        """Be the only one who builds or removes it. Raises ``OSError``."""
-        return locked(self._beside(".lock"), wait=wait)
-
 
 def sweep(cache: Path) -> None:
     """Remove what was interrupted, and what no run has used for a month."""
     oldest_s = time.time() - UNUSED_S
-    names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
-    for name in sorted(names):
-        built = Built(name[: -KEY_LENGTH - 1], cache / name)
+    for built in map(Built, kept_in(cache)):
         with contextlib.suppress(OSError), built.locked(wait=False) as is_mine:
             if is_mine:
                 shutil.rmtree(built.draft, ignore_errors=True)

@@ -10,8 +10,9 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+from neuros.caching import KEY_LENGTH
 from neuros.errors import Problem
-from neuros.messages.cache import KEY_LENGTH, Built, message_cache
+from neuros.messages.cache import Built, message_cache
 from neuros.messages.installed import Ros
 from neuros.messages.package import MANIFEST, Package, find_packages, problem_at
 
@@ -95,7 +96,7 @@ class Workspaces:
         """Packages and all that they depend on, built or not, as :meth:`closure` orders them."""
         packages = self.closure(names)
         keys = self._keys(packages)
-        return [Built(p.name, self._cache / f"{p.name}-{keys[p.name]}") for p in packages]
+        return [Built(self._cache / f"{p.name}-{keys[p.name]}") for p in packages]
 
     def closure(self, names: Iterable[str]) -> list[Package]:
         """Packages and all that they depend on, each after those that it needs.

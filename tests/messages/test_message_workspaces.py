@@ -291,7 +291,7 @@ class TestBuilding:
 class TestCache:
     def entry(self, bench: Bench, name: str, age_s: float) -> Built:
         environ: Mapping[str, str] = {"XDG_CACHE_HOME": str(bench.cache)}
-        built = Built(name, message_cache(environ) / f"{name}-0123456789ab")
+        built = Built(message_cache(environ) / f"{name}-0123456789ab")
         built.folder.mkdir(parents=True)
         now_s = built.folder.stat().st_mtime
         os.utime(built.folder, (now_s - age_s, now_s - age_s))

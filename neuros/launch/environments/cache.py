@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import shutil
 import sys
 import time
@@ -26,10 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuros.caching import UNUSED_S, cache_root, locked
-
-KEY_LENGTH = 12
-_NAME = re.compile(rf"(.+-[0-9a-f]{{{KEY_LENGTH}}})(?![^.])")
+from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
 
 
 def cache_folder(environ: Mapping[str, str]) -> Path:
@@ -38,22 +34,12 @@ def cache_folder(environ: Mapping[str, str]) -> Path:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One environment, made or not."""
-
-    folder: Path
+class Entry(Kept):
+    """One environment, made or not; the log has what pip wrote."""
 
     @property
     def stamp(self) -> Path:
-        return self._beside(".json")
-
-    @property
-    def log(self) -> Path:
-        """What pip wrote."""
-        return self._beside(".log")
-
-    def _beside(self, suffix: str) -> Path:
-        return self.folder.with_name(self.folder.name + suffix)
+        return self.beside(".json")
 
     @property
     def future_python(self) -> Path:
@@ -80,7 +66,7 @@ class Entry:
         Raises ``OSError``.
         """
         self.stamp.parent.mkdir(parents=True, exist_ok=True)
-        draft = self._beside(f".json.{os.getpid()}")
+        draft = self.beside(f".json.{os.getpid()}")
         try:
             draft.write_text(json.dumps({"is_here": is_here}), "utf-8")
             draft.replace(self.stamp)
@@ -94,20 +80,11 @@ class Entry:
                 file.unlink(missing_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
-        """Be the only one who makes or removes it. Raises ``OSError``.
-
-        The context is False if somebody else is, and ``wait`` is false.
-        """
-        return locked(self._beside(".lock"), wait=wait)
-
 
 def sweep(cache: Path) -> None:
     """Remove what was interrupted, and what no run has used for a month."""
     oldest_s = time.time() - UNUSED_S
-    names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
-    for name in sorted(names):
-        entry = Entry(cache / name)
+    for entry in map(Entry, kept_in(cache)):
         with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
             if is_mine and _last_used_s(entry) < oldest_s:
                 entry.remove()

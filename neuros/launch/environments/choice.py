@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import neuros
+from neuros.caching import KEY_LENGTH
 from neuros.installation.machine import dotted
 from neuros.launch.containers import ContainerFolder
-from neuros.launch.environments.cache import KEY_LENGTH, Entry
+from neuros.launch.environments.cache import Entry
 from neuros.launch.environments.interpreters import FILE, Version, find_python, wanted_version
 from neuros.launch.environments.requirements import Requirements, read_requirements, unmet
 
