@@ -101,14 +101,20 @@ def test_regular_trains_of_equal_rates_do_not_fire_together():
     assert len(set(spikes.time_s)) == len(spikes) == 100
 
 
-@given(rates_of_some, durations, st.floats(1e-3, 1.0))
-def test_the_window_holds_the_spikes_of_its_last_seconds(rates, lengths, window_s):
-    decoder, rng, now_s, everything = WindowRate(len(rates), window_s), generator(), 0.0, []
+def decoded(decoder, rates, lengths):
+    """Rates after Poisson spikes in steps of these lengths, when that is, and every spike."""
+    rng, now_s, everything = generator(), 0.0, []
     for length in lengths:
         spikes = poisson_spikes(rates, length, rng, now_s)
         everything.extend(zip(spikes.neuron, spikes.time_s, strict=True))
         now_s += length
         found = decoder.update(spikes, now_s)
+    return found, now_s, everything
+
+
+@given(rates_of_some, durations, st.floats(1e-3, 1.0))
+def test_the_window_holds_the_spikes_of_its_last_seconds(rates, lengths, window_s):
+    found, now_s, everything = decoded(WindowRate(len(rates), window_s), rates, lengths)
     expected = np.zeros(len(rates))
     for neuron, time_s in everything:
         expected[neuron] += time_s > now_s - window_s
@@ -118,12 +124,7 @@ def test_the_window_holds_the_spikes_of_its_last_seconds(rates, lengths, window_
 @settings(max_examples=50)
 @given(rates_of_some, durations, st.floats(1e-3, 1.0))
 def test_the_exponential_filter_is_its_formula_whatever_the_steps(rates, lengths, tau_s):
-    decoder, rng, now_s, everything = ExponentialRate(len(rates), tau_s), generator(), 0.0, []
-    for length in lengths:
-        spikes = poisson_spikes(rates, length, rng, now_s)
-        everything.extend(zip(spikes.neuron, spikes.time_s, strict=True))
-        now_s += length
-        found = decoder.update(spikes, now_s)
+    found, now_s, everything = decoded(ExponentialRate(len(rates), tau_s), rates, lengths)
     expected = np.zeros(len(rates))
     for neuron, time_s in everything:
         expected[neuron] += math.exp((time_s - now_s) / tau_s) / tau_s
