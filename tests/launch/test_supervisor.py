@@ -1,152 +1,22 @@
-"""However a run ends, the supervisor brings it to that end: exit code, reason, and nobody left.
-
-The nodes are stand-ins: real processes that keep to the control channel, without ROS.
-"""
+"""However a run ends, the supervisor brings it to that end: exit code, reason, and nobody left."""
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.host import HostProcess
-from neuros.launch.in_process import InProcessLauncher
-from neuros.launch.outcome import Outcome
-from neuros.launch.process import ProcessLauncher
-from neuros.launch.sides import Sides
-from neuros.launch.supervisor import Supervisor
-from neuros.project.model import Connection, Folders, Node, NodeFile
-
-HOST = [sys.executable, "-S", str(Path(__file__).parent / "stand_in_host.py")]
-WELL_BEHAVED = "host.up(); host.serve()"
-SHUTS_DOWN = "host.up_last(); host.tell('shutdown', reason='enough', drain_s=5); host.serve()"
-DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
-
-Act = Callable[[], object]
-
-
-@dataclass
-class Output:
-    """Notes what the supervisor says, and lets a test act when it says something."""
-
-    said: list[str] = field(default_factory=list)
-    when: dict[str, Act] = field(default_factory=dict)
-    polls: list[Act] = field(default_factory=list)
-
-    def log(self, severity: str, text: str) -> None:
-        self.said.append(text)
-        for beginning, act in tuple(self.when.items()):
-            if text.startswith(beginning):
-                del self.when[beginning]
-                act()
-
-    def poll(self) -> object:
-        for act in self.polls:
-            act()
-        return None
-
-
-class Run:
-    """Runs stand-ins under a supervisor."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.output = Output()
-        self.signals: list[int] = []
-        self.hosts: list[HostProcess] = []
-        self.lasted_s = 0.0
-
-    def file(self, name: str, act: str, connections: tuple[Connection, ...]) -> NodeFile:
-        node = Node(name, "", Path("/plugin.py"), environment={"ACT": f"{act}\n"})
-        mine = tuple(c for c in connections if name in (c.source_node, c.destination_node))
-        return NodeFile(node, mine, Folders(self.folder, self.folder, self.folder))
-
-    def __call__(
-        self,
-        *,
-        connections: tuple[Connection, ...] = (),
-        in_process: bool = False,
-        duration_s: float | None = None,
-        elsewhere: tuple[str, ...] = (),
-        **acts: str,
-    ) -> Outcome:
-        """Run nodes that do as the text under their names says, to the end."""
-        files = [self.file(name, act, connections) for name, act in acts.items()]
-        supervisor = Supervisor(
-            files,
-            _Noting(InProcessLauncher(HOST) if in_process else ProcessLauncher(HOST), self.hosts),
-            {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
-            self.folder,
-            self.output,
-            self.signals,
-            duration_s=duration_s,
-            sides=Sides("this run", elsewhere, files),
-        )
-        start_s = time.monotonic()
-        outcome = supervisor.run()
-        self.lasted_s = time.monotonic() - start_s
-        for host in self.hosts:
-            assert host.wait(5.0) is not None, "nobody is left"
-        return outcome
-
-    def clear(self) -> None:
-        """Make the folder new."""
-        self.hosts.clear()
-        (self.folder / "control.sock").unlink()
-
-    def after(self, beginning: str, act: Act) -> None:
-        """Do something when the supervisor says something that begins like this."""
-        self.output.when[beginning] = act
-
-    def when_file_exists(self, name: str, act: Act) -> None:
-        """Do something once a stand-in has made a file in the run folder."""
-
-        def look() -> None:
-            if look in self.output.polls and (self.folder / name).exists():
-                self.output.polls.remove(look)
-                act()
-
-        self.output.polls.append(look)
-
-    def press_ctrl_c(self) -> None:
-        self.signals.append(signal.SIGINT)
-
-
-@dataclass
-class _Noting:
-    """A launcher whose hosts the test can look after."""
-
-    launcher: Any
-    hosts: list[HostProcess]
-
-    def start(self, *arguments: Any) -> Any:
-        self.hosts += self.launcher.start(*arguments)
-        return list(self.hosts)
-
-    def describe(self, *arguments: Any) -> Any:
-        return self.launcher.describe(*arguments)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    run = Run(tmp_path)
-    yield run
-    for host in run.hosts:
-        host.kill()
-        host.wait(10)
-
-
-def wire(text: str, index: int = 0) -> Connection:
-    source, destination = text.split(" -> ")
-    return Connection(*source.split("."), *destination.split("."), 0, index=index)
+    with supervised(tmp_path) as run:
+        yield run
 
 
 # ------------------------------------------------------------------ drained ends
@@ -386,128 +256,6 @@ def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
 
 def test_nor_where_other_nodes_run_elsewhere(run: Run) -> None:
     assert run(a=WELL_BEHAVED, duration_s=2.5, elsewhere=("b",)).exit_code == 0
-
-
-# ------------------------------------------------------------------ signals
-
-
-@pytest.mark.parametrize(
-    ("number", "exit_code", "name"),
-    [
-        (signal.SIGINT, 130, "Ctrl+C"),
-        (signal.SIGTERM, 143, "SIGTERM"),
-        (signal.SIGHUP, 143, "SIGHUP (the terminal was closed)"),
-    ],
-)
-def test_a_signal_ends_the_run_without_draining(
-    run: Run, number: int, exit_code: int, name: str
-) -> None:
-    notes_drain = """
-host.up()
-heard = []
-while (message := host.hear())['kind'] != 'stop':
-    heard.append(message['kind'])
-assert 'drain' not in heard
-host.report(is_final=True)
-"""
-    run.when_file_exists("a.up", lambda: run.signals.append(number))
-    outcome = run(a=notes_drain)
-    assert (outcome.exit_code, outcome.reason) == (exit_code, f"ended by {name}")
-    assert outcome.has_final_report("a")
-
-
-def test_a_signal_that_came_before_anything_was_started_starts_nothing(run: Run) -> None:
-    run.press_ctrl_c()
-    assert run(a=WELL_BEHAVED).exit_code == 130
-    assert run.hosts == []
-
-
-def test_a_signal_during_start_up_kills_what_has_not_been_loaded(run: Run) -> None:
-    run.when_file_exists("there", run.press_ctrl_c)
-    outcome = run(a=f"open('there', 'w'); {DEAF}", b=f"host.hello(); {DEAF}")
-    assert (outcome.exit_code, outcome.failures) == (130, [])
-    assert run.lasted_s < 4, "there is nothing to finalise"
-
-
-def test_a_second_signal_kills_at_once(run: Run) -> None:
-    run.when_file_exists("a.up", run.press_ctrl_c)
-    run.after("Ctrl+C: stopping", run.press_ctrl_c)
-    outcome = run(a=f"host.up(); {DEAF}")
-    assert (outcome.exit_code, outcome.failures) == (130, [])
-    assert run.lasted_s < 4
-
-
-def test_one_ctrl_c_leaves_nodes_that_already_finalise_alone(run: Run) -> None:
-    run.when_file_exists("stopping", run.press_ctrl_c)
-    finalises = """
-import time
-host.up()
-host.wait_for('stop')
-open('stopping', 'w')
-time.sleep(0.5)
-host.report(is_final=True)
-"""
-    outcome = run(a=SHUTS_DOWN, b=finalises)
-    assert "Ctrl+C: already ending (once more kills at once)" in run.output.said
-    assert outcome.exit_code == 0
-    assert outcome.has_final_report("b")
-
-
-def test_two_do_not(run: Run) -> None:
-    run.when_file_exists("stopping", run.press_ctrl_c)
-    run.after("Ctrl+C: already ending", run.press_ctrl_c)
-    outcome = run(
-        a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); open('stopping', 'w'); {DEAF}"
-    )
-    assert outcome.exit_code == 0
-    assert run.lasted_s < 4
-
-
-def test_a_failure_while_a_signal_ends_the_run_is_noted(run: Run) -> None:
-    run.when_file_exists("a.up", run.press_ctrl_c)
-    fails = "host.up(); host.wait_for('stop'); host.tell('failed', text='why')"
-    outcome = run(a=fails)
-    assert (outcome.exit_code, outcome.reason) == (130, "ended by Ctrl+C")
-    assert outcome.failures == ["node 'a' failed: why"]
-
-
-# ------------------------------------------------------------------ nodes that do not cooperate
-
-
-def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None:
-    outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
-    assert "'b': not ended after 5 s, killed" in run.output.said
-    assert outcome.exit_code == 0
-    assert 5 <= run.lasted_s < 6.5
-
-
-def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
-    stops = "host.up_last(); host.tell('shutdown', reason='', drain_s=0.2); " + (
-        "import os, signal; os.kill(os.getpid(), signal.SIGSTOP)"
-    )
-    outcome = run(a=stops, b=WELL_BEHAVED)
-    assert outcome.has_final_report("b")
-    assert "'a': not ended after 5 s, killed" in run.output.said
-    assert run.lasted_s < 7
-
-
-def test_a_report_behind_the_final_one_does_not_count(run: Run) -> None:
-    outcome = run(a=SHUTS_DOWN + "; host.report(late=True)")
-    assert outcome.has_final_report("a")
-
-
-def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
-    outcome = run(
-        a="import socket; s = socket.socket(socket.AF_UNIX); s.connect('control.sock'); "
-        "s.sendall(b'GET / HTTP/1.1\\n'); assert s.recv(1) == b''; " + SHUTS_DOWN
-    )
-    assert outcome.exit_code == 0
-
-
-def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
-    explains = "host.up(); host.tell('explanation', lines=['waits for `x` from b', 'and more']); "
-    run(a=explains + "host.tell('shutdown', reason='', drain_s=5); host.serve()")
-    assert "a waits for `x` from b; and more" in run.output.said
 
 
 # ------------------------------------------------------------------ several nodes in one process

@@ -1,0 +1,138 @@
+"""A supervisor whose run gets a signal, or whose nodes do not cooperate, ends it all the same."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from supervised import DEAF, SHUTS_DOWN, WELL_BEHAVED, Run, supervised
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    with supervised(tmp_path) as run:
+        yield run
+
+
+# ------------------------------------------------------------------ signals
+
+
+@pytest.mark.parametrize(
+    ("number", "exit_code", "name"),
+    [
+        (signal.SIGINT, 130, "Ctrl+C"),
+        (signal.SIGTERM, 143, "SIGTERM"),
+        (signal.SIGHUP, 143, "SIGHUP (the terminal was closed)"),
+    ],
+)
+def test_a_signal_ends_the_run_without_draining(
+    run: Run, number: int, exit_code: int, name: str
+) -> None:
+    notes_drain = """
+host.up()
+heard = []
+while (message := host.hear())['kind'] != 'stop':
+    heard.append(message['kind'])
+assert 'drain' not in heard
+host.report(is_final=True)
+"""
+    run.when_file_exists("a.up", lambda: run.signals.append(number))
+    outcome = run(a=notes_drain)
+    assert (outcome.exit_code, outcome.reason) == (exit_code, f"ended by {name}")
+    assert outcome.has_final_report("a")
+
+
+def test_a_signal_that_came_before_anything_was_started_starts_nothing(run: Run) -> None:
+    run.press_ctrl_c()
+    assert run(a=WELL_BEHAVED).exit_code == 130
+    assert run.hosts == []
+
+
+def test_a_signal_during_start_up_kills_what_has_not_been_loaded(run: Run) -> None:
+    run.when_file_exists("there", run.press_ctrl_c)
+    outcome = run(a=f"open('there', 'w'); {DEAF}", b=f"host.hello(); {DEAF}")
+    assert (outcome.exit_code, outcome.failures) == (130, [])
+    assert run.lasted_s < 4, "there is nothing to finalise"
+
+
+def test_a_second_signal_kills_at_once(run: Run) -> None:
+    run.when_file_exists("a.up", run.press_ctrl_c)
+    run.after("Ctrl+C: stopping", run.press_ctrl_c)
+    outcome = run(a=f"host.up(); {DEAF}")
+    assert (outcome.exit_code, outcome.failures) == (130, [])
+    assert run.lasted_s < 4
+
+
+def test_one_ctrl_c_leaves_nodes_that_already_finalise_alone(run: Run) -> None:
+    run.when_file_exists("stopping", run.press_ctrl_c)
+    finalises = """
+import time
+host.up()
+host.wait_for('stop')
+open('stopping', 'w')
+time.sleep(0.5)
+host.report(is_final=True)
+"""
+    outcome = run(a=SHUTS_DOWN, b=finalises)
+    assert "Ctrl+C: already ending (once more kills at once)" in run.output.said
+    assert outcome.exit_code == 0
+    assert outcome.has_final_report("b")
+
+
+def test_two_do_not(run: Run) -> None:
+    run.when_file_exists("stopping", run.press_ctrl_c)
+    run.after("Ctrl+C: already ending", run.press_ctrl_c)
+    outcome = run(
+        a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); open('stopping', 'w'); {DEAF}"
+    )
+    assert outcome.exit_code == 0
+    assert run.lasted_s < 4
+
+
+def test_a_failure_while_a_signal_ends_the_run_is_noted(run: Run) -> None:
+    run.when_file_exists("a.up", run.press_ctrl_c)
+    fails = "host.up(); host.wait_for('stop'); host.tell('failed', text='why')"
+    outcome = run(a=fails)
+    assert (outcome.exit_code, outcome.reason) == (130, "ended by Ctrl+C")
+    assert outcome.failures == ["node 'a' failed: why"]
+
+
+# ------------------------------------------------------------------ nodes that do not cooperate
+
+
+def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None:
+    outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
+    assert "'b': not ended after 5 s, killed" in run.output.said
+    assert outcome.exit_code == 0
+    assert 5 <= run.lasted_s < 6.5
+
+
+def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
+    stops = "host.up_last(); host.tell('shutdown', reason='', drain_s=0.2); " + (
+        "import os, signal; os.kill(os.getpid(), signal.SIGSTOP)"
+    )
+    outcome = run(a=stops, b=WELL_BEHAVED)
+    assert outcome.has_final_report("b")
+    assert "'a': not ended after 5 s, killed" in run.output.said
+    assert run.lasted_s < 7
+
+
+def test_a_report_behind_the_final_one_does_not_count(run: Run) -> None:
+    outcome = run(a=SHUTS_DOWN + "; host.report(late=True)")
+    assert outcome.has_final_report("a")
+
+
+def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
+    outcome = run(
+        a="import socket; s = socket.socket(socket.AF_UNIX); s.connect('control.sock'); "
+        "s.sendall(b'GET / HTTP/1.1\\n'); assert s.recv(1) == b''; " + SHUTS_DOWN
+    )
+    assert outcome.exit_code == 0
+
+
+def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
+    explains = "host.up(); host.tell('explanation', lines=['waits for `x` from b', 'and more']); "
+    run(a=explains + "host.tell('shutdown', reason='', drain_s=5); host.serve()")
+    assert "a waits for `x` from b; and more" in run.output.said
