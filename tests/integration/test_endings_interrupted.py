@@ -1,0 +1,219 @@
+"""A project that is interrupted or killed ends, and one that stands still says why."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ending_bench import (
+    COUNTS,
+    ENDS,
+    MARK,
+    RELAY,
+    SINK,
+    SOURCE,
+    Bench,
+    assert_ended,
+    last_line,
+    made_bench,
+)
+from endings import GONE_WITHIN_S, RUNS
+from launching import BACKENDS
+
+from containers import wait_until
+
+
+@pytest.fixture(params=BACKENDS)
+def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    with made_bench(tmp_path, request.param) as bench:
+        yield bench
+
+
+# ------------------------------------------------------------------ signals
+
+
+@pytest.mark.parametrize(
+    ("number", "exit_code", "reason"),
+    [(signal.SIGINT, 130, "ended by Ctrl\\+C"), (signal.SIGTERM, 143, "ended by SIGTERM")],
+)
+def test_a_signal_ends_a_run(bench: Bench, number: int, exit_code: int, reason: str) -> None:
+    bench.project(a=RUNS, b=RUNS)
+    running = bench.start()
+    running.wait_for("[a]: running")
+    running.wait_for("[b]: running")
+    running.signal(number)
+    assert_ended(running.finish(GONE_WITHIN_S), exit_code, reason)
+    assert bench.saved("a", "b")
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.15, 0.35])
+def test_ctrl_c_during_start_up_ends_it_whenever_it_comes(bench: Bench, delay_s: float) -> None:
+    bench.project("a.o -> b.x", a=SOURCE, b=SINK)
+    running = bench.start()
+    running.wait_for("run folder")
+    time.sleep(delay_s)  # not to wait for something, but to hit different moments
+    running.signal(signal.SIGINT)
+    assert_ended(running.finish(GONE_WITHIN_S), 130, "ended by Ctrl\\+C")
+
+
+def test_a_second_ctrl_c_kills_at_once(bench: Bench) -> None:
+    bench.project(a=RUNS + "@neuros_finalise()\ndef dawdle(node):\n    time.sleep(30)\n")
+    running = bench.start()
+    running.wait_for("[a]: running")
+    running.signal(signal.SIGINT)
+    running.wait_for("all is saved")
+    running.signal(signal.SIGINT)
+    assert_ended(running.finish(3.0), 130, "ended by Ctrl\\+C")
+
+
+HOLDS = """
+@neuros_tick(seconds=0.1)
+def hold(node):
+    node.get_logger().info("running")
+    {}
+"""
+
+
+def test_nodes_that_cannot_end_are_killed(bench: Bench) -> None:
+    bench.project(
+        gil=HOLDS.format("ctypes.PyDLL(None).sleep(30)"),
+        sleeps=HOLDS.format("time.sleep(30)"),
+        stopped=HOLDS.format("os.kill(os.getpid(), signal.SIGSTOP)"),
+        good=RUNS,
+    )
+    running = bench.start()
+    for name in ("gil", "sleeps", "stopped") if bench.back_end == "process" else ("gil",):
+        running.wait_for(f"[{name}]: running")
+    running.signal(signal.SIGTERM)
+    assert_ended(running.finish(GONE_WITHIN_S), 143, "ended by SIGTERM")
+    if bench.back_end == "process":
+        assert bench.saved("good")
+
+
+def test_nobody_has_to_read_what_is_printed(bench: Bench) -> None:
+    bench.project(a="@neuros_tick(seconds=0.001)\ndef talk(node):\n    print('x' * 1000)\n", b=ENDS)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "neuros.cli", "launch", str(bench.folder), *bench._arguments(())],
+        cwd=bench.folder,
+        env={**os.environ, MARK: bench.mark},
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        wait_until(lambda: list(bench.folder.rglob("saved")), 10.0)
+        process.terminate()  # it would wait for the reader for ever, but not after that
+        assert process.wait(5.0) == 0
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+# ------------------------------------------------------------------ killed
+
+
+def test_when_a_node_is_killed_the_others_end_and_its_last_report_is_shown(bench: Bench) -> None:
+    bench.project(a=RUNS, b=RUNS)
+    running = bench.start()
+    running.wait_for("[b]: running")
+    running.wait_for("[a]: running")
+    os.kill(bench.pid_of("a"), signal.SIGKILL)
+    finished = running.finish(GONE_WITHIN_S)
+    assert finished.exit_code == 1
+    assert re.fullmatch("nodes? 'a'.* ended unexpectedly.*: killed by SIGKILL", last_line(finished))
+    assert re.search(r"last report \d\.\d s before the end", finished.output)
+    if bench.back_end == "process":
+        assert bench.saved("b")
+
+
+@pytest.mark.parametrize(
+    "moments", [["run folder"], ["[a]: running", "[b]: running"]], ids=["starting", "running"]
+)
+def test_when_the_launcher_is_killed_everything_ends(bench: Bench, moments: list[str]) -> None:
+    bench.project(a=RUNS, b=RUNS)
+    running = bench.start()
+    for text in moments:
+        running.wait_for(text)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    bench.outputs.append(running.output)
+    wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
+    if len(moments) == 2:
+        assert bench.saved("a", "b"), "nodes that were up had their time"
+
+
+def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
+    with made_bench(tmp_path, "process") as bench:
+        bench.project(a=HOLDS.format("ctypes.PyDLL(None).sleep(30)"), b=RUNS)
+        running = bench.start()
+        running.wait_for("[a]: running")
+        running.wait_for("[b]: running")
+        running.signal(signal.SIGKILL)
+        running.process.wait()
+        bench.outputs.append(running.output)
+        wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
+        assert bench.saved("b")
+
+
+# ------------------------------------------------------------------ what is said meanwhile
+
+
+def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(bench: Bench) -> None:
+    bench.project(
+        "a.o -> b.x",
+        "b.o -> c.x",
+        "d.o -> c.y",
+        a="@neuros_initialise(outputs='o')\ndef think(node):\n"
+        "    time.sleep(6.5)\n    return node.make_packet('o')\n",
+        b=RELAY,
+        c=SINK.replace("inputs='x'", "inputs=['x', 'y']").replace("x)", "x, y=None)"),
+        d="@neuros_tick(seconds=60, outputs='o')\ndef rarely(node):\n"
+        "    return node.make_packet('o')\n",
+    )
+    running = bench.start()
+    running.wait_for("a has been executing 'think' for 5 s", 10.0)
+    if bench.back_end == "process":
+        running.wait_for("c waits for `x` from b", 3.0)
+        running.wait_for("b waits for `x` from a", 3.0)
+        running.wait_for("d waits for the next tick of 'rarely'", 3.0)
+    running.signal(signal.SIGINT)
+    finished = running.finish()
+    assert_ended(finished, 130, "ended by Ctrl\\+C")
+    said = finished.said("neuros")
+    assert len([text for text in said if "has been executing" in text]) == 1
+    if bench.back_end == "process":
+        assert not any(text.startswith("a executes") for text in said), "that was said before"
+
+
+def test_waiting_connections_are_named_after_five_seconds(tmp_path: Path) -> None:
+    with made_bench(tmp_path, "process") as bench:
+        bench.project("a.o -> b.x", a=SOURCE, b=SINK)
+        running = bench.start("-n", "a")
+        running.wait_for("connections still waiting for their other end: a.o -> b.x", 8.0)
+        running.signal(signal.SIGINT)
+        assert running.finish().exit_code == 130
+
+
+# ------------------------------------------------------------------ side by side
+
+
+def test_two_runs_at_once_in_one_folder_do_not_meet(bench: Bench) -> None:
+    bench.project("a.o -> b.x", ("a.o -> c.x", None), a=SOURCE, b=SINK, c=COUNTS)
+    pair = [bench.start(), bench.start()]
+    for running in pair:
+        running.finish()
+        assert running.process.returncode == 0, running.output
+    records = [json.loads(file.read_text()) for file in bench.folder.rglob("run.json")]
+    assert len({record["domain_id"] for record in records}) == 2
+    for record in records:
+        lossless, _ = record["connections"]
+        assert lossless["sent"] == lossless["consumed"] >= 50
