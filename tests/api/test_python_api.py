@@ -194,7 +194,7 @@ def test_ctrl_c_between_start_and_wait_leaves_nothing_running(
     threads = set(threading.enumerate())
     with interrupted_at(file, function), pytest.raises(KeyboardInterrupt):
         made.run(backend="in-process", output="run")
-    assert set(threading.enumerate()) == threads
+    _await(lambda: set(threading.enumerate()) <= threads)
     assert str(tmp_path / "run") not in {each.folder for each in sessions()}
     assert not [each for each in open_files() if "neuros-domain-" in each]
 
