@@ -5,7 +5,8 @@
 
     .venv/bin/python docs/screenshots.py
 
-It needs ``install.py --dev``, Chromium, and what the examples need. Look at what it has made.
+It needs ``install.py --dev --extras rerun``, Chromium, and what the examples need. Look at what it
+has made.
 """
 
 from __future__ import annotations
@@ -26,14 +27,18 @@ from playwright.sync_api import sync_playwright
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
 DEADLINE_MS = 120_000
+RERUN_DRAWS_MS = 40_000  # on a canvas that says nothing of what it shows, without a graphics card
 WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
 
 
+LONG = ("--set", "nodes.robot.environment.DURATION=1000")
+
+
 @contextlib.contextmanager
-def dashboard_of(project: Path, *arguments: str) -> Iterator[str]:
-    """Run a project; yields the address of its dashboard."""
+def page_of(project: Path, name: str, *arguments: str) -> Iterator[str]:
+    """Run a project; yields the address that is printed behind this name."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "neuros.cli", "launch", str(project), "--dashboard"]
+        command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
         process = subprocess.Popen(
             [*command, "--backend", "process", *arguments],
             stdout=subprocess.PIPE,
@@ -43,7 +48,7 @@ def dashboard_of(project: Path, *arguments: str) -> Iterator[str]:
         assert process.stdout is not None
         with process.stdout as lines:
             try:
-                yield next(m[1] for line in lines if (m := re.search(r"dashboard: (\S+)", line)))
+                yield next(m[1] for line in lines if (m := re.search(rf"{name}: (http\S+)", line)))
             finally:
                 process.send_signal(signal.SIGINT)
                 for _ in lines:
@@ -53,7 +58,7 @@ def dashboard_of(project: Path, *arguments: str) -> Iterator[str]:
 
 def shoot_dashboard(page: Any) -> None:
     """WhiskEye, with a connection selected and two fields plotted."""
-    with dashboard_of(WHISKEYE, "--set", "nodes.robot.environment.DURATION=1000") as url:
+    with page_of(WHISKEYE, "dashboard", "--dashboard", *LONG) as url:
         page.goto(url)
         for connection, field in (
             ("snn.estimate -> visualiser.estimate", "vector.z"),
@@ -68,6 +73,14 @@ def shoot_dashboard(page: Any) -> None:
         page.screenshot(path=FIGURES / "dashboard.png")
 
 
+def shoot_rerun(page: Any) -> None:
+    """WhiskEye as ``--visualisations`` shows it where there is no RViz."""
+    with page_of(WHISKEYE, "visualisations", "-z", *LONG) as url:
+        page.goto(url)
+        page.wait_for_timeout(RERUN_DRAWS_MS)
+        page.screenshot(path=FIGURES / "rerun.png")
+
+
 def main() -> None:
     """Make all pictures."""
     with sync_playwright() as playwright:
@@ -76,6 +89,7 @@ def main() -> None:
         )
         page = browser.new_page(viewport={"width": 1300, "height": 1000})
         shoot_dashboard(page)
+        shoot_rerun(page)
         browser.close()
 
 

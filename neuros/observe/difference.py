@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -58,28 +58,7 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
             only = "A" if name in a.connections else "B"
             found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
             continue
-        in_a, in_b = (read_packets(run.folder, run.connection(name)) for run in (a, b))
-        missing = [
-            run.folder
-            for run, packets in zip((a, b), (in_a, in_b), strict=True)
-            if _lacks_digests(run.connections[name]["sent"], packets)
-        ]
-        if missing:
-            where = " and ".join(dict.fromkeys(map(str, missing)))
-            remarks.append(
-                f"{name}: not compared, there are no digests of it in {where} (in process they are"
-                " kept with --digests, and never of packets that a node sends to itself)"
-            )
-            continue
-        difference = _sent(name, in_a, in_b)
-        compared += _first_difference(in_a.sent, in_b.sent)
-        taken = _taken(name, in_a, in_b)
-        if difference is not None:
-            found.append(difference)
-        elif taken is not None and a.connections[name]["discard_limit"] == 0:
-            found.append(taken)
-        elif taken is not None:
-            remarks.append(f"{taken.text}: as a connection may that loses packets")
+        compared += _compare_connection(name, a, b, found, remarks)
     first = min(found, key=lambda difference: difference.at_ns, default=None)
     others = len(found) - 1
     if others > 0:
@@ -89,6 +68,42 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
     if first is not None and first.packet is not None:  # a bag is read for the first one only
         text = f"{first.text} {_field((a.folder, b.folder), *first.packet, message_of)}"
     return Verdict(text, tuple(remarks), compared)
+
+
+def _compare_connection(
+    name: str, a: PastRun, b: PastRun, found: list[_Difference], remarks: list[str]
+) -> int:
+    """Returns how many packets were found equal."""
+    in_a, in_b = (read_packets(run.folder, run.connection(name)) for run in (a, b))
+    sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
+    lacking = [_lacks_digests(*each) for each in sent]
+    if any(lacking):
+        folders = [run.folder for run, lacks in zip((a, b), lacking, strict=True) if lacks]
+        remarks.append(
+            f"{name}: not compared, there are no digests of it in"
+            f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process they are"
+            " kept with --digests, and never of packets that a node sends to itself)"
+        )
+        return 0
+    compared = _first_difference(in_a.sent, in_b.sent)
+    cut_off = [len(packets.sent) for count, packets in sent if (count or 0) > len(packets.sent)]
+    if cut_off:
+        listed = min(cut_off)
+        in_a, in_b = (replace(packets, sent=packets.sent[:listed]) for packets in (in_a, in_b))
+        remarks.append(
+            f"{name}: compared up to packet {listed}, of later ones no digests are there"
+        )
+        taken = None
+    else:
+        taken = _taken(name, in_a, in_b)
+    difference = _sent(name, in_a, in_b)
+    if difference is not None:
+        found.append(difference)
+    elif taken is not None and a.connections[name]["discard_limit"] == 0:
+        found.append(taken)
+    elif taken is not None:
+        remarks.append(f"{taken.text}: as a connection may that loses packets")
+    return compared
 
 
 def _lacks_digests(sent: int | None, packets: Packets) -> bool:

@@ -132,6 +132,24 @@ def test_what_a_node_that_never_reported_has_sent_is_not_said_to_be_identical(
     assert "not compared" in found.remarks[0]
 
 
+@pytest.mark.parametrize(
+    ("listed_in_b", "compared", "difference"),
+    [([1, 2], 2, None), ([1, 9], 1, f"{FIRST}: packet 2 differs")],
+)
+def test_packets_that_are_counted_and_not_listed_are_not_said_to_be_identical(
+    folders: tuple[Path, Path], listed_in_b: list[int], compared: int, difference: str | None
+) -> None:
+    a, b = run(folders[0], {FIRST: [1, 2, 3]}), run(folders[1], {FIRST: listed_in_b})
+    b.connections[FIRST]["sent"] = 3  # type: ignore[index]
+    found = verdict(a, b)
+    assert found.compared == compared
+    assert found.remarks == (
+        f"{FIRST}: compared up to packet 2, of later ones no digests are there",
+    )
+    assert (found.difference or "").startswith(difference or "")
+    assert (found.difference is None) == (difference is None)
+
+
 def test_one_that_may_lose_packets_may_have_lost_others(folders: tuple[Path, Path]) -> None:
     a = run(folders[0], {FIRST: [1, 2]}, discard_limit=None)
     b = run(folders[1], {FIRST: [1, 2]}, taken={FIRST: [2]}, discard_limit=None)
