@@ -131,9 +131,11 @@ def _load_of(process: psutil.Process, cpu_s: float | None = None) -> GroupLoad |
         with process.oneshot():
             if cpu_s is None:
                 cpu_s = sum(process.cpu_times()[:4])  # own and children's, user and system
-            return GroupLoad(cpu_s, process.memory_info().rss, process.num_threads())
+            memory_bytes, threads = process.memory_info().rss, process.num_threads()
     except psutil.Error:
         return None
+    # One that is about to end, or that nobody has waited for yet, has given its memory back.
+    return GroupLoad(cpu_s, memory_bytes, threads) if memory_bytes else None
 
 
 def _sum(loads: Sequence[GroupLoad]) -> GroupLoad:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -118,6 +119,15 @@ def test_a_process_that_ends_leaves_its_group(start: Start) -> None:
     load_of(meter, "snn", lambda load: load.threads == 1)
     process.kill()
     process.wait()
+    assert "snn" not in meter.groups()
+
+
+def test_a_process_that_nobody_has_waited_for_yet_has_no_figures(start: Start) -> None:
+    meter = LoadMeter(owner)
+    process = start(REST, "snn")
+    load_of(meter, "snn", lambda load: load.threads == 1)
+    os.kill(process.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     assert "snn" not in meter.groups()
 
 

@@ -266,7 +266,7 @@ def test_a_failing_hook_is_reported_with_its_address(plugin):
     bench = PluginHarness(path, inputs={"x": INT})
     bench.send("x", Int32(data=0))
     for _ in range(2):
-        with pytest.raises(HookError, match=r"plugin\.py:4.*hook 'divide'.*ZeroDivisionError"):
+        with pytest.raises(HookError, match=r"plugin\.py:6.*hook 'divide'.*ZeroDivisionError"):
             bench.run()
     assert isinstance(bench._failure.__cause__, ZeroDivisionError)
 
