@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import select
+import socket
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,22 +76,31 @@ def start_dashboard(
             "names": plan.names,
             "logs": {name: str(path) for name, path in logs.items()},
             "is_one_process": plan.backend == "in-process",
+            "start_s": time.monotonic(),
         },
     )
 
 
 def _run_dashboard(options: argparse.Namespace) -> int:
+    told = json.loads(sys.stdin.readline())
+    listening = socket.socket(fileno=told["descriptor"])
+    if not _is_looked_at(listening):
+        return 0
+    # Loading all this takes half a second of a core that the nodes can use.
     import asyncio
-    import socket
 
     from neuros.dashboard.server import Dashboard
 
-    told = json.loads(sys.stdin.readline())
     names = tuple(told["names"])
-    listening = socket.socket(fileno=told["descriptor"])
-    dashboard = Dashboard(told["plan"], names, _sources(told, names))
+    dashboard = Dashboard(told["plan"], names, _sources(told, names), told["start_s"])
     asyncio.run(dashboard.serve(listening, told["token"], told["run"], Path(options.run)))
     return 0
+
+
+def _is_looked_at(listening: socket.socket) -> bool:
+    """Wait for somebody who opens the page; False if the run ends before."""
+    readable, _, _ = select.select([listening, sys.stdin], [], [])
+    return listening in readable
 
 
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:

@@ -26,19 +26,20 @@ class Link:
 
     Args:
         names: the nodes of the run.
+        start_s: monotonic time from which the pages count.
 
     Attributes:
         phase: what the supervisor has said last of where the run is.
     """
 
-    def __init__(self, pages: Pages, names: tuple[str, ...]) -> None:
+    def __init__(self, pages: Pages, names: tuple[str, ...], start_s: float) -> None:
         self._pages = pages
         self._names = set(names)
         self._figures = Figures()
         self._answered: set[str] = set()
         self._has_answered = asyncio.Event()
         self._writer: asyncio.StreamWriter | None = None
-        self._start_s = time.monotonic()
+        self._start_s = start_s
         self.phase: dict[str, Any] = {"phase": "running", "is_paused": False}
 
     async def run(self, run_folder: Path) -> None:

@@ -81,13 +81,16 @@ class Dashboard:
     Args:
         plan: what :func:`neuros.dashboard.plan.plan` tells of the project.
         names: the nodes of the run.
+        start_s: monotonic time from which the page counts.
     """
 
-    def __init__(self, plan: Mapping[str, Any], names: tuple[str, ...], sources: Sources) -> None:
+    def __init__(
+        self, plan: Mapping[str, Any], names: tuple[str, ...], sources: Sources, start_s: float
+    ) -> None:
         self._plan = plan
         self._sources = sources
         self._pages = Pages()
-        self._link = Link(self._pages, names)
+        self._link = Link(self._pages, names, start_s)
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
 
     async def serve(self, listening: socket.socket, token: str, run: str, folder: Path) -> None:

@@ -22,7 +22,8 @@ class DashboardProcess:
     """Serves the dashboard of a run.
 
     It listens as soon as this is made, so the address may be opened at once; requests wait until
-    the process is started. It ends when the supervisor hangs up.
+    the process is started, which loads what it needs when the first one comes. It ends when the
+    supervisor hangs up, or, if nobody has looked, with its standard input.
 
     Args:
         port: on 127.0.0.1; 0: any free one.
@@ -74,9 +75,10 @@ class DashboardProcess:
         )
         self._listening.close()
         assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError), process.stdin:
+        with contextlib.suppress(BrokenPipeError):
             text = json.dumps({**told, "token": self._token, "descriptor": descriptor})
             process.stdin.write(text.encode() + b"\n")
+            process.stdin.flush()
         return process.pid
 
     def finish(self) -> None:
@@ -85,6 +87,9 @@ class DashboardProcess:
         process = self._process
         if process is None:
             return
+        if process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()
         try:
             process.wait(_END_S)
         except subprocess.TimeoutExpired:

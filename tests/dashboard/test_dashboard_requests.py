@@ -17,7 +17,7 @@ class Server:
     """The application, asked without a network."""
 
     def __init__(self) -> None:
-        dashboard = Dashboard({}, ("a",), Sources(lambda: None, dict))  # type: ignore[arg-type]
+        dashboard = Dashboard({}, ("a",), Sources(lambda: None, dict), 0.0)  # type: ignore[arg-type]
         self._app = dashboard.app(TOKEN, "0123456789abcdef")
 
     def post(self, path: str, body: Any) -> int:

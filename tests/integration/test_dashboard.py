@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -16,6 +17,12 @@ from neuros.dashboard.server import STATIC
 
 def start_watched(tmp_path: Path, *arguments: str) -> Running:
     return start(WATCHED, "--dashboard", *arguments, cwd=tmp_path)
+
+
+def server_of(running: Running) -> psutil.Process:
+    children = psutil.Process(running.process.pid).children()
+    (server,) = (child for child in children if "dashboard" in child.cmdline())
+    return server
 
 
 def sent(page: Any, name: str = IMU) -> int:
@@ -148,12 +155,31 @@ def test_a_paused_run_goes_on_when_its_dashboard_is_killed(tmp_path: Path) -> No
         assert visitor.post("/do/pause") == 204
         with visitor.events() as events:
             assert next(data for name, data in events if name == "phase" and data["is_paused"])
-        (dashboard,) = (
-            child
-            for child in psutil.Process(running.process.pid).children()
-            if "dashboard" in child.cmdline()
-        )
-        dashboard.kill()
+        server_of(running).kill()
         finished = running.finish()
     assert finished.exit_code == 0
     assert finished.connection(IMU)["sent"] > 0
+
+
+def test_the_server_loads_what_it_needs_when_somebody_looks(tmp_path: Path) -> None:
+    with start_watched(tmp_path) as running:
+        running.wait_for("turning fast")
+        loaded = Path(f"/proc/{server_of(running).pid}/maps")
+        assert "psutil" not in loaded.read_text()
+        visitor = Visitor(address(running))
+        assert visitor.get("/") == 200
+        assert "psutil" in loaded.read_text()
+        assert visitor.post("/do/stop") == 204
+        assert running.finish().exit_code == 0
+
+
+def test_a_run_that_nobody_looks_at_ends_with_its_server(tmp_path: Path) -> None:
+    with start_watched(tmp_path) as running:
+        running.wait_for("turning fast")
+        server = server_of(running)
+        running.signal(signal.SIGINT)
+        finished = running.finish()
+    assert finished.exit_code == 130
+    assert not server.is_running()
+    assert finished.run_folder is not None
+    assert (finished.run_folder / "dashboard.log").read_text() == ""
