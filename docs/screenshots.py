@@ -24,6 +24,8 @@ from typing import Any
 
 from playwright.sync_api import sync_playwright
 
+from neuros.launch.rerun import await_server
+
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
 DEADLINE_MS = 120_000
@@ -76,6 +78,7 @@ def shoot_dashboard(page: Any) -> None:
 def shoot_rerun(page: Any) -> None:
     """WhiskEye as ``--visualisations`` shows it where there is no RViz."""
     with page_of(WHISKEYE, "visualisations", "-z", *LONG) as url:
+        await_server(url)
         page.goto(url)
         page.wait_for_timeout(RERUN_DRAWS_MS)
         page.screenshot(path=FIGURES / "rerun.png")
