@@ -86,7 +86,7 @@ def _run_dashboard(options: argparse.Namespace) -> int:
     listening = socket.socket(fileno=told["descriptor"])
     if not _is_looked_at(listening):
         return 0
-    # Loading all this takes half a second of a core that the nodes can use.
+    # Loading all this takes a fifth of a second of a core that the nodes can use.
     import asyncio
 
     from neuros.dashboard.server import Dashboard
