@@ -58,10 +58,10 @@ def without_ledger() -> dict[Place, Any]:
     no_clock = {"self._clock()": "self.since_ns"}
     return {
         (Engine, "_wake"): rewritten(
-            Engine._wake, {**no_clock, "self.accounts.spend": "", "self.since_ns = now_ns": "pass"}
+            Engine._wake, {**no_clock, "self._spent_ns[": "", "self.since_ns = now_ns": "pass"}
         ),
         (Engine, "_run"): rewritten(
-            Engine._run, {**no_clock, "self.accounts.spend": "", "hook.busy_ns +=": ""}
+            Engine._run, {**no_clock, "self._spent_ns[": "", "hook.busy_ns +=": ""}
         ),
         (Exchange, "take"): rewritten(Exchange.take, {"inlet.taken_ns.append": ""}),
         (Inlet, "take"): rewritten(Inlet.take, {"self.taken.append": ""}),

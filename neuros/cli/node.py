@@ -15,7 +15,7 @@ from pathlib import Path
 from neuros.observe.provenance import note_versions
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
-from neuros.project.split import node_file_from_json
+from neuros.project.split import node_files_from_json
 from neuros.runtime.process import NodeProcess
 
 
@@ -24,7 +24,7 @@ def run_node(options: argparse.Namespace) -> int:
     leave = _Leave()
     atexit.register(leave)  # first, so that it comes last, after what plugins have registered
     faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log
-    files = [node_file_from_json(json.loads(Path(p).read_text())) for p in options.node_files]
+    files = node_files_from_json(json.loads(Path(p).read_text()) for p in options.node_files)
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     if not options.in_memory:  # else it is the launcher's Python

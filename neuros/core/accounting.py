@@ -49,10 +49,6 @@ class Accounts:
 
     totals_ns: Counter[Rest] = field(default_factory=Counter)
 
-    def spend(self, rest: Rest, duration_ns: int) -> None:
-        """Book time in which the node did nothing."""
-        self.totals_ns[rest] += duration_ns
-
 
 def cause_of_rest(hooks: Iterable[Hook]) -> Rest:
     """What holds up the node: a receiver, else a missing input, else only its clock.

@@ -83,6 +83,7 @@ class Engine:
         self._is_passing = False
         self.executing: Hook | None = None
         self.accounts = Accounts()
+        self._spent_ns = self.accounts.totals_ns
         self.trace = Trace()
         self._cause = REGISTERING
         self.created_ns = self.since_ns = clock()
@@ -275,7 +276,7 @@ class Engine:
         """Book the time since the last event; returns the time now."""
         now_ns = self._clock()
         if self.executing is None:  # else it is the hook's, and booked when that ends
-            self.accounts.spend(self._cause, now_ns - self.since_ns)
+            self._spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns
         return now_ns
 
@@ -316,7 +317,7 @@ class Engine:
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._life.tick_start_ns, start_ns)
-        self.accounts.spend(SCHEDULING, start_ns - self.since_ns)
+        self._spent_ns[SCHEDULING] += start_ns - self.since_ns
         self.since_ns = start_ns
         self.executing = hook
         try:

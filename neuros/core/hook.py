@@ -12,6 +12,8 @@ from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec, OutputSpec
 from neuros.project.model import Port
 
+_SEVERAL = (tuple, list)  # as a union it would be made anew at each use
+
 
 class Output:
     """One output of the node and the connections that it feeds.
@@ -48,6 +50,7 @@ class Hook:
         "_is_due",
         "_is_enabled",
         "_lacking",
+        "_outlets",
         "_results",
         "blocked",
         "busy_ns",
@@ -72,6 +75,7 @@ class Hook:
         self.name = spec.name
         self.slots = tuple(slots)
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
+        self._outlets = tuple(outlet for output in self.outputs for outlet in output.outlets)
         self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
         self.blocked = 0
         self.turn = 0
@@ -88,7 +92,7 @@ class Hook:
         self.period_ns = 0 if spec.period_s is None else max(1, round(spec.period_s * 1e9))
         self.ticks = TickBook(self.period_ns) if self.period_ns else None
         self.loops = tuple(self._loops())
-        for outlet in self.outlets():
+        for outlet in self._outlets:
             outlet.hooks.append(self)
             self.blocked += outlet.is_blocked
 
@@ -125,7 +129,7 @@ class Hook:
 
     def outlets(self) -> list[Outlet]:
         """Every connection that the hook may send on."""
-        return [outlet for output in self.outputs for outlet in output.outlets]
+        return list(self._outlets)
 
     def is_ready(self) -> bool:
         """Whether it may start now: input, output and timer condition, and the node's phase."""
@@ -135,7 +139,13 @@ class Hook:
 
     def can_send(self) -> bool:
         """Whether none of its outlets is blocked, but for packets that its own start would take."""
-        return not self.blocked or len(self._freed_outlets()) == self.blocked
+        if not self.blocked:
+            return True
+        return bool(self.loops) and len(self._freed_outlets()) == self.blocked
+
+    def awaited_slot(self) -> InputSlot | None:
+        """The first of its required inputs that has no packet, if that is all it waits for."""
+        return self.missing_slot() if self._lacking and self._is_enabled and self._is_due else None
 
     def missing_slot(self) -> InputSlot | None:
         """The first of its required inputs that has no packet."""
@@ -152,8 +162,8 @@ class Hook:
 
     def blocking_outlets(self) -> list[Outlet]:
         """The outlets that hold it up."""
-        freed = self._freed_outlets()
-        return [outlet for outlet in self.outlets() if outlet.is_blocked and outlet not in freed]
+        freed = self._freed_outlets() if self.loops else ()
+        return [outlet for outlet in self._outlets if outlet.is_blocked and outlet not in freed]
 
     def has_reliable_packet(self) -> bool:
         """Whether a packet that must not be lost waits for it."""
@@ -186,7 +196,7 @@ class Hook:
             return ()
         if result is None:
             packets: Sequence[Any] = (None,) * len(results)
-        elif isinstance(result, tuple | list):
+        elif isinstance(result, _SEVERAL):
             packets = result
         else:
             packets = (result,)
@@ -227,7 +237,7 @@ class Hook:
         """Connections from this hook to itself."""
         return [
             (outlet, slot, mailbox)
-            for outlet in self.outlets()
+            for outlet in self._outlets
             for slot in self.slots
             for mailbox in slot.mailboxes
             if mailbox.inlet.key is outlet.connection

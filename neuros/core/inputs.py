@@ -270,8 +270,9 @@ class InputSlot:
             mailbox = self.chosen()
             if mailbox is None:
                 return None
-            touched.append(mailbox.inlet)
-            return mailbox.inlet.take(mailbox)
+            inlet = mailbox.inlet
+            touched.append(inlet)
+            return inlet.take(mailbox)
         taken = []
         for mailbox in self.mailboxes:
             if mailbox.packets:

@@ -76,8 +76,8 @@ class Schedule:
         """As :func:`neuros.core.accounting.cause_of_rest`, without a look at all that only wait."""
         if not self.candidates:
             for hook in self.order:
-                slot = hook.missing_slot()
-                if slot is not None and hook.is_enabled and hook.is_due:
+                slot = hook.awaited_slot()
+                if slot is not None:
                     return slot.rest
             return IDLE
         for hook in self.candidates:

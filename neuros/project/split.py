@@ -133,6 +133,20 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
     )
 
 
+def node_files_from_json(contents: Iterable[Mapping[str, Any]]) -> list[NodeFile]:
+    """Those of nodes that share a process.
+
+    A connection between two of them is one object for both, so that whoever looks it up finds it
+    without a comparison of all its fields.
+    """
+    files = [node_file_from_json(content) for content in contents]
+    known: dict[Connection, Connection] = {}
+    return [
+        replace(file, connections=tuple(known.setdefault(c, c) for c in file.connections))
+        for file in files
+    ]
+
+
 def project_to_json(project: Project) -> dict[str, Any]:
     """The expanded project: every node in place, every path absolute, every value a text.
 

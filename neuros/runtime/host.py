@@ -21,6 +21,7 @@ class NodeHost:
     Attributes:
         engine: the node's, ``None`` until its plugin is loaded.
         is_ending: whether no further hook starts.
+        make_packet: a new message with default values, for a type in ROS notation.
         waiting_threads: those that wait until packets that they have offered are sent.
     """
 
@@ -35,16 +36,12 @@ class NodeHost:
         self.engine: Engine | None = None
         self.is_ending = False
         self.waiting_threads: set[threading.Thread] = set()
-        self._transport = transport
+        self.make_packet = transport.make_packet
         self._loop = loop
         self._time = time
         self._failures = failures
         self._ask_for_end = ask_for_end
         self._closers: list[Callable[[], None]] = []
-
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return self._transport.make_packet(type_name)
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""

@@ -194,10 +194,13 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
-        if connection in self._kept_on_arrival and self._keeper is not None:
+        if self._kept_on_arrival and connection in self._kept_on_arrival:
+            assert self._keeper is not None
             self._keeper.keep(Way.RECEIVED, str(connection), packet)
+        engine = self.engine
+        assert engine is not None
         try:
-            self._loaded.on_packet(connection, packet)
+            engine.on_packet(connection, packet)
         except NeurosError as error:
             self.failures.report(error)
 
@@ -211,8 +214,10 @@ class NodeRuntime:
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
+        engine = self.engine
+        assert engine is not None
         try:
-            self._loaded.on_acknowledgement(connection, position)
+            engine.on_acknowledgement(connection, position)
         except NeurosError as error:
             self.failures.report(error)
 

@@ -104,16 +104,22 @@ class Stage:
         current = self._current
         if current is scope:
             return
-        self._take_modules(current)
+        modules = sys.modules
+        if len(modules) != self._known_modules:
+            self._find_modules(current)
+        for name in current.modules:
+            modules.pop(name, None)
         self._current = scope
         self._set_variables(current, scope)
-        _exchange_environ(scope.environ)
+        os.environ._data = scope.environ  # type: ignore[attr-defined]  # who holds a reference, too
         current.path, sys.path = sys.path, scope.path
         if scope.modules:
-            sys.modules.update(scope.modules)
+            modules.update(scope.modules)
         for owned in self._owned.values():
-            owned.show(is_visible=scope is owned.owner or scope is self._process)
-        self._known_modules = len(sys.modules)
+            is_visible = scope is owned.owner or scope is self._process
+            if is_visible is not owned.is_visible:
+                owned.show(is_visible=is_visible)
+        self._known_modules = len(modules)
         if scope.log_fd is not None:
             os.dup2(scope.log_fd, 1)
             os.dup2(scope.log_fd, 2)
@@ -131,15 +137,12 @@ class Stage:
         self._process.project = str(project) + os.sep
         self._known_modules = -1
 
-    def _take_modules(self, scope: Scope) -> None:
-        """Take the modules that are private to a node out of the process."""
-        if len(sys.modules) != self._known_modules:
-            for name, module in tuple(sys.modules.items()):
-                if scope.hides(module):
-                    scope.modules[name] = module
-            self._note_owned(scope)
-        for name in scope.modules:
-            sys.modules.pop(name, None)
+    def _find_modules(self, scope: Scope) -> None:
+        """Note which modules of the process are private to a node."""
+        for name, module in tuple(sys.modules.items()):
+            if scope.hides(module):
+                scope.modules[name] = module
+        self._note_owned(scope)
 
     def _set_variables(self, old: Scope, new: Scope) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""
@@ -188,9 +191,11 @@ class _Owned:
 
     def __init__(self, name: str, module: ModuleType, owner: Scope) -> None:
         self.name, self.module, self.owner = name, module, owner
+        self.is_visible = True
 
     def show(self, *, is_visible: bool) -> None:
         """Let it be imported now, or not."""
+        self.is_visible = is_visible
         if is_visible:
             sys.modules[self.name] = self.module
             if self in sys.meta_path:
@@ -221,8 +226,3 @@ def _open_log(path: Path) -> int:
 
 def _environ_data() -> dict[Any, Any]:
     return os.environ._data  # type: ignore[attr-defined,no-any-return]
-
-
-def _exchange_environ(data: dict[Any, Any]) -> None:
-    """Let ``os.environ`` itself show these variables, for those who hold a reference to it, too."""
-    os.environ._data = data  # type: ignore[attr-defined]

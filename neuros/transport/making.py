@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from copy import copy
-from functools import cache, partial
+from functools import cache
 from typing import Any, TypeAlias
 
 from neuros.transport.messages import message_class
@@ -51,6 +50,9 @@ def _again(value: Any) -> Make | None:
     if hasattr(value, "get_fields_and_field_types"):
         kind: Any = type(value)
         return _maker(kind)
-    if isinstance(value, array) or hasattr(value, "dtype"):
-        return partial(copy, value)
+    if isinstance(value, array):
+        return value.__copy__
+    if hasattr(value, "dtype"):
+        copy: Make = value.copy
+        return copy
     return list if value == [] else None

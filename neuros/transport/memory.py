@@ -95,6 +95,7 @@ class MemoryTransport:
         elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
         digested = [c for c in elsewhere if digest is not None and digests_of(c)]
         self.digests = {c: array("Q") for c in digested}
+        self.make_packet = outside.make_packet
         hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
@@ -145,10 +146,6 @@ class MemoryTransport:
             if c.source_node not in joined or c.destination_node not in joined
         ]
 
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return self._outside.make_packet(type_name)
-
     def close(self) -> None:
         """Send and receive nothing any more."""
         self._is_open = False
@@ -189,12 +186,13 @@ class _Channel:
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 
-    __slots__ = ("_connection", "_digests", "_hub", "_packets")
+    __slots__ = ("_connection", "_digests", "_hub", "_packets", "_window")
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
         self._connection = connection
-        self._packets: deque[Any] = deque(maxlen=connection.window)
+        self._window = connection.window
+        self._packets: deque[Any] = deque(maxlen=self._window)
         self._digests: deque[int] = deque(maxlen=connection.window)
 
     def announce(self, digest: int) -> None:
@@ -202,12 +200,13 @@ class _Channel:
         self._digests.append(digest)
 
     def send(self, packet: Any) -> None:
-        if len(self._packets) < self._connection.window:
+        if len(self._packets) < self._window:
             self._hub.post(self._deliver)  # else an event is on its way for the one that is lost
         self._packets.append(packet)
 
     def _deliver(self) -> None:
         if self._digests:
             self._hub.received[self._connection].append(self._digests.popleft())
-        inbox = self._hub.inboxes[self._connection.destination_node]
-        inbox.on_packet(self._connection, self._packets.popleft())
+        connection = self._connection
+        inbox = self._hub.inboxes[connection.destination_node]
+        inbox.on_packet(connection, self._packets.popleft())

@@ -29,27 +29,29 @@ from neuros.transport.messages import message_class
 
 Check: TypeAlias = Callable[[Any], bool]
 
+_SEVERAL = (tuple, list)  # as a union it would be made anew at each use
+
 
 def _count(box: Sequence[Any], place: int) -> int:
     """How many references there are to an item, those that counting needs included."""
     return sys.getrefcount(getitem(box, place))
 
 
-def _counts(get: Callable[[Any], tuple[Any, ...]], message: Any) -> tuple[int, ...]:
-    """The same for parts of a message."""
-    return tuple(map(sys.getrefcount, get(message)))
+def _counts(found: tuple[Any, ...], number: int) -> tuple[int, ...]:
+    """The same for the first ones of the parts of a message, which have been got from it."""
+    return tuple(map(sys.getrefcount, found[:number]))
 
 
 def _measured() -> tuple[int, int]:
     """What both say of an object with one holder; 0, which never occurs, if they do not count."""
-    box, get = [[0], [0]], attrgetter("free", "held")
-    message = SimpleNamespace(free=[0], held=[0])
+    box, get = [[0], [0]], attrgetter("free", "held", "other")
+    message = SimpleNamespace(free=[0], held=[0], other=[0])
     keeper = [box[1], message.held]
     has_free_threads = not getattr(sys, "_is_gil_enabled", lambda: True)()
-    in_box, in_message = _count(box, 0), _counts(get, message)[0]
-    is_counting = _count(box, 1) == in_box + 1 and _counts(get, message)[1] == in_message + 1
+    in_box, in_message = _count(box, 0), _counts(get(message), 2)[0]
+    is_counting = _count(box, 1) == in_box + 1 and _counts(get(message), 2)[1] == in_message + 1
     del keeper[:]
-    is_exact = is_counting and _counts(get, message) == (in_message, in_message)
+    is_exact = is_counting and _counts(get(message), 2) == (in_message, in_message)
     return (in_box, in_message) if is_exact and not has_free_threads else (0, 0)
 
 
@@ -63,7 +65,7 @@ def unheld(box: Sequence[Any]) -> list[Any]:
     """
     if _count(box, 0) != _ALONE_IN_BOX:
         return []
-    if not isinstance(box[0], tuple | list):
+    if not isinstance(box[0], _SEVERAL):
         return [box[0]]
     result = box[0]
     return [
@@ -91,30 +93,37 @@ def _check_of(kind: type) -> Check | None:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of a message: where it is, and what it must be (``None``: anything of its class)."""
+    """A part of a message: where it is, and what it must be (``None``: anything of its class).
+
+    A ``switch`` is no field but the message's own, and must have this one value.
+    """
 
     path: str
     kind: type
     is_changeable: bool
-    check: Check | None
+    check: Check | None = None
+    switch: object = None
 
 
 def _message(kind: Any) -> Check:
-    parts = tuple(_parts(kind, ""))
-    changeable = _Getter([part.path for part in parts if part.is_changeable])
-    values = _Getter([part.path for part in parts])
+    # Changeable ones first, switches last: so each sort is a slice of what is got at once.
+    parts = sorted(_parts(kind, ""), key=lambda p: (p.switch is not None, not p.is_changeable))
+    get = _getter([part.path for part in parts])
     kinds = tuple(part.kind for part in parts)
+    changeable = sum(part.is_changeable for part in parts)
+    alone = (_ALONE_IN_MESSAGE,) * changeable
+    positions = tuple(part.switch for part in parts if part.switch is not None)
+    fields = len(parts) - len(positions)
     checks = tuple((place, part.check) for place, part in enumerate(parts) if part.check)
-    alone = (_ALONE_IN_MESSAGE,) * len(changeable.paths)
 
     def is_unshared(message: Any) -> bool:
         try:
-            if _counts(changeable.get, message) != alone:
-                return False
-            found = values.get(message)
+            found = get(message)
         except AttributeError:  # a part is of another class
             return False
-        if tuple(map(type, found)) != kinds:
+        if _counts(found, changeable) != alone:
+            return False
+        if tuple(map(type, found)) != kinds or found[fields:] != positions:
             return False
         for place, check in checks:  # noqa: SIM110, a generator takes thrice as long
             if not check(found[place]):
@@ -134,26 +143,21 @@ def _parts(kind: Any, prefix: str) -> Iterator[_Part]:
         path, value_kind = prefix + slot, type(value)
         type_name = types.get(slot[1:])
         if hasattr(value, "get_fields_and_field_types"):
-            yield _Part(path, value_kind, True, None)
+            yield _Part(path, value_kind, is_changeable=True)
             yield from _parts(value_kind, f"{path}.")
         elif type_name is None:  # a switch of the message's own
-            yield _Part(path, value_kind, False, _is(value))
+            yield _Part(path, value_kind, is_changeable=False, switch=value)
         else:
             is_changeable = not isinstance(value, float | int | str)
             yield _Part(path, value_kind, is_changeable, _field(type_name, value))
 
 
-class _Getter:
+def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
     """Gets many parts at once, which is what makes this cheaper than a copy."""
-
-    def __init__(self, paths: Sequence[str]) -> None:
-        self.paths = paths
-        # With one path attrgetter returns the value, not a tuple with it.
-        self.get: Callable[[Any], tuple[Any, ...]] = (
-            attrgetter(*paths)
-            if len(paths) > 1
-            else lambda message: tuple(attrgetter(path)(message) for path in paths)
-        )
+    if len(paths) > 1:
+        return attrgetter(*paths)
+    # With one path attrgetter returns the value, not a tuple with it.
+    return lambda message: tuple(attrgetter(path)(message) for path in paths)
 
 
 def _field(type_name: str, default: Any) -> Check | None:
@@ -173,8 +177,7 @@ def _single(type_name: str) -> Check | None:
     if type_name in ("double", "boolean"):
         return None
     if type_name in INTEGERS:
-        allowed = INTEGERS[type_name]
-        return lambda value: value in allowed
+        return INTEGERS[type_name].__contains__
     if type_name == "string":
         return is_plain_text
     package, _, name = type_name.partition("/")
@@ -223,7 +226,3 @@ def _numbers_in_array(default: Any) -> Check:
         )
 
     return is_unshared
-
-
-def _is(default: Any) -> Check:
-    return lambda value: value is default

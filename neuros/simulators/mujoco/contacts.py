@@ -21,8 +21,10 @@ from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
-from neuros.simulators.mujoco.places import Vector
+Vector: TypeAlias = "npt.NDArray[np.float64]"
+"""Shape (3,)."""
 
 _Fill: TypeAlias = Callable[[Any, Any, int], None]
 

@@ -7,10 +7,9 @@ from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-Vector: TypeAlias = "npt.NDArray[np.float64]"
-"""Shape (3,), or (4,) for a quaternion, w first."""
+Vector: TypeAlias = "list[float]"
+"""3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
 
 
 class Place:
@@ -20,26 +19,27 @@ class Place:
         self._model, self._is_site, self.index = model, what == "site", index
         objects = mujoco.mjtObj
         self.object = (objects.mjOBJ_SITE if self._is_site else objects.mjOBJ_XBODY).value
-        self._spatial = np.zeros(6)
+        self._spatial, self._turned = np.zeros(6), np.zeros(4)
+        if self._is_site:
+            self._body = int(model.site_bodyid[index])
+            self._in_body = model.site_quat[index]
 
     def position(self, data: Any) -> Vector:
         """In the world, metres."""
         positions = data.site_xpos if self._is_site else data.xpos
-        return np.array(positions[self.index])
+        return _plain(positions[self.index])
 
     def orientation(self, data: Any) -> Vector:
         """In the world, a unit quaternion."""
         if not self._is_site:
-            return np.array(data.xquat[self.index])
-        turned = np.zeros(4)
-        body = self._model.site_bodyid[self.index]
-        mujoco.mju_mulQuat(turned, data.xquat[body], self._model.site_quat[self.index])
-        return turned
+            return _plain(data.xquat[self.index])
+        mujoco.mju_mulQuat(self._turned, data.xquat[self._body], self._in_body)
+        return _plain(self._turned)
 
     def angular_velocity(self, data: Any) -> Vector:
         """In the frame of the place, rad/s: a gyroscope."""
         mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
-        return np.array(self._spatial[:3])
+        return _plain(self._spatial[:3])
 
     def acceleration(self, data: Any) -> Vector:
         """In the frame of the place, m/s^2, gravity included: an accelerometer."""
@@ -47,7 +47,12 @@ class Place:
         if not getattr(data, "flg_rnepost", False):
             mujoco.mj_rnePostConstraint(self._model, data)
         mujoco.mj_objectAcceleration(self._model, data, self.object, self.index, self._spatial, 1)
-        return np.array(self._spatial[3:])
+        return _plain(self._spatial[3:])
+
+
+def _plain(values: Any) -> Vector:
+    numbers: Vector = values.tolist()
+    return numbers
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class OwnSensor:
     variance: float
 
     def read(self, data: Any) -> Vector:
-        return np.array(data.sensordata[self.start : self.end])
+        return _plain(data.sensordata[self.start : self.end])
 
 
 def own_sensor(model: Any, sensor_type: Any, place: Place) -> OwnSensor | None:

@@ -65,13 +65,18 @@ def set_time(time: Any, time_ns: int) -> None:
     time.sec, time.nanosec = divmod(time_ns, 1_000_000_000)
 
 
+def _set_header(header: Any, time_ns: int, frame: str) -> None:
+    set_time(header.stamp, time_ns)
+    header.frame_id = frame
+
+
 def _set_vector(vector: Any, values: Vector) -> None:
-    vector.x, vector.y, vector.z = values.tolist()
+    vector.x, vector.y, vector.z = values
 
 
 def _set_quaternion(quaternion: Any, values: Vector) -> None:
     """ROS writes the real part last, MuJoCo first."""
-    quaternion.w, quaternion.x, quaternion.y, quaternion.z = values.tolist()
+    quaternion.w, quaternion.x, quaternion.y, quaternion.z = values
 
 
 def _bind_imu(binding: Binding) -> Fill | None:
@@ -92,8 +97,7 @@ def _bind_imu(binding: Binding) -> Fill | None:
     orientation = own_sensor(model, mujoco.mjtSensor.mjSENS_FRAMEQUAT, place)
 
     def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        set_time(packet.header.stamp, time_ns)
-        packet.header.frame_id = frame
+        _set_header(packet.header, time_ns, frame)
         velocity = gyro.read(data) if gyro else place.angular_velocity(data)
         acceleration = accelerometer.read(data) if accelerometer else place.acceleration(data)
         attitude = orientation.read(data) if orientation else place.orientation(data)
@@ -120,8 +124,7 @@ def _bind_pose(binding: Binding) -> Fill | None:
 
     def fill(packet: Packet, data: Any, time_ns: int) -> None:
         if stamped:
-            set_time(packet.header.stamp, time_ns)
-            packet.header.frame_id = _WORLD_FRAME
+            _set_header(packet.header, time_ns, _WORLD_FRAME)
         pose = packet.pose if stamped else packet
         _set_vector(pose.position, place.position(data))
         _set_quaternion(pose.orientation, place.orientation(data))
@@ -177,8 +180,7 @@ def _bind_camera(binding: Binding) -> Fill | None:
     cameras = binding.cameras
 
     def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        set_time(packet.header.stamp, time_ns)
-        packet.header.frame_id = frame
+        _set_header(packet.header, time_ns, frame)
         packet.width, packet.height, packet.step = width, height, 3 * width
         packet.encoding = "rgb8"
         # rclpy checks lists and bytes element by element; an array is taken as it is.

@@ -19,15 +19,15 @@ class Timebase:
 
     Whole nanoseconds are taken as written (``0.002`` is 1/500); a rounded ``0.0041666667`` is
     taken as the 1/240 that it stands for.
+
+    Attributes:
+        timestep_s: the float next to that.
     """
 
     def __init__(self, timestep_s: float) -> None:
         self._step = _as_fraction(timestep_s)
         self._numerator, self._denominator = self._step.as_integer_ratio()
-
-    @property
-    def timestep_s(self) -> float:
-        return float(self._step)
+        self.timestep_s = float(self._step)
 
     def seconds(self, steps: int) -> float:
         """The time after ``steps``, correctly rounded."""
@@ -64,12 +64,12 @@ class Schedule:
     def next_firing(self, step: int) -> int | None:
         """The first step after ``step`` at which any sensor fires; ``None`` without sensors."""
         return min(
-            (step - step % period + period for period in self._periods.values()), default=None
+            [step - step % period + period for period in self._periods.values()], default=None
         )
 
     def due(self, step: int) -> tuple[str, ...]:
         """The sensors that fire at ``step``, in the order of their declaration."""
-        return tuple(name for name, period in self._periods.items() if step and step % period == 0)
+        return tuple([n for n, period in self._periods.items() if step and step % period == 0])
 
     def find_crossing(
         self, unread: Collection[str], step: int, target: int
