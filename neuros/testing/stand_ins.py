@@ -121,6 +121,8 @@ class RosNodeStandIn:
 class Topics:
     """External topics in a test: what the node publishes is kept (``Outside`` of a transport)."""
 
+    heard: tuple[Connection, ...] = ()
+
     def __init__(self) -> None:
         self.inbox: Inbox | None = None
         self.published: dict[str, list[Any]] = {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -19,6 +19,10 @@ from neuros.transport.ownership import is_unshared_inside, unheld
 
 class Outside(Protocol):
     """What lies beyond the process: external topics, and listeners to the data topics."""
+
+    @property
+    def heard(self) -> Collection[Connection]:
+        """The connections whose packets somebody listens to there."""
 
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...
@@ -120,12 +124,14 @@ class MemoryTransport:
             return
         if self.digests:
             self._note_digest([c for c in connections if c in self.digests], packet)
-        *others, last = connections
-        for connection in others:
-            self._channels[connection].send(self._hub.copy(packet))
+        last = connections[-1]
+        if len(connections) > 1:
+            for connection in connections[:-1]:
+                self._channels[connection].send(self._hub.copy(packet))
         own = packet if self._is_unshared(packet) else self._hub.copy(packet)
         self._channels[last].send(own)
-        self._outside.show(connections, packet)
+        if self._outside.heard:
+            self._outside.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""

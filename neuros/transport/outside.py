@@ -23,7 +23,11 @@ _LOOK_S = 0.25
 
 
 class RosOutside:
-    """External topics and listeners of one node whose connections stay within the process."""
+    """External topics and listeners of one node whose connections stay within the process.
+
+    Attributes:
+        heard: the connections that somebody listens to; looked up four times per second.
+    """
 
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
         self._external = ExternalTopics(file, ros_node, loop)
@@ -31,7 +35,7 @@ class RosOutside:
         self._ros_node = ros_node
         self._loop = loop
         self._publishers: dict[Connection, Publisher] = {}
-        self._heard: frozenset[Connection] = frozenset()
+        self.heard: frozenset[Connection] = frozenset()
 
     def open(self, inbox: Inbox) -> None:
         """Create the endpoints."""
@@ -48,10 +52,9 @@ class RosOutside:
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
         """Publish a packet for those who listen."""
-        if self._heard:
-            for connection in connections:
-                if connection in self._heard:
-                    self._publishers[connection].publish(packet)
+        for connection in connections:
+            if connection in self.heard:
+                self._publishers[connection].publish(packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
@@ -63,11 +66,11 @@ class RosOutside:
 
     def close(self) -> None:
         """Publish and receive nothing any more."""
-        self._heard = frozenset()
+        self.heard = frozenset()
         self._external.close()
 
     def _look(self) -> None:
-        self._heard = frozenset(
+        self.heard = frozenset(
             connection
             for connection, publisher in self._publishers.items()
             if publisher.get_subscription_count()

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -17,6 +18,7 @@ from std_msgs.msg import Int32
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import choose_domain
+from neuros.transport import ros_loop
 from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
@@ -249,3 +251,34 @@ def test_a_task_that_fails_is_an_error_and_does_not_end_the_process(
     with pytest.raises(ValueError, match="in a task"):
         loop.run()
     node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("event_ms", "has_ticks", "turn_ms"),
+    [(0.1, False, 1.1), (2.0, False, 12.0), (30.0, False, 30.0), (2.0, True, 2.0)],
+    ids=["short events", "long events", "an event that is longer", "beside ticks"],
+)
+def test_ros_waits_a_millisecond_or_as_long_as_a_few_of_the_long_events(
+    event_ms: float, has_ticks: bool, turn_ms: float, loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_ns = [0]
+    clock = SimpleNamespace(monotonic_ns=lambda: clock_ns[0], monotonic=time.monotonic)
+    monkeypatch.setattr(ros_loop, "time", clock)
+    if has_ticks:
+        loop.loop.add_timer(lambda: None, lambda: None)
+    waited_ns: list[int] = []
+
+    def event() -> None:
+        clock_ns[0] += round(event_ms * 1e6)
+        if waited_ns:
+            loop.loop.stop()
+        else:
+            loop.loop.post(event)
+
+    def begin() -> None:
+        loop.loop.post_from_thread(lambda: waited_ns.append(clock_ns[0]))
+        event()
+
+    loop.loop.post(begin)
+    loop.run()
+    assert waited_ns == [round(turn_ms * 1e6)]

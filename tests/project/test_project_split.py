@@ -21,6 +21,7 @@ from neuros.project.split import (
     merge,
     node_file_from_json,
     node_file_to_json,
+    node_files_from_json,
     project_to_json,
     split,
 )
@@ -159,6 +160,16 @@ def test_a_node_file_survives_json_and_has_the_documented_form(project: Project)
         Draft202012Validator(form).validate(content)
         Draft202012Validator(schema("node")).validate(content["node"])
         assert node_file_from_json(content) == part
+
+
+@settings(max_examples=100)
+@given(projects())
+def test_nodes_that_share_a_process_share_their_connections(project: Project) -> None:
+    parts = split(project, folders_for)
+    files = node_files_from_json(map(node_file_to_json, parts))
+    assert files == list(parts)
+    ends = [connection for file in files for connection in file.connections]
+    assert len({id(connection) for connection in ends}) == len(project.connections)
 
 
 @settings(max_examples=100)

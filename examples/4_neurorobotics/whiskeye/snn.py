@@ -20,7 +20,7 @@ class GyroIntegrator:
     """
 
     def __init__(self, network, bias_rad_s=0.0):
-        self._network = network
+        self.network = network
         self._bias_rad_s = bias_rad_s
         self._quantum_ns = round(network.quantum_s * 1e9)
         self._done_ns = 0  # the network was settled for the start of simulated time
@@ -35,9 +35,9 @@ class GyroIntegrator:
         quanta = (stamp_ns - self._done_ns) // self._quantum_ns  # the rest is for the next packet
         if quanta > 0:
             step_ns = quanta * self._quantum_ns
-            self._network.step(rate_rad_s, step_ns * 1e-9)
+            self.network.step(rate_rad_s, step_ns * 1e-9)
             self._done_ns += step_ns
-        return math.remainder(self._network.heading_rad + self._bridged_rad, math.tau)
+        return math.remainder(self.network.heading_rad + self._bridged_rad, math.tau)
 
 
 @neuros_initialise()
