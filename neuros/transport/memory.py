@@ -79,6 +79,9 @@ class MemoryTransport:
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
     serialised for one, which is not done here otherwise. ``digests_of`` tells of which connections
     they are kept.
+
+    Attributes:
+        make_packet: a new message with default values, for a type in ROS notation.
     """
 
     def __init__(
