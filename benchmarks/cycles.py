@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.launching import launch
 
 BY_HAND = Path(__file__).resolve().parent / "by_hand"
-NEUROS, HAND, LOOP = "neuros", "by hand", "one loop"
+NEUROS, HAND, APART, LOOP = "neuros", "by hand", "by hand, apart", "one loop"
 _NEIGHBOURS = 12
 _TAIL = 10
 _MINIMUM_SLICES = 20
@@ -26,9 +26,9 @@ def speeds(project: Path, settings: dict[str, Any]) -> dict[str, float]:
     """How fast the nodes are in one process, and hooks called by hand, as shares of one loop.
 
     Returns:
-        ``neuros`` and ``by hand``: share of the speed of ``floor.py``'s loop, and ``around hooks``:
-        that of NeuROS in the speed of the same hooks called by hand. By the processor time of the
-        thread that does all.
+        ``neuros``, ``by hand`` and ``by hand, apart`` (each hook in the surroundings of its node):
+        share of the speed of ``floor.py``'s loop, and ``around hooks``: that of NeuROS in the speed
+        of the same hooks called by hand. By the processor time of the thread that does all.
 
     Raises:
         RuntimeError: if the run fails, or is too short.
@@ -47,6 +47,7 @@ def speeds(project: Path, settings: dict[str, Any]) -> dict[str, float]:
     return {
         NEUROS: costs[LOOP] / costs[NEUROS],
         HAND: costs[LOOP] / costs[HAND],
+        APART: costs[LOOP] / costs[APART],
         "around hooks": costs[HAND] / costs[NEUROS],
     }
 

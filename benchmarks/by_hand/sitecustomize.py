@@ -8,11 +8,13 @@ few cycles; a cycle is 20 ms simulated time. In random order, a slice is driven
 ``by hand``
     by calls of the very hooks of the nodes, one after the other, with the messages that they
     return: no engine, no transport, no change of surroundings;
+``by hand, apart``
+    the same, but each hook in the surroundings of its node (environment, modules, output);
 ``one loop``
     by ``floor.py`` of the example, with the network and the figure of the run, and a copy of the
     state of its physics: no messages either.
 
-So all three have the same libraries, memory, caches and neighbours on the machine. For each slice
+So all have the same libraries, memory, caches and neighbours on the machine. For each slice
 the process writes a line: the name of the mode, and nanoseconds of processor time per cycle, of the
 thread. Slices in which the figure was redrawn (by the wall clock) are left out.
 
@@ -25,17 +27,19 @@ import os
 import random
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from neuros.hooks import HookKind, HookSpec
 from neuros.runtime import node
+from neuros.runtime.scope import Scope, Stage
 
 CYCLES = 12
 SETTLING_CYCLES = 100
-MODES = ("neuros", "by hand", "one loop")
+MODES = ("neuros", "by hand", "by hand, apart", "one loop")
 
 
 class Cycles:
@@ -45,11 +49,16 @@ class Cycles:
         self._path = path
         self._hooks: dict[str, Callable[..., Any]] = {}
         self._handles: dict[str, Any] = {}
+        self._enter: dict[str, Callable[[], None]] = {}
         self._random = random.Random(1)
         self._modes: list[str] = []
         self._loop: Any = None
         self._left = SETTLING_CYCLES
         self._begun_ns = self._redraws = 0
+
+    def add_scope(self, node: str, enter: Callable[[], None]) -> None:
+        """Take note of how to enter the surroundings of a node."""
+        self._enter[node] = enter
 
     def add(self, node: str, specs: Sequence[HookSpec]) -> list[HookSpec]:
         """Take note of the hooks of a node; the robot's own counts the cycles from now on."""
@@ -76,12 +85,18 @@ class Cycles:
     def _count(self) -> None:
         if self._left == 0:
             self._end_slice("neuros")
+            ways = {
+                "by hand": self._by_hand,
+                "by hand, apart": self._by_hand_apart,
+                "one loop": self._one_cycle,
+            }
             while (mode := self._next_mode()) != "neuros":
                 self._begin_slice()
-                one_cycle = self._by_hand if mode == "by hand" else self._loop.cycle
+                one_cycle = ways[mode]
                 for _ in range(CYCLES):
                     one_cycle()
                 self._end_slice(mode)
+                self._enter["robot"]()
             self._left = CYCLES
             self._begin_slice()
         self._left -= 1
@@ -113,6 +128,20 @@ class Cycles:
         hooks["keep_truth"](visualiser, pose)
         hooks["keep_estimate"](visualiser, hooks["integrate"](self._handles["snn"], imu))
 
+    def _by_hand_apart(self) -> None:
+        hooks, enter, visualiser = self._hooks, self._enter, self._handles["visualiser"]
+        enter["robot"]()
+        imu, pose = hooks["simulate"](self._handles["robot"])
+        enter["visualiser"]()
+        hooks["keep_truth"](visualiser, pose)
+        enter["snn"]()
+        estimate = hooks["integrate"](self._handles["snn"], imu)
+        enter["visualiser"]()
+        hooks["keep_estimate"](visualiser, estimate)
+
+    def _one_cycle(self) -> None:
+        self._loop.cycle()
+
     def _one_loop(self) -> Any:
         import mujoco
         from floor import OneLoop  # of the example: its folder is on the path in this hook
@@ -130,16 +159,21 @@ def random_order(numbers: random.Random) -> list[str]:
 
 
 def install() -> None:
-    """Have the hooks of every plugin that this process loads noted."""
-    cycles: list[Cycles] = []
-    load = node.load_plugin
+    """Have the surroundings and hooks of every node of this process noted."""
+    cycles = Cycles(Path(os.environ["NEUROS_CYCLES"]))
+    load, make_scope = node.load_plugin, Stage.scope
 
-    def noting(plugin: Path, name: str) -> Sequence[HookSpec]:
-        if not cycles:
-            cycles.append(Cycles(Path(os.environ["NEUROS_CYCLES"])))
-        return cycles[0].add(name, load(plugin, name))
+    def noting_hooks(plugin: Path, name: str) -> Sequence[HookSpec]:
+        return cycles.add(name, load(plugin, name))
 
-    node.load_plugin = noting
+    def noting_scope(self: Stage, environment: Mapping[str, str], *rest: Any) -> Scope:
+        scope = make_scope(self, environment, *rest)
+        name = Path(environment["NEUROS_RUN_DIR"]).name
+        cycles.add_scope(name, partial(self.enter, scope))
+        return scope
+
+    node.load_plugin = noting_hooks
+    Stage.scope = noting_scope  # type: ignore[method-assign]
 
 
 if "NEUROS_CYCLES" in os.environ and "neuros.cli.main" not in sys.modules:

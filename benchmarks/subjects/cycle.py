@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 
-from benchmarks.cycles import HAND, NEUROS, speeds
+from benchmarks.cycles import APART, HAND, NEUROS, speeds
 from benchmarks.measure import Case, Figure, Group, Subject
 from benchmarks.subjects.whiskeye import WHISKEYE
 
@@ -17,6 +17,7 @@ SIMULATED_S = 60.0
 ROWS = {
     NEUROS: "NeuROS, share of the speed of one loop",
     HAND: "its hooks called by hand, share of the speed of one loop",
+    APART: "by hand, each in its node's surroundings, share of the speed of one loop",
     "around hooks": "NeuROS, share of the speed of its hooks called by hand",
 }
 

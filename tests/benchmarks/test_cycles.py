@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks import cycles
-from benchmarks.cycles import HAND, LOOP, NEUROS, relative_costs, slice_of
+from benchmarks.cycles import APART, HAND, LOOP, NEUROS, relative_costs, slice_of
 from neuros.hooks import HookKind, HookSpec
 
 
@@ -45,7 +45,7 @@ def test_a_run_that_is_too_short_is_an_error() -> None:
 
 
 def test_each_mode_has_its_turn(by_hand: Any) -> None:
-    assert sorted(by_hand.random_order(random.Random(3))) == sorted((NEUROS, HAND, LOOP))
+    assert sorted(by_hand.random_order(random.Random(3))) == sorted((NEUROS, HAND, APART, LOOP))
 
 
 def test_hooks_are_counted_and_otherwise_left_as_they_are(by_hand: Any, tmp_path: Any) -> None:
