@@ -90,7 +90,8 @@ def test_nodes_that_cannot_end_are_killed(bench: Bench) -> None:
         good=RUNS,
     )
     running = bench.start()
-    for name in ("gil", "sleeps", "stopped") if bench.back_end == "process" else ("gil",):
+    everyone = ("gil", "sleeps", "stopped", "good")
+    for name in everyone if bench.back_end == "process" else ("gil",):
         running.wait_for(f"[{name}]: running")
     running.signal(signal.SIGTERM)
     assert_ended(running.finish(GONE_WITHIN_S), 143, "ended by SIGTERM")
