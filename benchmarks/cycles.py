@@ -6,14 +6,12 @@ few cycles of one run are hit alike (``benchmarks/by_hand/sitecustomize.py``).
 
 from __future__ import annotations
 
-import os
 import statistics
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.launching import launch
+from benchmarks.launching import lines_from
 
 BY_HAND = Path(__file__).resolve().parent / "by_hand"
 NEUROS, HAND, APART, LOOP = "neuros", "by hand", "by hand, apart", "one loop"
@@ -33,17 +31,8 @@ def speeds(project: Path, settings: dict[str, Any]) -> dict[str, float]:
     Raises:
         RuntimeError: if the run fails, or is too short.
     """
-    with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
-        lines = Path(folder) / "cycles"
-        path = os.pathsep.join([str(BY_HAND), *filter(None, [os.environ.get("PYTHONPATH")])])
-        launch(
-            project,
-            Path(folder) / "run",
-            "in-process",
-            settings=settings,
-            environment={"PYTHONPATH": path, "NEUROS_CYCLES": str(lines)},
-        )
-        costs = relative_costs([slice_of(line) for line in lines.read_text().splitlines()])
+    lines = lines_from(BY_HAND, "NEUROS_CYCLES", project, "in-process", settings=settings)
+    costs = relative_costs([slice_of(line) for line in lines])
     return {
         NEUROS: costs[LOOP] / costs[NEUROS],
         HAND: costs[LOOP] / costs[HAND],

@@ -6,14 +6,12 @@ seen from run to run. Slices of one run that follow each other differ less, and 
 
 from __future__ import annotations
 
-import os
 import statistics
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.launching import launch
+from benchmarks.launching import lines_from
 
 SWITCH = Path(__file__).resolve().parent / "switch"
 _SETTLING_PAIRS = 1
@@ -37,24 +35,16 @@ def speed_with(
     Raises:
         RuntimeError: if the run fails, or is too short for slices of this length.
     """
-    with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
-        slices = Path(folder) / "slices"
-        path = os.pathsep.join([str(SWITCH), *filter(None, [os.environ.get("PYTHONPATH")])])
-        launch(
-            project,
-            Path(folder) / "run",
-            backend,
-            settings=settings,
-            options=options,
-            environment={
-                "PYTHONPATH": path,
-                "NEUROS_PART": part,
-                "NEUROS_SLICE_NS": str(round(slice_s * 1e9)),
-                "NEUROS_SLICES": str(slices),
-            },
-            codes=(0, _INCOMPLETE_BAG),
-        )
-        lines = slices.read_text().splitlines()
+    lines = lines_from(
+        SWITCH,
+        "NEUROS_SLICES",
+        project,
+        backend,
+        settings=settings,
+        options=options,
+        environment={"NEUROS_PART": part, "NEUROS_SLICE_NS": str(round(slice_s * 1e9))},
+        codes=(0, _INCOMPLETE_BAG),
+    )
     pairs = pairs_of(lines)[_SETTLING_PAIRS:]
     if not pairs:
         raise RuntimeError(f"{project.name}: no two slices of {slice_s} s in the run")

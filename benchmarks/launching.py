@@ -28,6 +28,21 @@ def project_of_plugins(project: Mapping[str, Any]) -> Iterator[Path]:
         yield folder
 
 
+def lines_from(site: Path, variable: str, project: Path, backend: str, **options: Any) -> list[str]:
+    """Run a project to its end; returns the lines that a ``sitecustomize`` has written meanwhile.
+
+    Every Python of the run imports that of the folder ``site``, and finds the name of the file to
+    write to in the environment ``variable``. The options, and what is raised, are those of
+    :func:`launch`.
+    """
+    with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
+        lines = Path(folder) / "lines"
+        path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+        own = {**(options.pop("environment", None) or {}), "PYTHONPATH": path, variable: str(lines)}
+        launch(project, Path(folder) / "run", backend, environment=own, **options)
+        return lines.read_text().splitlines()
+
+
 def launch(
     project: Path,
     run_folder: Path,

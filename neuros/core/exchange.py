@@ -44,8 +44,6 @@ class Exchange:
 
     def take(self, hook: Hook, now_ns: int) -> list[Any]:
         """The arguments of a hook that starts now; their senders are told."""
-        if not hook.slots:
-            return []
         touched: list[Inlet] = []
         arguments = [slot.take(touched) for slot in hook.slots]
         for inlet in touched:

@@ -270,9 +270,8 @@ class InputSlot:
             mailbox = self.chosen()
             if mailbox is None:
                 return None
-            inlet = mailbox.inlet
-            touched.append(inlet)
-            return inlet.take(mailbox)
+            touched.append(mailbox.inlet)
+            return mailbox.inlet.take(mailbox)
         taken = []
         for mailbox in self.mailboxes:
             if mailbox.packets:

@@ -58,15 +58,8 @@ class Schedule:
         hooks that have been executed, below ``first_new`` to the others.
         """
         last, first_new, place = self._turn, self._first_turn, -_MANY - 1
-        found: Hook | None
-        if len(self.candidates) == 1:  # as nearly always, and then it is in the pass
-            (found,) = self.candidates
-            place = found.turn
-            yield found
-            if self.candidates <= {found}:
-                return
         while self.candidates:
-            found = None
+            found: Hook | None = None
             for hook in self.candidates:
                 turn = hook.turn
                 is_in_pass = place < turn <= last and (turn > 0 or turn < first_new)

@@ -111,7 +111,8 @@ class Stage:
             modules.pop(name, None)
         self._current = scope
         self._set_variables(current, scope)
-        os.environ._data = scope.environ  # type: ignore[attr-defined]  # who holds a reference, too
+        # Within os.environ itself, so that whoever holds a reference to it sees these, too.
+        os.environ._data = scope.environ  # type: ignore[attr-defined]
         current.path, sys.path = sys.path, scope.path
         if scope.modules:
             modules.update(scope.modules)

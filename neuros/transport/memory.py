@@ -128,9 +128,8 @@ class MemoryTransport:
         if self.digests:
             self._note_digest([c for c in connections if c in self.digests], packet)
         last = connections[-1]
-        if len(connections) > 1:
-            for connection in connections[:-1]:
-                self._channels[connection].send(self._hub.copy(packet))
+        for connection in connections[:-1]:
+            self._channels[connection].send(self._hub.copy(packet))
         own = packet if self._is_unshared(packet) else self._hub.copy(packet)
         self._channels[last].send(own)
         if self._outside.heard:
