@@ -100,6 +100,7 @@ class Engine:
         """A packet has arrived on a connection, or on the external topic of the input ``key``."""
         self._wake()
         self._exchange.receive(key, packet)
+        del packet  # whatever a hook sends on of it would be shared while this holds it
         self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:

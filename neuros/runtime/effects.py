@@ -70,6 +70,7 @@ class NodeEffects:
             self.has_run = True
             self._on_first_hook()
         box = [self.run(hook.spec, arguments)]
+        del arguments  # else a packet that the hook passes on would count as held
         if hook.spec.kind is HookKind.INITIALISE:
             self._on_initialised()
         if hook.outputs:

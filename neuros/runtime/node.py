@@ -199,8 +199,11 @@ class NodeRuntime:
             self._keeper.keep(Way.RECEIVED, str(connection), packet)
         engine = self.engine
         assert engine is not None
+        # What a hook sends on of a packet (its stamp, say) is shared while anybody holds that.
+        arrived = [packet]
+        del packet
         try:
-            engine.on_packet(connection, packet)
+            engine.on_packet(connection, arrived.pop())
         except NeurosError as error:
             self.failures.report(error)
 
