@@ -98,7 +98,7 @@ def _report(results: Results, is_whole: bool) -> str:
         parts.append(targets_table(results.rows, is_whole=is_whole))
     parts.append(LEGEND)
     parts += ["\n".join(notice_lines(results.notices))] if results.notices else []
-    about = {**results.machine, **results.versions}
+    about = {**results.machine, **results.versions, "commit": results.commits}
     parts.append(", ".join(f"{name} {value}" for name, value in about.items()))
     loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
     parts.append(f"busy with other things before: {loads}")

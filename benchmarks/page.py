@@ -61,11 +61,11 @@ def _by_subject(results: Results) -> str:
 
 
 def _about(results: Results) -> str:
-    machine, versions = results.machine, dict(results.versions)
+    machine, versions = results.machine, {**results.versions, "commit": results.commits}
     loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
     others = ", ".join(f"{name} {version}" for name, version in versions.items())
     text = (
-        f"{results.started[:10]}, {machine['cores']} cores of {machine['processor']},"
+        f"{results.days}, {machine['cores']} cores of {machine['processor']},"
         f" {machine['system']}; {others}. Others kept this share of the cores busy in the second"
         f" before each subject: {loads}."
     )

@@ -9,7 +9,8 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,15 @@ class Notice:
     is_failure: bool
 
 
+@dataclass(frozen=True)
+class Origin:
+    """A run of the benchmarks, among several whose rows were put together, and its subjects."""
+
+    started: str
+    commit: str
+    subjects: tuple[str, ...]
+
+
 @dataclass
 class Results:
     """All that one run of the benchmarks found out.
@@ -38,6 +48,7 @@ class Results:
     Attributes:
         load_before: by subject, the share of all cores that others kept busy just before.
         rounds: by subject, what each round of each group measured: candidate, figure, value.
+        origins: where the rows are from, if from several runs.
     """
 
     started: str = ""
@@ -49,6 +60,23 @@ class Results:
     plots: list[Plot] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     rounds: dict[str, list[list[Round]]] = field(default_factory=dict)
+    origins: list[Origin] = field(default_factory=list)
+
+    @property
+    def commits(self) -> str:
+        """The commit that was measured, or which subjects were measured on which."""
+        subjects: dict[str, dict[str, None]] = {}
+        for origin in self.origins:
+            subjects.setdefault(origin.commit, {}).update(dict.fromkeys(origin.subjects))
+        if len(subjects) < 2:
+            return next(iter(subjects), self.versions.get("commit", "unknown"))
+        return ", ".join(f"{commit} ({', '.join(names)})" for commit, names in subjects.items())
+
+    @property
+    def days(self) -> str:
+        """The day on which it was measured, or the first and the last one."""
+        days = sorted({each.started[:10] for each in self.origins} or {self.started[:10]})
+        return days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
 
     @classmethod
     def here(cls, is_quick: bool) -> Results:
@@ -79,6 +107,10 @@ class Results:
         data["rows"] = [Row.from_json(each) for each in data["rows"]]
         data["plots"] = [Plot(**each) for each in data["plots"]]
         data["notices"] = [Notice(**each) for each in data["notices"]]
+        data["origins"] = [
+            Origin(each["started"], each["commit"], tuple(each["subjects"]))
+            for each in data.get("origins", [])
+        ]
         return cls(**data)
 
 
@@ -87,15 +119,25 @@ def combine(parts: Sequence[Results]) -> Results:
     whole = Results(parts[-1].started, any(each.is_quick for each in parts))
     rows: dict[tuple[str, str], Row] = {}
     plots: dict[str, Plot] = {}
+    origins: dict[tuple[str, str], list[Origin]] = {}
     for part in parts:
         whole.machine, whole.versions = part.machine, part.versions
         whole.load_before |= part.load_before
         whole.rounds |= part.rounds
         rows |= {row.key: row for row in part.rows}
+        origins |= {row.key: _origins(part, row.subject) for row in part.rows}
         plots |= {plot.key: plot for plot in part.plots}
         whole.notices += part.notices
     whole.rows, whole.plots = list(rows.values()), list(plots.values())
+    whole.origins = list(dict.fromkeys(chain.from_iterable(origins.values())))
     return whole
+
+
+def _origins(part: Results, subject: str) -> list[Origin]:
+    """Where the rows of a subject may be from: of results that were put together, several runs."""
+    one = Origin(part.started, part.versions.get("commit", "unknown"), (subject,))
+    found = [each for each in part.origins if subject in each.subjects]
+    return [replace(each, subjects=(subject,)) for each in found] or [one]
 
 
 def differences(a: Results, b: Results) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.comparing import changes, report
 from benchmarks.measure import Plot, Point
-from benchmarks.results import Notice, Results, combine
+from benchmarks.results import Notice, Origin, Results, combine
 from benchmarks.rows import Row
 from benchmarks.table import rows_table, targets_table
 from neuros.errors import UsageError
@@ -38,6 +38,7 @@ def test_a_results_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         [Plot("p", "Title", "x", "y", is_log_x=True)],
         [Notice("s", "other", "dora-rs is not installed", False)],
         {"s": [[{"a": {"median": 1.0}}]]},
+        [Origin("2026-11-21T08-00-00Z", "abc", ("s",))],
     )
     whole.write(tmp_path / "new" / "a.json")
     assert Results.read(tmp_path / "new" / "a.json") == whole
@@ -69,6 +70,41 @@ def test_of_a_row_in_several_files_the_last_one_counts() -> None:
         ("b", (3,)),
         ("c", (4,)),
     ]
+
+
+def run_of(day: str, commit: str, *rows: Row) -> Results:
+    return Results(f"2026-11-{day}T08-00-00Z", versions={"commit": commit}, rows=[*rows])
+
+
+def subject(name: str, row_name: str) -> Row:
+    return Row(name, row_name, "us", (1.0,), "", (), None)
+
+
+def test_of_several_runs_it_is_said_what_was_measured_on_which_commit() -> None:
+    first = run_of("20", "abc", subject("idle", "a"), subject("tick", "a"), subject("tick", "b"))
+    second = run_of("22", "def", subject("tick", "b"), subject("whiskeye", "a"))
+    third = run_of("21", "abc", subject("memory", "a"))
+    whole = combine([first, second, third])
+    assert whole.commits == "abc (idle, tick, memory), def (tick, whiskeye)"
+    assert whole.days == "2026-11-20 to 2026-11-22"
+
+
+def test_a_commit_of_which_no_row_is_left_is_not_named() -> None:
+    old, new = run_of("20", "abc", subject("idle", "a")), run_of("22", "def", subject("idle", "a"))
+    assert (combine([old, new]).commits, combine([old, new]).days) == ("def", "2026-11-22")
+
+
+def test_what_was_put_together_before_keeps_its_commits() -> None:
+    first = run_of("20", "abc", subject("idle", "a"), subject("x", "a"))
+    second = run_of("21", "def", subject("x", "b"))
+    whole = combine([combine([first, second]), run_of("22", "ghi", subject("y", "a"))])
+    assert whole.commits == "abc (idle, x), def (x), ghi (y)"
+
+
+def test_of_one_run_there_is_one_commit() -> None:
+    one = run_of("20", "abc", subject("idle", "a"))
+    assert (one.commits, one.days) == ("abc", "2026-11-20")
+    assert Results("2026-11-20").commits == "unknown"
 
 
 def test_a_change_is_marked_where_the_intervals_have_nothing_in_common() -> None:
