@@ -124,6 +124,10 @@ class EventLoop(Protocol):
     def has_waiting_events(self) -> bool:
         """Whether events of engines wait."""
 
+    @property
+    def has_taken_in(self) -> bool:
+        """Whether all that had come from outside has been handled; at a loop-back it has."""
+
     def note_execution(self) -> None:
         """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
 

@@ -158,7 +158,7 @@ class Workbench:
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
         self.loop = loop
         self.topics = topics
-        self.hub = MemoryHub(loop.post, copy_packet)
+        self.hub = MemoryHub(loop, copy_packet)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 

@@ -31,10 +31,13 @@ class HeldLoop:
 
     Attributes:
         from_threads: events that threads have posted.
+        has_taken_in: always true, since nothing comes by itself.
 
     Args:
         post, post_loop_back: where events go that the node posts itself.
     """
+
+    has_taken_in = True
 
     def __init__(
         self, post: Callable[[Event], None], post_loop_back: Callable[[Event], None]
