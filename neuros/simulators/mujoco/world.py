@@ -15,6 +15,7 @@ from neuros.simulators.mujoco.cameras import Cameras
 from neuros.simulators.mujoco.commands import Command, bind_commands
 from neuros.simulators.mujoco.declarations import Problems, read_commands, read_sensors
 from neuros.simulators.mujoco.elements import has_any, names_of
+from neuros.simulators.mujoco.opengl import import_opengl
 from neuros.simulators.mujoco.sensors import Binding, Fill, bind
 from neuros.simulators.mujoco.timebase import Schedule, Timebase
 
@@ -67,6 +68,8 @@ class World:
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
+        if any(sensor.kind == "camera" for sensor in self._sensors):
+            import_opengl()  # what is missing is said now, and not at the first image
         self.data = mujoco.MjData(self.model)
         self.cameras = Cameras(self.model, fine=fine)
         self.time = Timebase(self.model.opt.timestep)
