@@ -46,7 +46,7 @@ def import_opengl() -> Any:
         elif choice == "glfw":
             from mujoco import GLContext
         else:
-            raise ImportError("neither EGL, with OpenGL itself, nor OSMesa is installed")
+            raise ImportError("there is neither EGL with libGL or libGLESv2, nor OSMesa")
     return GLContext
 
 
