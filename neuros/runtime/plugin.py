@@ -11,6 +11,7 @@ from typing import TypeGuard
 
 from neuros.errors import NeurosError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
+from neuros.runtime.nest2 import nest2_hint
 
 _GONE = {
     "neuros.gazebo": "MuJoCo stands in for Gazebo, and reads its SDF files: use MuJoCo(node, path)"
@@ -57,10 +58,12 @@ def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxErr
 
 
 def describe(error: BaseException) -> str:
-    """An exception in one line: its type, and the first line of its text."""
+    """An exception in one line: its type, the first line of its text, and what helps, if known."""
     lines = "".join(traceback.format_exception_only(type(error), error)).splitlines()
     # A syntax error shows the place first, indented.
-    return next(line for line in lines if line and not line.startswith(" ")).strip()
+    line = next(line for line in lines if line and not line.startswith(" ")).strip()
+    hint = nest2_hint(error, line.partition(": ")[2])
+    return f"{line} ({hint})" if hint else line
 
 
 def last_line(error: BaseException, where: str) -> str:
