@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from neuros.observe.load_table import load_table
+from neuros.observe.spending import spending_of
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 
@@ -82,8 +83,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         colalign=("left", *("right" for _ in _COUNTS)) if record["connections"] else None,
     )
     nodes = tabulate(
-        [[name, *_shares(node)] for name, node in record["nodes"].items()],
-        headers=["node", "busy", "waiting", "blocked", "idle", "remark"],
+        [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()],
+        headers=["node", "executing", "waiting", "blocked", "idle", "remark"],
         missingval="?",
         disable_numparse=True,
         colalign=("left", "right", "right", "right", "right", "left"),
@@ -91,6 +92,12 @@ def run_table(record: Mapping[str, Any]) -> str:
     parts = [connections] if record["connections"] else []
     load = [load_table(record["system_load"])] if "system_load" in record else []
     return "\n\n".join([*parts, nodes, *load, _times(record)])
+
+
+def consumed_percent(connection: Mapping[str, Any]) -> float | None:
+    """The share of the packets sent on a connection that were consumed, in per cent."""
+    sent, consumed = connection.get("sent"), connection.get("consumed")
+    return 100 * consumed / sent if sent and consumed is not None else None
 
 
 def _running_s(ended: Ended) -> float | None:
@@ -189,21 +196,14 @@ def _results(node_folder: Path) -> dict[str, Any]:
     return results if isinstance(results, dict) else {}
 
 
-def _shares(node: Mapping[str, Any]) -> list[str]:
-    if node["report"] is None:
+def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
+    spent = spending_of(node, running_s)
+    if spent is None:
         return ["?", "?", "?", "?", "never reported"]
-    spent = node["accounting"]
-    running_s = spent["total"] - spent["registering"]
-
-    def share(seconds: float) -> str:
-        return f"{seconds / running_s:.0%}" if running_s > 0 else "-"
-
     remark = "" if node["report"] == "final" else node["report"]
-    return [
-        *(share(sum(spent[kind].values())) for kind in ("executing", "waiting", "blocked")),
-        share(spent["idle"]),
-        remark,
-    ]
+    if not spent.total_s:
+        return ["-", "-", "-", "-", remark]
+    return [*(f"{share:.0%}" for share in spent.shares.values()), remark]
 
 
 def _times(record: Mapping[str, Any]) -> str:
