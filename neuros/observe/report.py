@@ -43,7 +43,7 @@ def run_record(
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
     sim_s = max(sim_times, default=None)
-    running_s = _running_s(ended)
+    all_ran_s = running_s(ended)
     ledgers = {**ended.elsewhere, **{n: r["ledger"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -53,14 +53,14 @@ def run_record(
         "reason": ended.reason,
         "wall_s": wall_s,
         "sim_s": sim_s,
-        "running_s": running_s,
+        "running_s": all_ran_s,
         "paused_s": ended.paused_s,
-        "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
+        "real_time_factor": None if sim_s is None or not all_ran_s else sim_s / all_ran_s,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, ledgers, running_s, run_folder, _cut_off(ended))
+            _connection(c, ledgers, all_ran_s, run_folder, _cut_off(ended))
             for c in _connections(files)
         ],
         "nodes": {
@@ -100,7 +100,7 @@ def consumed_percent(connection: Mapping[str, Any]) -> float | None:
     return 100 * consumed / sent if sent and consumed is not None else None
 
 
-def _running_s(ended: Ended) -> float | None:
+def running_s(ended: Ended) -> float | None:
     """Wall time in which simulated time went on: not initialisation, pauses, draining and the end.
 
     It counts from when every node had initialised, or, if that was not before the end, from when
