@@ -35,7 +35,7 @@ DELIVERY_PERCENT = {
     "no_discard_limit": Known(40, is_below=True),
     "asynchronous": Known(40, is_below=True),
 }
-"""Packets of all connections that were delivered."""
+"""Packets of all connections that were consumed: a hook started on them."""
 
 IMU_DELIVERY_PERCENT = {
     "strict": Known(100),

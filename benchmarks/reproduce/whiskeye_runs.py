@@ -127,18 +127,18 @@ def _headings(file: Path) -> tuple[dict[int, float], dict[int, float]]:
 
 
 def _packets(past: PastRun) -> dict[str, float | None]:
-    """Packets sent and delivered (a hook started on them), by connection and in all."""
+    """Packets sent and consumed (a hook started on them), by connection and in all."""
     figures: dict[str, float | None] = {}
-    whole = dict.fromkeys(("sent", "delivered"), 0)
+    whole = dict.fromkeys(("sent", "consumed"), 0)
     for name, short in CONNECTIONS.items():
         counts = past.connections[name]
-        sent, delivered = counts["sent"] or 0, counts["consumed"] or 0
-        figures |= {f"sent.{short}": sent, f"delivered.{short}": delivered}
-        figures[f"delivery_percent.{short}"] = _percent(delivered, sent)
+        sent, consumed = counts["sent"] or 0, counts["consumed"] or 0
+        figures |= {f"sent.{short}": sent, f"consumed.{short}": consumed}
+        figures[f"consumed_percent.{short}"] = _percent(consumed, sent)
         whole["sent"] += sent
-        whole["delivered"] += delivered
+        whole["consumed"] += consumed
     figures |= whole
-    return {**figures, "delivery_percent": _percent(whole["delivered"], whole["sent"])}
+    return {**figures, "consumed_percent": _percent(whole["consumed"], whole["sent"])}
 
 
 def _percent(part: float, whole: float) -> float | None:

@@ -33,8 +33,8 @@ def test_one_orchestration_comes_out_whole(tmp_path: Path) -> None:
     assert main([*command, "--backend", "in-process", "-o", str(tmp_path)]) == 0
     (row,) = rows(tmp_path).values()
     assert row["backend"] == "in-process"
-    assert row["sent.imu"] == row["delivered.imu"] == row["estimates"] == "50"
-    assert float(row["delivery_percent"]) == 100
+    assert row["sent.imu"] == row["consumed.imu"] == row["estimates"] == "50"
+    assert float(row["consumed_percent"]) == 100
     assert float(row["rms_deg"]) < 6
     assert float(row["speed_percent"]) > 0
     assert len(row["estimates_digest"]) == 8
@@ -47,7 +47,7 @@ def test_all_seven_orchestrations_come_out_and_lossless_ones_repeat(tmp_path: Pa
     found = rows(tmp_path / "all")
     assert len(found) == len(PARTS)
     assert {row["sent.imu"] for row in found.values()} <= {"199", "200"}  # the clock ends one
-    assert float(found["strict-1"]["delivery_percent"]) == 100
+    assert float(found["strict-1"]["consumed_percent"]) == 100
 
     lossless = ["--only", "strict", "hybrid", "--repeat", "2", "-o", str(tmp_path / "again")]
     assert main([*command, *lossless]) == 0
