@@ -256,6 +256,19 @@ def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     assert bench.has_saved("b") or bench.has_saved("a", "b")
 
 
+@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
+def test_no_paused_container_outlives_a_killed_launcher_either(
+    bench: ContainerBench, plugin: str
+) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    pause(bench, running)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+    assert bench.has_saved("b") or bench.has_saved("a", "b"), "it was resumed, and ended by itself"
+
+
 @pytest.mark.acceptance
 def test_killed_together_with_its_guardian_what_is_left_goes_with_the_next_run(
     bench: ContainerBench,
@@ -443,6 +456,13 @@ def neuros(*arguments: str) -> str:
         text=True,
         timeout=30.0,
     ).stdout
+
+
+def pause(bench: ContainerBench, running: Running) -> None:
+    """Pause all containers of a run."""
+    run = bench.session(running).run
+    for container in bench.engine.containers.list(filters={"label": f"neuros.run={run}"}):
+        container.pause()
 
 
 def guardian_of(session: Session) -> int:
