@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import socket
@@ -17,32 +16,22 @@ from typing import Any
 
 import pytest
 from docker.errors import APIError
+from needs import cannot_run
 
-from containers import wait_until
+from containers import connected, require_containers, wait_until
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.build_steps import pulled
 from neuros.launch.docker.context import context_of
-from neuros.launch.docker.engine import connect
 from neuros.launch.docker.images import image_for
 
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Any]:
     """An engine that has NeuROS's base image."""
-    reason = ""
-    try:
-        engine = connect()
-    except EnvironmentFault as fault:
-        reason = str(fault)
-    else:
-        if not engine.images.list("neuros_python"):
-            reason = "the image of neuros_python is not built: run ./install.py"
-            engine.close()
-    if reason:
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-    yield engine
-    engine.close()
+    require_containers("neuros_python")
+    with connected() as engine:
+        yield engine
 
 
 class Bench:
@@ -293,14 +282,10 @@ class TestImagesOfUsers:
     @pytest.fixture
     def bare(self, engine: Any) -> str:
         """An image with Python and without rclpy."""
-        for name in ("debian-python:bookworm", "debian-python:trixie"):
-            try:
-                return str(engine.images.get(name).tags[0])
-            except APIError:
-                continue
-        reason = "no image with Python alone: .ci/docker-engine start makes one"
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-        raise AssertionError
+        names = {tag for image in engine.images.list("debian-python") for tag in image.tags}
+        if not names:
+            cannot_run("an image with Python alone", ".ci/docker-engine start makes one")
+        return min(names)
 
     def test_one_without_rclpy_is_refused_with_what_adds_it(
         self, bare: str, engine: Any, bench: Bench
@@ -317,7 +302,7 @@ class TestRegistries:
     def registry(self, tmp_path: Path) -> Iterator[str]:
         """The address of a registry; it ends with the test."""
         if shutil.which("docker-registry") is None:
-            pytest.skip("there is no docker-registry: apt-get install docker-registry")
+            cannot_run("docker-registry", "apt-get install docker-registry")
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"

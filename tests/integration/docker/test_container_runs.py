@@ -173,7 +173,7 @@ def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     assert "a script in Python" in finished.output
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.needs("root")
 def test_an_ordinary_user_of_the_engine_leaves_files_of_nobody_else(bench: ContainerBench) -> None:
     uid, group = 1000, os.stat(engine_socket(bench.engine)).st_gid
     # May read what root has installed, and use the engine; nothing else that is not its own.
