@@ -230,11 +230,68 @@ class TestDockerfiles:
         assert f" : {step}" in log.read_text()
         assert f" : {step}" in out
 
+    def test_a_base_image_that_would_not_be_used_is_refused_before_anything_is_built(
+        self, bench: Bench
+    ) -> None:
+        bench.write("FROM neuros_python\n")
+        code, _, error = bench.build("--base-image", f"{bench.name}=neuros_nest")
+        assert (code, bench.tags) == (2, [])
+        assert f"{bench.recipe}/Dockerfile does not begin from BASE_IMAGE: let it begin" in error
+        code, _, error = bench.build("--base-image", "nothing=neuros_nest")
+        assert (code, bench.tags) == (2, [])
+        assert "no container 'nothing' is built here; those that are: " in error
+
+    def test_one_that_was_used_is_forgotten_when_the_dockerfile_takes_none_any_more(
+        self, bench: Bench
+    ) -> None:
+        bench.write("ARG BASE_IMAGE=scratch\nFROM ${BASE_IMAGE}\n")
+        assert bench.build("--base-image", f"{bench.name}=neuros_python")[0] == 0
+        bench.write("FROM neuros_python\nENV ANEW=1\n")
+        assert bench.build()[0] == 0
+
     def test_an_image_that_can_never_run_nodes_gets_no_name(self, bench: Bench) -> None:
         bench.write("FROM scratch\nCOPY Dockerfile /\n")
         code, _, error = bench.build()
         assert (code, bench.tags) == (4, [])
         assert f"image '{bench.name}' has no Python: take one with Python 3.10 to 3.14" in error
+
+
+class TestBuildKit:
+    """It builds where a Dockerfile takes it: nothing has to be installed or switched on."""
+
+    def test_a_step_may_mount_caches_and_files_and_all_else_is_as_ever(self, bench: Bench) -> None:
+        (bench.recipe / "hello").write_text("hello\n")
+        (bench.folder / "ca.pem").write_text("certificates\n")
+        bench.write(
+            "FROM neuros_python\nUSER 0\nARG VARIANT=cpu\n"
+            "RUN --mount=type=cache,target=/cache \\\n"
+            "    --mount=type=bind,source=hello,target=/mnt/hello \\\n"
+            '    cat /mnt/hello "$PIP_CERT" > /seen && echo $VARIANT >> /seen\nUSER 1000\n'
+        )
+        options = ("--ca-bundle", str(bench.folder / "ca.pem"), "--build-arg", "VARIANT=cuda")
+        code, out, error = bench.build(*options)
+        assert (code, f"{bench.name}: built in " in out) == (0, True), error
+        seen = bench.run("sh", "-c", "cat /seen; ls /tmp /cache; id -u").split()
+        assert seen == ["hello", "certificates", "cuda", "/cache:", "/tmp:", "1000"]
+        assert bench.engine.images.list("neuros_begin") == []
+        assert f"{bench.name}: up to date" in bench.build(*options)[1]
+
+    def test_a_step_that_fails_is_shown_with_what_it_said(self, bench: Bench) -> None:
+        bench.write("FROM neuros_python\nRUN --mount=type=cache,target=/c echo why && false\n")
+        code, out, error = bench.build()
+        assert (code, bench.tags) == (4, [])
+        assert "exit code: 1" in error
+        assert "  why\n" in out
+
+    def test_heredocs_are_built_or_the_line_and_what_it_takes_are_named(self, bench: Bench) -> None:
+        bench.write("FROM neuros_python\n\nRUN <<EOF\necho hello > /tmp/seen\nEOF\n")
+        code, _, error = bench.build()
+        if int(bench.engine.version()["Version"].split(".")[0]) >= 23:
+            assert (code, bench.run("cat", "/tmp/seen")) == (0, "hello\n")
+        else:
+            assert (code, bench.tags) == (4, [])
+            assert "line 3 of its Dockerfile (RUN <<EOF) takes Docker Engine 23 or newer" in error
+            assert "as one RUN, with && between them" in error
 
 
 class TestImagesOfUsers:

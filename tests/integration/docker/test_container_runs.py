@@ -20,7 +20,8 @@ from launching import EXAMPLES, Finished, Running, launch, start
 from containers import require_containers, wait_until
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.launcher import DockerLauncher, engine_socket, find_containers
+from neuros.launch.docker.engine import engine_socket
+from neuros.launch.docker.launcher import DockerLauncher, find_containers
 from neuros.launch.docker.settings import container_name, shared_memory
 from neuros.launch.run_processes import RUN_ID, environ_of
 from neuros.launch.sessions import Session, guardian_environment
