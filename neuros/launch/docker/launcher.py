@@ -16,7 +16,7 @@ from docker import DockerClient
 from neuros.errors import EnvironmentFault
 from neuros.launch.dead_runs import hold
 from neuros.launch.docker.container import RunningContainer
-from neuros.launch.docker.engine import Abilities, connect, engine_faults
+from neuros.launch.docker.engine import Abilities, connect, engine_faults, engine_socket
 from neuros.launch.docker.images import Image, images_for
 from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
@@ -156,22 +156,6 @@ class DockerLauncher:
         facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
         where = on_cores(self._placement.get(node.name))
         return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
-
-
-def engine_socket(engine: DockerClient) -> str:
-    """The Unix socket of the engine.
-
-    Raises:
-        EnvironmentFault: if it is reached in another way. It may be on another machine then, where
-            the folders of the project and of the run are not.
-    """
-    path = getattr(engine.api.get_adapter(engine.api.base_url), "socket_path", None)
-    if path is None:
-        raise EnvironmentFault(
-            f"the Docker engine at {engine.api.base_url} may be on another machine: set"
-            " DOCKER_HOST to the socket of one on this machine (unix:///var/run/docker.sock)"
-        )
-    return str(path)
 
 
 def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:

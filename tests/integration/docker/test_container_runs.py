@@ -20,7 +20,8 @@ from launching import EXAMPLES, Finished, Running, launch, start
 from containers import require_containers, wait_until
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.launcher import DockerLauncher, engine_socket, find_containers
+from neuros.launch.docker.engine import engine_socket
+from neuros.launch.docker.launcher import DockerLauncher, find_containers
 from neuros.launch.docker.settings import container_name, shared_memory
 from neuros.launch.run_processes import RUN_ID, environ_of
 from neuros.launch.sessions import Session, guardian_environment
@@ -173,7 +174,7 @@ def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     assert "a script in Python" in finished.output
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.needs("root")
 def test_an_ordinary_user_of_the_engine_leaves_files_of_nobody_else(bench: ContainerBench) -> None:
     uid, group = 1000, os.stat(engine_socket(bench.engine)).st_gid
     # May read what root has installed, and use the engine; nothing else that is not its own.
@@ -254,6 +255,19 @@ def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     running.process.wait()
     wait_until(lambda: not bench.left(), GONE_WITHIN_S)
     assert bench.has_saved("b") or bench.has_saved("a", "b")
+
+
+@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
+def test_no_paused_container_outlives_a_killed_launcher_either(
+    bench: ContainerBench, plugin: str
+) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    pause(bench, running)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+    assert bench.has_saved("b") or bench.has_saved("a", "b"), "it was resumed, and ended by itself"
 
 
 @pytest.mark.acceptance
@@ -443,6 +457,13 @@ def neuros(*arguments: str) -> str:
         text=True,
         timeout=30.0,
     ).stdout
+
+
+def pause(bench: ContainerBench, running: Running) -> None:
+    """Pause all containers of a run."""
+    run = bench.session(running).run
+    for container in bench.engine.containers.list(filters={"label": f"neuros.run={run}"}):
+        container.pause()
 
 
 def guardian_of(session: Session) -> int:
