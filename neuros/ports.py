@@ -121,6 +121,12 @@ class EventLoop(Protocol):
     def has_waiting_events(self) -> bool:
         """Whether events of engines wait."""
 
+    def has_taken_in(self) -> bool:
+        """Whether all that had arrived has been handled; when a loop-back is, it is so."""
+
+    def note_execution(self) -> None:
+        """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
+
     def post(self, event: Callable[[], None]) -> None:
         """Handle ``event`` after everything that already waits. Loop thread only."""
 

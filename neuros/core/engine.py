@@ -4,6 +4,8 @@ Every event (a packet, an acknowledgement, a registration, a due timer, the loop
 of a method here. It changes some counters and is followed by one *pass*: each hook is looked at
 once, least recently executed first, and runs if it is ready at its turn. If one is still ready
 afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
+Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
+the loop-back goes on when that has been taken in. So no hook starts on a backlog.
 All that leaves the engine goes through :class:`~neuros.core.effects.Effects`.
 """
 
@@ -67,6 +69,7 @@ class Engine:
     ) -> None:
         self.node = node
         self._effects = effects
+        self._has_taken_in = effects.has_taken_in
         self._clock = clock
         ports = NodePorts(node, connections, packet_types or {})
         self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
@@ -296,6 +299,8 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
+                        if not self._has_taken_in():
+                            break
                         self._run(hook)
             finally:
                 self._is_passing = False

@@ -48,6 +48,13 @@ class HeldLoop:
         """Nothing waits for this loop."""
         return False
 
+    def has_taken_in(self) -> bool:
+        """Always: nothing arrives while a hook runs."""
+        return True
+
+    def note_execution(self) -> None:
+        """Nothing has arrived meanwhile."""
+
     def post_from_thread(self, event: Event) -> None:
         """Keep an event for whoever takes it."""
         self.from_threads.put(event)

@@ -73,6 +73,7 @@ class RosTransport:
                 self._open_receiver(connection, inbox)
         self._external.open(inbox)
         if self._registrations:
+            self._loop.expect_arrivals()
             self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
 
     def note_result(self, box: Sequence[Any]) -> None:

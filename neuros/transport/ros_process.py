@@ -108,8 +108,7 @@ class RosProcess:
         """Remember what exists on a ROS node before its plugin gets hold of it."""
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = _entities(ros_node)
-        callbacks = PluginCallbacks(ros_node, enter, fail, is_limited=self._loop.is_limited)
-        self._callbacks.append(callbacks)
+        self._callbacks.append(PluginCallbacks(ros_node, self._loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has created something on its ROS node that may call back."""

@@ -1,0 +1,10 @@
+"""A main loop: each acknowledgement that it gets could start it once more."""
+
+from neuros.hooks import Optional, neuros_function
+from notes import send, take
+
+
+@neuros_function(inputs=Optional("command"), outputs="state")
+def step(node, command):
+    take(node, "step", command, 0.005)
+    return send(node, "state")

@@ -1,0 +1,9 @@
+"""Takes six times as long as there is between two packets."""
+
+from neuros.hooks import neuros_function
+from notes import take
+
+
+@neuros_function(inputs="limited")
+def work(node, packet):
+    take(node, "work", packet, 0.3)
