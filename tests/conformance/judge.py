@@ -127,6 +127,11 @@ class Judge:
                     times = self.sent_ns[f"{name}.{port}"]
                     if number == len(times) + 1:
                         times.append(each.end_ns)
+        self.busy = {name: _Busy(log) for name, log in self.log.items()}
+        self.busy_elsewhere = {
+            name: _Busy(e for other, log in self.log.items() if other != name for e in log)
+            for name in (self.log if self.is_one_process else ())
+        }
         self.begin_ns = {node.name: self._begin(node) for node in project.nodes}
         self._found: list[Violation] = []
         self.intakes: dict[tuple[str, str, Connection], _Intake] = {}
@@ -386,9 +391,7 @@ class Judge:
         """For how long hooks of other nodes ran, in process."""
         if not self.is_one_process:
             return 0
-        return sum(
-            _within(log, from_ns, to_ns) for name, log in self.log.items() if name != node
-        )
+        return self.busy_elsewhere[node].within(from_ns, to_ns)
 
     def _waiting_since(self, c: Connection, intake: _Intake, position: int) -> int:
         """When the packet was sent for which the mailbox is no longer empty; ``_NEVER``: unknown."""
@@ -566,7 +569,7 @@ class Judge:
                     f"{node.name}.{hook.name} {how} {waited_ms:.0f} ms after it was ready, and"
                     f" {name} ran {count} times in between",
                 )
-        busy_ns = _within(log, since_ns, now_ns) + self._others_ns(node.name, since_ns, now_ns)
+        busy_ns = self.busy[node.name].within(since_ns, now_ns) + self._others_ns(node.name, since_ns, now_ns)
         rested_ns = now_ns - since_ns - busy_ns
         if rested_ns > self.tolerance_ns:
             yield Violation(
@@ -773,8 +776,21 @@ def _took(intake: _Intake, each: Execution) -> bool:
     return place < len(intake.starts_ns) and intake.starts_ns[place] == each.start_ns
 
 
-def _within(log: Sequence[Execution], from_ns: int, to_ns: int) -> int:
-    """For how long the executions of a log ran in a span of time; they do not overlap."""
-    first = max(0, bisect.bisect_right(log, from_ns, key=lambda e: e.start_ns) - 1)
-    last = bisect.bisect_left(log, to_ns, key=lambda e: e.start_ns)
-    return sum(max(0, min(e.end_ns, to_ns) - max(e.start_ns, from_ns)) for e in log[first:last])
+class _Busy:
+    """For how long the executions of a log, which do not overlap, ran in spans of time."""
+
+    def __init__(self, log: Iterable[Execution]) -> None:
+        self._log = sorted(log, key=lambda e: e.start_ns)
+        self._starts = [e.start_ns for e in self._log]
+        self._before = [0, *itertools.accumulate(e.end_ns - e.start_ns for e in self._log)]
+
+    def within(self, from_ns: int, to_ns: int) -> int:
+        """Between two moments."""
+        return max(0, self._until(to_ns) - self._until(from_ns))
+
+    def _until(self, ns: int) -> int:
+        place = bisect.bisect_left(self._starts, ns)
+        if not place:
+            return 0
+        last = self._log[place - 1]
+        return self._before[place - 1] + min(last.end_ns, ns) - last.start_ns
