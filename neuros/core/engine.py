@@ -129,10 +129,10 @@ class Engine:
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself."""
+        """The event that the engine posted to itself; all that waited then has been taken in."""
         self._wake()
         self._has_posted_loop_back = False
-        self._pass()
+        self._pass(may_start=True)
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
         """Send packets as if a hook with those outputs had returned them, once it might run.
@@ -284,7 +284,7 @@ class Engine:
             self.since_ns = now_ns
         return now_ns
 
-    def _pass(self) -> None:
+    def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
         life, gate = self._life, self._gate
@@ -299,8 +299,9 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
-                        if not self._has_taken_in():
+                        if not (may_start or self._has_taken_in()):
                             break
+                        may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False

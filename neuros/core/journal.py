@@ -130,10 +130,10 @@ class JournalledEngine(Engine):
         super().stop_hooks()
         self._note(_entry(What.STOP))
 
-    def _pass(self) -> None:
+    def _pass(self, *, may_start: bool = False) -> None:
         if not self._is_passing:
             self._starts = 0
-        super()._pass()
+        super()._pass(may_start=may_start)
 
     def _run(self, hook: Hook) -> None:
         self._starts += 1

@@ -68,7 +68,8 @@ class Script:
         self._next = next(self._starts, _NO_START)
         self._readings: Iterator[int] = iter(next(self._events).readings)
         self._now_ns = 0
-        self._left: int | None = None
+        self._limit: int | None = None
+        self._in_event = 0
         self.started = 0
         self.deliveries: deque[Callable[[], None]] = deque()
         self.loop_back: Callable[[], None] | None = None
@@ -80,15 +81,17 @@ class Script:
 
     def may_start(self) -> bool:
         """Whether a ready hook starts now, rather than after what had arrived at this point."""
-        if self._left is not None:
-            self._left -= 1
-        return self._left is None or self._left >= 0
+        return self._limit is None or self._in_event < self._limit
+
+    def note_start(self) -> None:
+        """A hook starts, or packets from a thread of the plugin leave."""
+        self._in_event += 1
 
     def events(self) -> Iterator[Event]:
         """The events, in their order."""
         for event in self._events:
             self._readings = iter(event.readings)
-            self._left = event.limit
+            self._limit, self._in_event = event.limit, 0
             yield event
 
     @property
@@ -134,6 +137,7 @@ class ReplayedEngine(Engine):
         place = self._places.get(hook)
         if place is not None:
             self._script.check_start(place, self._names)
+        self._script.note_start()
         super()._run(hook)
 
 

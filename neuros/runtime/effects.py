@@ -56,7 +56,7 @@ class NodeEffects:
         self._clock_outputs = time.clock_outputs
         # Nothing is to be added to these: each call that is left out counts.
         self.acknowledge = transport.acknowledge
-        self.has_taken_in = middleware.loop.has_taken_in
+        self.has_taken_in = transport.has_taken_in
         self._keeper = keeper
         self._sampler = sampler
         self._enter = enter

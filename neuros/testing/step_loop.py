@@ -44,10 +44,6 @@ class StepLoop:
         """The same."""
         self._events.append(event)
 
-    def has_taken_in(self) -> bool:
-        """Always: nothing arrives while a hook runs."""
-        return True
-
     def note_execution(self) -> None:
         """Nothing has arrived meanwhile."""
 

@@ -48,10 +48,6 @@ class HeldLoop:
         """Nothing waits for this loop."""
         return False
 
-    def has_taken_in(self) -> bool:
-        """Always: nothing arrives while a hook runs."""
-        return True
-
     def note_execution(self) -> None:
         """Nothing has arrived meanwhile."""
 
@@ -79,6 +75,9 @@ class _Nowhere:
     def send_external(self, port: Port, packet: Any) -> None: ...
     def acknowledge(self, connection: Connection, position: int) -> None: ...
     def close(self) -> None: ...
+
+    def has_taken_in(self) -> bool:
+        return True
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         return None

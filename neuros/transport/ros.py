@@ -60,6 +60,7 @@ class RosTransport:
         self._registrations: list[Registration] = []
         self._large = LargeCarriers(file, ros_node.get_logger().warning)
         self._is_open = False
+        self.has_taken_in = loop.has_taken_in
 
     def open(self, inbox: Inbox) -> None:
         """Create all endpoints and look for the other ends until each is found."""

@@ -65,10 +65,10 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._loop = RosLoop(self._context, on_failure)
+        self._loop = loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
         self._is_recorded = record
-        self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
+        self._hub = MemoryHub(loop.post, copy_packet, loop.has_taken_in) if in_memory else None
         self._ros_nodes: dict[str, PlainNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []

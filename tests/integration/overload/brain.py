@@ -1,7 +1,8 @@
 """Looks for long, and should obey at once."""
 
-from neuros.hooks import neuros_function
 from notes import take
+
+from neuros.hooks import neuros_function
 
 
 @neuros_function(inputs="image")

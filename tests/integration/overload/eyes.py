@@ -1,7 +1,8 @@
 """Two inputs that are both too fast."""
 
-from neuros.hooks import neuros_function
 from notes import take
+
+from neuros.hooks import neuros_function
 
 
 @neuros_function(inputs="left")

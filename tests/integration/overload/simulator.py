@@ -1,7 +1,8 @@
 """A main loop: each acknowledgement that it gets could start it once more."""
 
-from neuros.hooks import Optional, neuros_function
 from notes import send, take
+
+from neuros.hooks import Optional, neuros_function
 
 
 @neuros_function(inputs=Optional("command"), outputs="state")

@@ -1,7 +1,8 @@
 """Takes six times as long as there is between two packets."""
 
-from neuros.hooks import neuros_function
 from notes import take
+
+from neuros.hooks import neuros_function
 
 
 @neuros_function(inputs="limited")

@@ -1,7 +1,8 @@
 """Sends faster than others can follow."""
 
-from neuros.hooks import neuros_tick
 from notes import send
+
+from neuros.hooks import neuros_tick
 
 
 @neuros_tick(seconds=0.01, outputs="image")
