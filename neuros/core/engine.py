@@ -287,7 +287,7 @@ class Engine:
     def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life, gate = self._life, self._gate
+        life, gate, exchange = self._life, self._gate, self._exchange
         if not life.has_begun:
             return
         if self._schedule.candidates:
@@ -299,7 +299,7 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
-                        if not (may_start or self._has_taken_in()):
+                        if not may_start and (exchange.to_itself or not self._has_taken_in()):
                             break
                         may_start = False
                         self._run(hook)

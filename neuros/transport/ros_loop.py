@@ -78,6 +78,7 @@ class RosLoop:
         self.turns = 0
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
+        self._has_older_events = False
         self._is_stopping = False
 
     @property
@@ -160,15 +161,21 @@ class RosLoop:
         return guarded
 
     def run(self) -> None:
-        """Run until :meth:`stop`."""
+        """Run until :meth:`stop`.
+
+        Where a timer is overdue, and one may always be, all that waits is handled before it.
+        """
         while not self._is_stopping:
             self._planned_ns = self._next_due_ns()
             if self._planned_ns is None:
                 wait_s = _LONG_S
             else:
                 wait_s = (self._planned_ns - time.monotonic_ns()) / 1e9
-            if wait_s > 0:
-                self._executor.spin_until_future_complete(self._waker, wait_s)
+            if wait_s <= 0:
+                wait_s = _LONG_S
+                self._has_older_events = True
+                self.post(self._end_older_events)
+            self._executor.spin_until_future_complete(self._waker, wait_s)
             self._run_due_timers()
 
     def run_for(self, seconds: float) -> None:
@@ -190,6 +197,11 @@ class RosLoop:
         self._executor.shutdown(0)
 
     def _wake(self) -> None:
+        self._waker.wake(None)
+
+    def _end_older_events(self) -> None:
+        """All that waited when a timer was overdue has been handled: now it is the timer's turn."""
+        self._has_older_events = False
         self._waker.wake(None)
 
     def _post_turn(self) -> None:
@@ -237,6 +249,8 @@ class RosLoop:
 
     def _check_timers(self) -> None:
         """Leave the executor if a timer is due, or due at another time than was planned for."""
+        if self._has_older_events:
+            return
         next_ns = self._next_due_ns()
         if next_ns != self._planned_ns or (next_ns and next_ns <= time.monotonic_ns()):
             self._waker.wake(None)
