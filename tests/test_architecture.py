@@ -92,6 +92,8 @@ GENERATORS |= {"rosidl_adapter"}
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
     "transport": {"rclpy", "rpyutils", "xxhash"} | MESSAGES,
+    "transport.schema": {"rosidl_parser"},
+    "transport.values": {"numpy"},
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},

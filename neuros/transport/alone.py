@@ -22,6 +22,7 @@ from neuros.transport.copying import copy_packet
 from neuros.transport.making import make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import plain_node
+from neuros.transport.values import checker
 
 Event = Callable[[], None]
 
@@ -134,6 +135,10 @@ class Alone:
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
+
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
 
     def close(self) -> None:
         """Give up ROS."""
