@@ -11,8 +11,7 @@ from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.testing.step_loop import StepLoop
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException

@@ -18,8 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import message_carrier
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import plain_node
 from neuros.transport.values import checker

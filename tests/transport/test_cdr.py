@@ -35,7 +35,7 @@ QUICK = (
     Bool, Clock, Float32, Header, Image, Imu, Int8, Int32, JointState, LaserScan, MagneticField,
     String, TwistStamped, UInt64, Vector3,
 )  # fmt: skip
-LEFT_TO_ROS = (Byte, Empty, Float64MultiArray, PointCloud2, UInt8MultiArray)
+LEFT_TO_ROS = (Empty,)
 
 for _kind in (*QUICK, *LEFT_TO_ROS):  # ROS's first conversion of a type imports what warns
     message_class(f"{_kind.__module__.split('.')[0]}/msg/{_kind.__name__}")
