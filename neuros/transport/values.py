@@ -321,7 +321,7 @@ def _convert_float(of: Type) -> Convert:
         try:
             if not is_single:
                 return float(number)
-            rounded: float = _FLOAT.unpack(_FLOAT.pack(number))[0]
+            rounded: float = _FLOAT.unpack(_FLOAT.pack(float(number)))[0]
         except OverflowError:
             raise _Mismatch(_describe(value), limits) from None
         # Of what is no number no two are equal: one that is held already stays.
