@@ -207,6 +207,12 @@ class Middleware(Protocol):
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
 
+    def checker(self, kind: type) -> Callable[[Packet], Packet]:
+        """What checks packets of a class before they are sent.
+
+        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
+        """
+
     def close(self) -> None:
         """Let what was sent last leave, then give up everything."""
 

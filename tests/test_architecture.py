@@ -91,7 +91,7 @@ GENERATORS |= {"rosidl_adapter"}
 # What is not named here has none; a part of a room may have less than the room.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
-    "transport": {"rclpy", "rpyutils", "xxhash"} | MESSAGES,
+    "transport": {"numpy", "rclpy", "rosidl_parser", "rpyutils", "xxhash"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},

@@ -27,7 +27,7 @@ from neuros.core.accounting import (
 from neuros.core.effects import Effects
 from neuros.core.exchange import Exchange
 from neuros.core.gate import Gate, drives
-from neuros.core.hook import Hook, Source
+from neuros.core.hook import Hook, PacketType, Source
 from neuros.core.inputs import Inlet
 from neuros.core.life import Life
 from neuros.core.node_ports import NodePorts, undeclared
@@ -45,7 +45,7 @@ class Engine:
         node: the node, with its ports.
         connections: all connections that begin or end at it, in the project's order.
         specs: its hooks, in the order of declaration.
-        packet_types: message class per output name, for checking what hooks return.
+        packet_types: per output name, what hooks must return; any value will do for others.
         clock: monotonic wall clock in nanoseconds.
 
     Attributes:
@@ -65,7 +65,7 @@ class Engine:
         specs: Sequence[HookSpec],
         effects: Effects,
         clock: Callable[[], int],
-        packet_types: Mapping[str, type] | None = None,
+        packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
         self.node = node
         self._effects = effects
@@ -353,7 +353,7 @@ class Engine:
             if name not in self.outputs:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
-        source = self._sources[names] = Source(names, self.outputs)
+        source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
         self._life.add_source(source)
         self.all_hooks.append(source)
         return source

@@ -11,11 +11,11 @@ from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.testing.step_loop import StepLoop
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException
+from neuros.transport.values import checker
 
 _LEVELS = {
     "DEBUG": logging.DEBUG,
@@ -205,6 +205,10 @@ class Workbench:
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
+
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
 
     def close(self) -> None:
         """Nothing to give up."""

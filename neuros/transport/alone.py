@@ -18,10 +18,10 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import message_carrier
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import plain_node
+from neuros.transport.values import checker
 
 Event = Callable[[], None]
 
@@ -143,6 +143,10 @@ class Alone:
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
+
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
 
     def close(self) -> None:
         """Give up ROS."""

@@ -20,11 +20,11 @@ from std_msgs.msg import UInt64
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.copying import make_packet
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.external import ExternalTopics
 from neuros.transport.large_carriers import LargeCarriers
 from neuros.transport.large_packets import is_parcel
-from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop

@@ -24,6 +24,7 @@ from neuros.transport.plain_node import PlainNode, plain_node
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
+from neuros.transport.values import checker
 
 _LINGER_S = 0.05
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
@@ -137,6 +138,10 @@ class RosProcess:
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
+
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
 
     def close(self) -> None:
         """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
