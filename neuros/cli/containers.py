@@ -136,8 +136,11 @@ def _remove(options: argparse.Namespace) -> int:
     from neuros.launch.docker.inventory import remove_images
 
     with closing(connect()) as engine:
-        for tag in remove_images(engine, options.names):
+        tags = 0
+        for tags, tag in enumerate(remove_images(engine, options.names), start=1):
             print(f"removed {tag}")
+        if not tags:
+            print("NeuROS has built no images: there is nothing to remove")
     return 0
 
 
