@@ -523,3 +523,42 @@ def test_simulated_results_come_through_as_ros_rounds_them(plugin):
     bench.run()
     assert bench.received("y")[0].data == pytest.approx(0.1)
     assert bench.received("y")[0].data != 0.1
+
+
+def test_a_plugin_can_look_around(plugin):
+    harness = PluginHarness(
+        plugin(COUNT),
+        inputs={"x": INT},
+        outputs={"total": INT, "done": "std_msgs/msg/Empty"},
+        connections=[wire("camera.image -> node.x")],
+    )
+    topics = ["/neuros/camera/image/node/x/data"]
+    topics += [f"/neuros/node/{name}/receiver/{name}/data" for name in ("done", "total")]
+    assert harness.node.get_topic_list() == topics
+    assert harness.node.get_topic_info(topics[0]) == (
+        "Type: std_msgs/msg/Int32\nPublisher count: 1\nSubscription count: 1"
+    )
+    with pytest.raises(NodeError, match="get_topic_info: there is no topic '/x' now$"):
+        harness.node.get_topic_info("x")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "kind"),
+    [
+        ({"a": INT}, "Int32"),
+        ({"a": INT, "b": INT}, "Int32"),
+        ({"a": INT, "b": "std_msgs/msg/Empty"}, "Empty"),
+        ({"a": INT, "b": TEXT}, None),
+        ({}, None),
+    ],
+    ids=["one output", "one type", "Empty, as published", "two types", "no output"],
+)
+def test_a_packet_without_a_name_is_of_the_type_that_alone_can_be_meant(plugin, outputs, kind):
+    path = plugin("from neuros.hooks import *\n@neuros_initialise()\ndef f(node): pass")
+    node = PluginHarness(path, outputs=outputs).node
+    if kind:
+        assert type(node.make_packet()).__name__ == kind
+    else:
+        known = ", ".join(outputs) or "none"
+        with pytest.raises(NodeError, match=f"say for which output of node 'node': {known}$"):
+            node.make_packet()
