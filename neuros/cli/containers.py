@@ -136,11 +136,12 @@ def _remove(options: argparse.Namespace) -> int:
     from neuros.launch.docker.inventory import remove_images
 
     with closing(connect()) as engine:
-        tags = 0
-        for tags, tag in enumerate(remove_images(engine, options.names), start=1):
+        has_removed = False
+        for tag in remove_images(engine, options.names):
             print(f"removed {tag}")
-        if not tags:
-            print("NeuROS has built no images: there is nothing to remove")
+            has_removed = True
+    if not has_removed:
+        print("NeuROS has built no images: there is nothing to remove")
     return 0
 
 

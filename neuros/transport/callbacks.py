@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 from neuros.errors import NodeError
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.plain_node import PlainNode
+from neuros.transport.plain_node import PlainNode, not_in_hooks
 
 Fail: TypeAlias = Callable[[Any, BaseException], None]
 
@@ -106,6 +106,7 @@ class PluginCallbacks:
         def creating(*arguments: Any, **keywords: Any) -> Any:
             client = create(*arguments, **keywords)
             client.call_async = self._calling(client.call_async)
+            client.call = not_in_hooks(client.call, "client.call")
             return client
 
         return creating
