@@ -168,6 +168,7 @@ class Execution:
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
+            outcome.failures = [self._as_here(text) for text in outcome.failures]
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
             record |= {

@@ -7,6 +7,7 @@ registers there are not served.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 from array import array
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,7 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import plain_node
+from neuros.transport.plain_node import plain_node, without_spinning
 from neuros.transport.values import checker
 
 Event = Callable[[], None]
@@ -97,6 +98,8 @@ class Alone:
 
     def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
         self.loop = loop
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
         self._context = rclpy.Context()
         rclpy.init(
             args=["--ros-args", "--disable-external-lib-logs"],
@@ -150,5 +153,6 @@ class Alone:
 
     def close(self) -> None:
         """Give up ROS."""
+        self._no_spinning.close()
         self._ros_node.destroy_node()
         rclpy.shutdown(context=self._context)

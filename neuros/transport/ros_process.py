@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +21,7 @@ from neuros.transport.digests import digest_of
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
-from neuros.transport.plain_node import PlainNode, plain_node
+from neuros.transport.plain_node import PlainNode, plain_node, without_spinning
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
@@ -66,6 +67,8 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
         self._loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
         self._is_recorded = record
@@ -149,6 +152,7 @@ class RosProcess:
         Others in that crowd notice after 20 s that a process has gone, as with one that was
         killed; the shared memory of DDS is left to the guardian.
         """
+        self._no_spinning.close()
         for callbacks in self._callbacks:
             callbacks.close()
         for transport in self._transports:
