@@ -11,12 +11,12 @@ import functools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.launching import launch, project_of_plugins
+from benchmarks.launching import launch
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import (
     CORE_EACH,
@@ -36,6 +36,7 @@ SITUATIONS = (QUIET, *BUSY, OTHER_RUN, SWEEP)
 PLACES = (UNPINNED, KERNEL, CORE_EACH)
 DEFAULT = "default"
 SIMULATED_S = 10.0
+Figures = Callable[[], Mapping[str, float]]
 _SPIN = "while True: pass"
 _ENDLESS = 10**9
 
@@ -96,7 +97,7 @@ def _name(place: str) -> str:
     return DEFAULT if place == UNPINNED else place
 
 
-def under(situation: str, place: str, measure: Measurement) -> Mapping[str, float]:
+def under(situation: str, place: str, measure: Figures) -> Mapping[str, float]:
     """A measurement while something else runs; of two at once, the means."""
     if situation == SWEEP:
         with ThreadPoolExecutor(2) as pool:
