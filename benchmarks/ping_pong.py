@@ -25,7 +25,7 @@ STRING, IMU, IMAGE = "std_msgs/msg/String", "sensor_msgs/msg/Imu", "sensor_msgs/
 
 UNPINNED, CORE_EACH, ONE_CORE = "unpinned", "a core each", "one core"
 KERNEL = "left to the kernel"
-"""What *unpinned* means without NeuROS; with it, its launcher places the nodes by default."""
+"""``--no-placement``: what *unpinned* means as long as the default pins nothing."""
 
 _TIMEOUT_S = 120.0
 
