@@ -76,6 +76,9 @@ class Transport(Protocol):
         Whoever reads them takes them away. Connections of which none are kept are left out.
         """
 
+    def has_taken_in(self) -> bool:
+        """Whether all that has reached this node, from wherever, has been handled."""
+
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""
 
@@ -120,6 +123,9 @@ class EventLoop(Protocol):
     @property
     def has_waiting_events(self) -> bool:
         """Whether events of engines wait."""
+
+    def note_execution(self) -> None:
+        """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Handle ``event`` after everything that already waits. Loop thread only."""

@@ -4,6 +4,8 @@ Every event (a packet, an acknowledgement, a registration, a due timer, the loop
 of a method here. It changes some counters and is followed by one *pass*: each hook is looked at
 once, least recently executed first, and runs if it is ready at its turn. If one is still ready
 afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
+Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
+the loop-back goes on when that has been taken in. So no hook starts on a backlog.
 All that leaves the engine goes through :class:`~neuros.core.effects.Effects`.
 """
 
@@ -67,6 +69,7 @@ class Engine:
     ) -> None:
         self.node = node
         self._effects = effects
+        self._has_taken_in = effects.has_taken_in
         self._clock = clock
         ports = NodePorts(node, connections, packet_types or {})
         self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
@@ -126,10 +129,10 @@ class Engine:
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself."""
+        """The event that the engine posted to itself; all that waited then has been taken in."""
         self._wake()
         self._has_posted_loop_back = False
-        self._pass()
+        self._pass(may_start=True)
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
         """Send packets as if a hook with those outputs had returned them, once it might run.
@@ -281,7 +284,7 @@ class Engine:
             self.since_ns = now_ns
         return now_ns
 
-    def _pass(self) -> None:
+    def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
         life, gate = self._life, self._gate
@@ -296,6 +299,9 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
+                        if not (may_start or self._has_taken_in()):
+                            break
+                        may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False

@@ -44,6 +44,9 @@ class StepLoop:
         """The same."""
         self._events.append(event)
 
+    def note_execution(self) -> None:
+        """Nothing has arrived meanwhile."""
+
     def post_from_thread(self, event: Event) -> None:
         """The same, from any thread; nobody is woken, since nobody waits."""
         self._events.append(event)

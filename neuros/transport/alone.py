@@ -48,6 +48,9 @@ class HeldLoop:
         """Nothing waits for this loop."""
         return False
 
+    def note_execution(self) -> None:
+        """Nothing has arrived meanwhile."""
+
     def post_from_thread(self, event: Event) -> None:
         """Keep an event for whoever takes it."""
         self.from_threads.put(event)
@@ -72,6 +75,9 @@ class _Nowhere:
     def send_external(self, port: Port, packet: Any) -> None: ...
     def acknowledge(self, connection: Connection, position: int) -> None: ...
     def close(self) -> None: ...
+
+    def has_taken_in(self) -> bool:
+        return True
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
         return None

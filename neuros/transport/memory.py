@@ -7,7 +7,7 @@ given from outside, which is also what makes it the deterministic transport of t
 from __future__ import annotations
 
 from array import array
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -34,19 +34,26 @@ class Outside(Protocol):
 class MemoryHub:
     """Joins the nodes of one process.
 
-    ``post`` queues an event; ``copy(packet)`` must share nothing with ``packet``.
+    Args:
+        post: queues an event.
+        copy: what it returns must share nothing with its argument.
+        has_taken_in: whether all that has come from outside the process has been handled.
 
     Attributes:
         received: where the digests of what is received go, by connection.
+        coming: how many packets and acknowledgements are on their way to each node.
     """
 
     def __init__(
         self,
         post: Callable[[Callable[[], None]], None],
         copy: Callable[[Any], Any],
+        has_taken_in: Callable[[], bool] = lambda: True,
     ) -> None:
         self.post = post
         self.copy = copy
+        self.has_taken_in = has_taken_in
+        self.coming: dict[str, int] = defaultdict(int)
         self.received: dict[Connection, array[int]] = {}
         self.inboxes: dict[str, Inbox] = {}
         self._waiting: list[Connection] = []
@@ -61,8 +68,14 @@ class MemoryHub:
                 self._register(connection)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender of a connection how far its receiver has come."""
-        self.inboxes[connection.source_node].on_acknowledgement(connection, position)
+        """Tell the sender of a connection, as an event, how far its receiver has come."""
+        self.coming[connection.source_node] += 1
+        self.post(partial(self._acknowledge, connection, position))
+
+    def _acknowledge(self, connection: Connection, position: int) -> None:
+        sender = connection.source_node
+        self.coming[sender] -= 1
+        self.inboxes[sender].on_acknowledgement(connection, position)
 
     def leave(self, name: str) -> None:
         """Let what is under way to a node go nowhere."""
@@ -141,9 +154,12 @@ class MemoryTransport:
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
-        if not self._is_open:
-            return
-        self._hub.post(partial(self._hub.acknowledge, connection, position))
+        if self._is_open:
+            self._hub.acknowledge(connection, position)
+
+    def has_taken_in(self) -> bool:
+        """Whether nothing is on its way here, from within the process or from outside."""
+        return not self._hub.coming[self._name] and self._hub.has_taken_in()
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not joined yet."""
@@ -209,12 +225,16 @@ class _Channel:
 
     def send(self, packet: Any) -> None:
         if len(self._packets) < self._window:
-            self._hub.post(self._deliver)  # else an event is on its way for the one that is lost
+            # Else an event is on its way for the one that is lost.
+            self._hub.coming[self._connection.destination_node] += 1
+            self._hub.post(self._deliver)
         self._packets.append(packet)
 
     def _deliver(self) -> None:
         if self._digests:
             self._hub.received[self._connection].append(self._digests.popleft())
         connection = self._connection
-        inbox = self._hub.inboxes[connection.destination_node]
+        receiver = connection.destination_node
+        self._hub.coming[receiver] -= 1
+        inbox = self._hub.inboxes[receiver]
         inbox.on_packet(connection, self._packets.popleft())

@@ -60,6 +60,7 @@ class RosTransport:
         self._registrations: list[Registration] = []
         self._large = LargeCarriers(file, ros_node.get_logger().warning)
         self._is_open = False
+        self.has_taken_in = loop.has_taken_in
 
     def open(self, inbox: Inbox) -> None:
         """Create all endpoints and look for the other ends until each is found."""
@@ -73,6 +74,7 @@ class RosTransport:
                 self._open_receiver(connection, inbox)
         self._external.open(inbox)
         if self._registrations:
+            self._loop.expect_arrivals()
             self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
 
     def note_result(self, box: Sequence[Any]) -> None:

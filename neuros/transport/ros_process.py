@@ -65,10 +65,10 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._loop = RosLoop(self._context, on_failure)
+        self._loop = loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
         self._is_recorded = record
-        self._hub = MemoryHub(self._loop.post, copy_packet) if in_memory else None
+        self._hub = MemoryHub(loop.post, copy_packet, loop.has_taken_in) if in_memory else None
         self._ros_nodes: dict[str, PlainNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
@@ -108,8 +108,7 @@ class RosProcess:
         """Remember what exists on a ROS node before its plugin gets hold of it."""
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = _entities(ros_node)
-        callbacks = PluginCallbacks(ros_node, enter, fail, is_limited=self._loop.is_limited)
-        self._callbacks.append(callbacks)
+        self._callbacks.append(PluginCallbacks(ros_node, self._loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has created something on its ROS node that may call back."""

@@ -109,6 +109,7 @@ class Bench:
         sent: ``(connection, packet)`` to other nodes; ``external`` the same with topics' ports.
         acknowledged: ``(connection, position)`` sent to other nodes.
         log: all these together.
+        is_taken_in: whether all that has reached the node has been handled.
     """
 
     def __init__(
@@ -130,6 +131,7 @@ class Bench:
         self.log: list[tuple[Any, ...]] = []
         self.during_call: Callable[[], None] | None = None
         self.hook_s = 0.0
+        self.is_taken_in = True
         self.posted: deque[tuple[str, Callable[[], None]]] = deque()
         node = node_for("node", specs, connections, external_inputs, external_outputs)
         self.by_name: dict[str, Any] = {str(c): c for c in connections}
@@ -211,6 +213,9 @@ class Bench:
         for connection in connections:
             self.sent.append((str(connection), packet))
             self.log.append(("send", str(connection)))
+
+    def has_taken_in(self) -> bool:
+        return self.is_taken_in
 
     def send_external(self, port: Port, packet: Any) -> None:
         self.external.append((port.name, packet))

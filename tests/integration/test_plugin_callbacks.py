@@ -41,9 +41,7 @@ class Plugin:
         self.loop = RosLoop(context, self._fail_outside)
         self.ros = PlainNode("plugin", context)
         self.loop.add_node(self.ros)
-        self.callbacks = PluginCallbacks(
-            self.ros, self._enter, self._fail, is_limited=self.loop.is_limited
-        )
+        self.callbacks = PluginCallbacks(self.ros, self.loop, self._enter, self._fail)
 
     def run(self) -> None:
         """Until a callback has failed, or :meth:`stop`."""
