@@ -260,7 +260,7 @@ class Execution:
     def _supervisor(self, guardian: Guardian) -> Supervisor:
         return Supervisor(
             self._files,
-            self._plan.launcher(self._domain.id, guardian),
+            self._plan.launcher(guardian),
             self._environment(),
             self.folder,
             self._console,

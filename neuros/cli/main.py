@@ -195,7 +195,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     launch.add_argument(
         "--no-placement",
         action="store_true",
-        help="leave it to the kernel which node runs on which core; affinity has no effect",
+        help="ignore affinity: the kernel chooses the cores of every node",
     )
     add_observation(launch)
     add_dashboard_options(launch)

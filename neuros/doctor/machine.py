@@ -15,8 +15,8 @@ from pathlib import Path
 from neuros.doctor.findings import Finding, absent, bad, good
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
-from neuros.launch.affinity import usable_cores
 from neuros.launch.domain import choose_domain
+from neuros.launch.placement import usable_cores
 
 SHARED_MEMORY = Path("/dev/shm")
 _LEAST_SHARED_BYTES = 64 * 2**20
