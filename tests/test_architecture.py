@@ -41,6 +41,7 @@ def is_within(module: str, package: str) -> bool:
 SUPERVISOR = (
     "supervisor",
     "channels",
+    "declarations",
     "ending",
     "onlookers",
     "outcome",

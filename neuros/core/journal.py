@@ -9,7 +9,7 @@ one a reading of the clock. An entry costs some 0.1 us.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -40,6 +40,7 @@ class What(IntEnum):
     PAUSE = 12
     RESUME = 13
     STEP = 14  # place: 1 if some node of the project drives it; position: how many
+    LAST_ROUND = 15  # place: of a hook that starts at most once more when the node drains: next
 
 
 class Event(NamedTuple):
@@ -102,9 +103,11 @@ class JournalledEngine(Engine):
         self._note(_OFFER)
         return super().offer(packets, accepted)
 
-    def drain(self) -> None:
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        for place in last_round:
+            self._note(_entry(What.LAST_ROUND, place))
         self._note(_entry(What.DRAIN))
-        super().drain()
+        super().drain(last_round)
 
     def pause(self) -> None:
         self._note(_entry(What.PAUSE))

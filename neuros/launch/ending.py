@@ -9,6 +9,7 @@ import signal
 import time
 
 from neuros.launch.channels import Channels
+from neuros.launch.declarations import Declarations
 from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Output, Phase
 from neuros.launch.probing import Probing, Verdict
 from neuros.launch.processes import Processes, names_of
@@ -32,6 +33,7 @@ class Ending:
         self,
         channels: Channels,
         processes: Processes,
+        declarations: Declarations,
         probing: Probing,
         sides: Sides,
         outcome: Outcome,
@@ -42,6 +44,7 @@ class Ending:
         self._deadline_s = 0.0
         self._channels = channels
         self._processes = processes
+        self._declarations = declarations
         self._probing = probing
         self._sides = sides
         self._outcome = outcome
@@ -53,8 +56,11 @@ class Ending:
         """Whether something outlasts even SIGKILL; the guardian will try on for a while."""
         return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
 
-    def drain(self, reason: str, drain_s: float) -> None:
-        """Let packets under way arrive, and then end; only a run that is not ending already."""
+    def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
+        """Let packets under way arrive, and then end; only a run that is not ending already.
+
+        ``stopped`` is the node that asks for it, and starts no further hook.
+        """
         if self.phase is not Phase.RUNNING:
             return
         self.phase = Phase.DRAINING
@@ -68,7 +74,7 @@ class Ending:
         for process in self._processes.not_loaded():
             self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
             self._processes.kill(process)
-        self._channels.send("drain")
+        self._channels.send("drain", last_round=self._declarations.last_round(stopped))
         self._probing.drain(self._processes.killed, now_s)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:

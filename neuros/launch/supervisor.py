@@ -16,6 +16,7 @@ from typing import Any
 
 from neuros.control import Lines
 from neuros.launch.channels import Channels
+from neuros.launch.declarations import Declarations
 from neuros.launch.ending import STOP_S, Ending
 from neuros.launch.onlookers import Onlookers, Overheard, Pause
 from neuros.launch.outcome import Outcome, Output, Phase
@@ -92,9 +93,11 @@ class Supervisor:
             self._channels.send,
             self._sides if self._sides.exist else None,
         )
+        self._declarations = Declarations(files)
         self._ending = Ending(
             self._channels,
             self._processes,
+            self._declarations,
             self._probing,
             self._sides,
             self.outcome,
@@ -111,6 +114,10 @@ class Supervisor:
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
             "report": self._on_report,
+            "hooks": lambda _, message: self._declarations.take(message),
+            "finalising": lambda _, message: self._declarations.note_finalising(
+                message["node"], message["hook"]
+            ),
             "first_hook": self._on_first_hook,
             "shutdown": self._on_shutdown,
             "failed": self._on_failed,
@@ -177,7 +184,9 @@ class Supervisor:
     def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
         reason = f": {message['reason']}" if message["reason"] else ""
         self._ending.drain(
-            f"{message['node']} ended the project{reason}", float(message["drain_s"])
+            f"{message['node']} ended the project{reason}",
+            float(message["drain_s"]),
+            stopped=message["node"],
         )
 
     def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:

@@ -15,6 +15,7 @@ from neuros.control import Lines, connect
 from neuros.core.engine import Engine
 from neuros.core.journal import JournalledEngine
 from neuros.errors import NeurosError
+from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.runtime.callbacks import callback_error
@@ -104,10 +105,13 @@ class NodeProcess:
                 return
         self._middleware.loop.post_from_thread(event)
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked. Loop thread only."""
+    def drain(self, last_round: Mapping[str, Sequence[int]]) -> None:
+        """Stop the hooks that send unasked; ``last_round``, by node, start at most once more.
+
+        Loop thread only.
+        """
         for node in self._nodes:
-            node.drain()
+            node.drain(last_round.get(node.name, ()))
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`. Loop thread only."""
@@ -173,6 +177,7 @@ class NodeProcess:
                 return
             try:
                 node.load()
+                self._tell("hooks", node=node.name, **_declared(node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
         if self._is_ending:
@@ -260,6 +265,22 @@ class NodeProcess:
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)
+
+
+def _declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
+    """What the supervisor has to know of the hooks of a node."""
+    return {
+        "hooks": [
+            {
+                "kind": spec.kind.value,
+                "inputs": [[port.name, port.is_all, port.is_optional] for port in spec.inputs],
+                "outputs": [port.name for port in spec.outputs],
+            }
+            for spec in specs
+            if spec.kind is not HookKind.FINALISE
+        ],
+        "finalise": [spec.name for spec in specs if spec.kind is HookKind.FINALISE],
+    }
 
 
 def _keep_for_good() -> None:
