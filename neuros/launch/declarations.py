@@ -2,7 +2,7 @@
 
 A loop in which every hook waits for the one before it never comes to rest by itself, so a drained
 end has to stop it after one more round. Which hooks these are follows from their declarations:
-:func:`last_round`. They tell, too, which finalise hooks of a node that had to be killed did not run.
+:func:`last_round`. Of a node that had to be killed, they tell which finalise hooks did not run.
 """
 
 from __future__ import annotations
@@ -76,6 +76,10 @@ class Declarations:
         self._finalising[node] = hook
         if hook in self._finalisers.get(node, ()):
             self._finalisers[node].remove(hook)
+
+    def is_finalising(self, node: str) -> bool:
+        """Whether a node has come as far as its finalise hooks."""
+        return node in self._finalising
 
     def unfinished(self, node: str) -> list[str]:
         """What a node that has not made its final report owes: clauses about its finalise hooks."""

@@ -14,6 +14,8 @@ from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Output, Pha
 from neuros.launch.probing import Probing, Verdict
 from neuros.launch.processes import Processes, names_of
 from neuros.launch.sides import Sides
+from neuros.launch.watch import Watch, with_stack
+from neuros.ports import RunningNode
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
@@ -33,6 +35,7 @@ class Ending:
         self,
         channels: Channels,
         processes: Processes,
+        watch: Watch,
         declarations: Declarations,
         probing: Probing,
         sides: Sides,
@@ -44,6 +47,7 @@ class Ending:
         self._deadline_s = 0.0
         self._channels = channels
         self._processes = processes
+        self._watch = watch
         self._declarations = declarations
         self._probing = probing
         self._sides = sides
@@ -94,6 +98,7 @@ class Ending:
                 self._outcome.is_signalled = True
             elif self.phase is Phase.STOPPING and self._outcome.is_signalled:
                 self._output.log("WARN", f"{name} again: killing what is left")
+                self._outcome.end_by_force(EXIT_CODES[number], name)
                 self._kill_all()
             elif self.phase is Phase.STOPPING:
                 self._outcome.is_signalled = True
@@ -123,20 +128,35 @@ class Ending:
                 self._stop()
             elif now_s >= self._deadline_s:
                 why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
-                self._output.log("WARN", f"not drained in time, so packets may be lost: {why}")
+                self._output.log("WARN", f"not drained in time: {why}")
+                self._outcome.late_drain = why
                 self._stop()
 
     def _look_at_stopping(self, now_s: float) -> None:
         if now_s >= self._deadline_s:
             for process in self._processes:
-                self._output.log(
-                    "WARN", f"{names_of(process)}: not ended after {STOP_S:g} s, killed"
-                )
+                self._fail_to_end(process)
             self._kill_all()
         elif self._sides.exist and self._processes.have_reported():
             may_go = self._sides.finish(self._outcome.reports, now_s)
             if may_go or self._deadline_s - now_s < _CLOSING_S:
                 self._channels.send("leave")
+
+    def _fail_to_end(self, process: RunningNode) -> None:
+        """Its nodes have had their time."""
+        nodes = "node" if len(process.names) == 1 else "nodes"
+        unfinished = []
+        for name in process.names:
+            if self._outcome.has_final_report(name):
+                continue
+            hook = self._watch.executing(name)
+            if hook and not self._declarations.is_finalising(name):
+                unfinished.append(f"'{name}' was still executing '{hook}'")
+            unfinished += self._declarations.unfinished(name)
+        why = "; ".join(unfinished) or "its process did not end"
+        self._outcome.fail(
+            f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
+        )
 
     def _stop_with(self, exit_code: int, reason: str) -> None:
         self._outcome.exit_code, self._outcome.reason = exit_code, reason
@@ -156,4 +176,9 @@ class Ending:
         self.phase = Phase.KILLED
         self._deadline_s = time.monotonic() + STOP_S
         for process in self._processes:
+            for name in process.names:
+                if stack := self._watch.stack_of(name):
+                    self._outcome.stacks[name] = stack.text
+                    text = f"{name} was at this point when it was killed"
+                    self._output.log("ERROR", with_stack(text, stack))
             self._processes.kill(process)

@@ -24,6 +24,7 @@ from neuros.runtime.failures import as_node_error
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
+from neuros.stacks import StackFile
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
@@ -64,6 +65,7 @@ class NodeProcess:
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._lines: Lines | None = None
+        self._stack_file: StackFile | None = None
         self._side = SideLink(
             [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
         )
@@ -73,6 +75,9 @@ class NodeProcess:
         run_folder = self._files[0].folders.run
         os.chdir(run_folder)
         self._lines = connect(run_folder)
+        own_folder = run_folder / self._files[0].node.name
+        plugins = {file.node.name: file.node.plugin for file in self._files}
+        self._stack_file = StackFile(own_folder, plugins)
         self._tell("hello", nodes=[file.node.name for file in self._files], pid=os.getpid())
         with signals_as_socket() as signalled:
             thread = ControlThread(self._lines, signalled, self)
@@ -146,6 +151,8 @@ class NodeProcess:
 
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
+        if self._stack_file is not None:
+            self._stack_file.renew()
         for node in tuple(self._nodes):
             node.reports.write_books()
             self._tell("report", **node.reports.state(), is_final=is_final)
