@@ -63,12 +63,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import socket
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 SOCKET_NAME = "control.sock"
+_NO_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 class Lines:
@@ -120,7 +122,9 @@ class Lines:
 
 def encode_line(kind: str, fields: Mapping[str, Any]) -> bytes:
     """One object as it goes through the socket."""
-    return json.dumps({"kind": kind, **fields}).encode() + b"\n"
+    text = json.dumps({"kind": kind, **fields}, ensure_ascii=False)
+    # What is no character cannot be written anywhere: both ends see its escape in its place.
+    return _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text).encode() + b"\n"
 
 
 @contextlib.contextmanager
