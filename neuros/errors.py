@@ -27,6 +27,11 @@ class NeurosError(Exception):
     """Base of all errors that NeuROS raises on purpose; its text is written for the user."""
 
 
+def printable(text: str) -> str:
+    r"""A text that can be written as UTF-8: half a character, as ``'\udc80'``, is spelt out."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 @dataclass(frozen=True, order=True)
 class Problem:
     """One thing wrong in a project file, or a file of a message package.

@@ -41,6 +41,7 @@ def is_within(module: str, package: str) -> bool:
 SUPERVISOR = (
     "supervisor",
     "channels",
+    "declarations",
     "ending",
     "onlookers",
     "outcome",
@@ -58,7 +59,7 @@ ROOMS = (
     Room(1, ("hooks",)),
     Room(1, ("project",)),
     Room(2, ("core",)),
-    Room(3, ("ports", "control")),
+    Room(3, ("ports", "control", "stacks")),
     Room(3, ("convert",)),
     Room(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
     Room(4, ("launch",)),

@@ -150,10 +150,15 @@ class Engine:
         self._pass()
         return withdraw
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; the others go on."""
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; the others go on.
+
+        Args:
+            last_round: places in :attr:`all_hooks` of hooks that would go on for ever (each of a
+                loop waits for the one before): they start at most once more.
+        """
         self._wake()
-        self._life.drain()
+        self._life.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
         self.resume()
 
@@ -324,6 +329,8 @@ class Engine:
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._life.tick_start_ns, start_ns)
+        if self._life.last_round and hook in self._life.last_round:
+            self._life.finish_round(hook)
         self._spent_ns[SCHEDULING] += start_ns - self.since_ns
         self.since_ns = start_ns
         self.executing = hook

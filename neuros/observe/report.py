@@ -31,6 +31,7 @@ class Ended(Protocol):
     ending_s: float | None
     ended_s: float
     paused_s: float
+    stacks: dict[str, str]
 
 
 def run_record(
@@ -64,7 +65,11 @@ def run_record(
             for c in _connections(files)
         ],
         "nodes": {
-            name: {**_node(name, ended), "results": _results(run_folder / name)}
+            name: {
+                **_node(name, ended),
+                "results": _results(run_folder / name),
+                **({"stack": ended.stacks[name]} if name in ended.stacks else {}),
+            }
             for name in (file.node.name for file in files)
         },
         "expanded_project": project_to_json(project),

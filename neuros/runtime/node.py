@@ -72,6 +72,7 @@ class NodeRuntime:
         self._middleware = middleware
         self._clock = clock
         self._make_engine = make_engine
+        self._tell = tell
         self._stage = stage
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
         self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
@@ -159,9 +160,12 @@ class NodeRuntime:
             self._middleware.loop.add_timer(lambda: engine.next_due_ns, self.on_timer)
         self._guard(self._loaded.start)
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; after a pause, the others go on."""
-        self._guard(self._loaded.drain)
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; after a pause, the others go on.
+
+        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        """
+        self._guard(lambda: self._loaded.drain(last_round))
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -186,6 +190,7 @@ class NodeRuntime:
         if self.engine is not None:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
+                    self._tell("finalising", node=self.name, hook=spec.name)
                     self._guard(partial(self._effects.run, spec))
         if self._keeper is not None:
             self._keeper.close()
