@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from neuros.api.workspace import WORKSPACE
-from neuros.errors import ProjectError
+from neuros.errors import Problem, ProjectError
+from neuros.launch.containers import misspelt
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
@@ -43,7 +45,15 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    return loaded, messages
+    return replace(loaded, warnings=(*loaded.warnings, *_misspelt(loaded))), messages
+
+
+def _misspelt(loaded: Loaded) -> Iterator[Problem]:
+    """The containers that are probably meant to be others."""
+    for node in loaded.project.nodes:
+        if meant := misspelt(node.container, loaded.project.folder):
+            text = f"there is no container '{node.container}'"
+            yield Problem(f"node '{node.name}'", 0, 0, "", text, f"did you mean '{meant}'?")
 
 
 def workspaces_of(project: Path) -> Workspaces:

@@ -80,6 +80,7 @@ class PluginFile:
         hooks: those that are known.
         mistakes: what would keep a node from starting, whatever its ports are.
         doubts: what may be a mistake.
+        imports: the modules that it imports.
         texts: all text constants.
         model_arguments: what is given to ``MuJoCo`` as its model.
         sets_timestep: whether it may change the timestep of a model.
@@ -89,6 +90,7 @@ class PluginFile:
     hooks: list[DeclaredHook] = field(default_factory=list)
     mistakes: list[Remark] = field(default_factory=list)
     doubts: list[Remark] = field(default_factory=list)
+    imports: frozenset[str] = frozenset()
     texts: frozenset[str] = frozenset()
     model_arguments: tuple[ast.expr, ...] = ()
     sets_timestep: bool = False
@@ -179,7 +181,9 @@ class _Reader:
         plugin.texts = frozenset(c.value for c in constants if isinstance(c.value, str))
         plugin.model_arguments = tuple(self._model_arguments())
         plugin.sets_timestep = any(
-            isinstance(node, ast.Attribute) and node.attr in ("opt", "option", "timestep")
+            isinstance(node, ast.Attribute)
+            and (node.attr in ("opt", "option") or isinstance(node.ctx, ast.Store))
+            and node.attr in ("opt", "option", "timestep")
             for node in self._nodes
         )
 
@@ -190,11 +194,13 @@ class _Reader:
             self._origins.setdefault(name, set()).add(origin)
 
         if isinstance(node, ast.Import):
+            self._plugin.imports |= {alias.name for alias in node.names}
             for alias in node.names:
                 top = alias.name.partition(".")[0]
                 bind(alias.asname or top, alias.name if alias.asname else top)
         elif isinstance(node, ast.ImportFrom):
             module = "." * node.level + (node.module or "")
+            self._plugin.imports |= {module}
             for alias in node.names:
                 if alias.name == "*":
                     self._stars.append(module)
@@ -260,7 +266,18 @@ class _Reader:
                 "neuros.simulators.mujoco.simulator.MuJoCo",
             ):
                 given = [k.value for k in node.keywords if k.arg == "model"] or node.args[1:2]
-                yield given[0] if given else ast.Constant(None)
+                yield self._value(given[0]) if given else ast.Constant(None)
+
+    def _value(self, expression: ast.expr) -> ast.expr:
+        """What a name is bound to, once and for all; anything else as it is."""
+        if isinstance(expression, ast.Name):
+            name = expression.id
+            made = [each for each in self._nodes if getattr(each, "targets", None)]
+            values = [a.value for a in made if isinstance(a, ast.Assign) and _binds(a, name)]
+            stores = [n for n in self._nodes if isinstance(n, ast.Name) and n.id == name]
+            if sum(not isinstance(n.ctx, ast.Load) for n in stores) == len(values) == 1:
+                return values[0]
+        return expression
 
     # ------------------------------------------------------------------ hooks
 
@@ -432,6 +449,10 @@ class _Reader:
         remark = Remark(line, column, text, hint)
         if remark not in self._plugin.mistakes:
             self._plugin.mistakes.append(remark)
+
+
+def _binds(assignment: ast.Assign, name: str) -> bool:
+    return any(isinstance(each, ast.Name) and each.id == name for each in assignment.targets)
 
 
 def _module_level(
