@@ -46,6 +46,7 @@ class Project:
         self.settings = dict(settings)
         self._path = file
         self._loaded = self._load()
+        self._said = {*self._loaded.warnings}
         self.file = self._loaded.project.file
 
     @classmethod
@@ -247,8 +248,9 @@ class Project:
             seeds = seed_texts(loaded.project, seed)
             loaded, messages = load_with_messages(self._path, [*texts, *seeds])
         for warning in loaded.warnings:
-            if warning not in self._loaded.warnings:
-                warnings.warn(str(warning), stacklevel=2)
+            if warning not in self._said:
+                self._said.add(warning)
+                warnings.warn(str(warning), stacklevel=3)
         return loaded.project, messages
 
 
