@@ -99,18 +99,15 @@ def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
     model = _model(models[0], node, project)
     if model is None:
         return
-    import mujoco
-
+    from neuros.simulators.mujoco.build import timestep_of
     from neuros.simulators.mujoco.timebase import Timebase
 
     try:
-        is_text = isinstance(model, str)
-        spec = (mujoco.MjSpec.from_string if is_text else mujoco.MjSpec.from_file)(str(model))
+        time = Timebase(timestep_of(model))
     except ValueError as error:
-        where = display_name(node.plugin if isinstance(model, str) else model)
+        where = display_name(model if isinstance(model, Path) else node.plugin)
         yield Problem(where, 0, 0, "", " ".join(str(error).split()))
         return
-    time = Timebase(spec.option.timestep)
     for index, rate in _rates(node).items():
         try:
             time.period_steps(rate)

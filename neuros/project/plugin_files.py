@@ -18,7 +18,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
-from neuros import hooks as declarations
 from neuros.project.suggest import did_you_mean
 
 _HOOKS = "neuros.hooks"
@@ -28,6 +27,10 @@ _ARGUMENTS = {
     "neuros_function": ("inputs", "outputs"),
     "neuros_finalise": (),
 }
+_FOR_TOOLS = ("HookKind", "HookSpec", "InputSpec", "OutputSpec", "hook_specs_of")
+PUBLIC_NAMES = ("All", "Optional", *_ARGUMENTS, *_FOR_TOOLS)
+"""What there is in ``neuros.hooks``."""
+
 # Packages whose functions are no hooks; those of any other one may be.
 _WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "numpy", "rclpy", "scipy"}
 # With these, a plugin may make hooks in ways that are not to be seen.
@@ -97,7 +100,9 @@ class PluginFile:
 
 
 def read_plugin(path: Path) -> PluginFile | None:
-    """What a plugin declares; ``None`` if the file cannot be read."""
+    """What a plugin declares; ``None`` if the file cannot be read, or is a compiled one."""
+    if path.suffix != ".py":
+        return None
     try:
         status = path.stat()
         return _read(path, status.st_mtime_ns, status.st_size)
@@ -213,8 +218,8 @@ class _Reader:
             bind(node.name, "")
 
     def _check_import(self, node: ast.ImportFrom, module: str, name: str) -> None:
-        if module == _HOOKS and not hasattr(declarations, name):
-            hint = did_you_mean(name, declarations.__all__)
+        if module == _HOOKS and name not in PUBLIC_NAMES:
+            hint = did_you_mean(name, PUBLIC_NAMES)
             self._mistake(node, f"neuros.hooks has no '{name}'", hint)
 
     def _meaning(self, expression: ast.expr) -> str:
@@ -225,7 +230,7 @@ class _Reader:
         if not isinstance(expression, ast.Name):
             return ""
         origins = self._origins.get(expression.id, set())
-        if not origins and self._stars == [_HOOKS] and expression.id in declarations.__all__:
+        if not origins and self._stars == [_HOOKS] and expression.id in PUBLIC_NAMES:
             return f"{_HOOKS}.{expression.id}"
         return next(iter(origins)) if len(origins) == 1 else ""
 
@@ -236,7 +241,7 @@ class _Reader:
             return name
         is_forgotten = (
             isinstance(expression, ast.Name)
-            and expression.id in declarations.__all__
+            and expression.id in PUBLIC_NAMES
             and expression.id not in self._origins
             and not self._stars
         )
@@ -339,7 +344,7 @@ class _Reader:
             return
         try:
             value = ast.literal_eval(seconds)
-        except ValueError:
+        except (TypeError, ValueError):
             return
         if isinstance(value, bool) or not isinstance(value, int | float):
             self._mistake(seconds, f"{who}: seconds={value!r} is not a number")
@@ -351,6 +356,8 @@ class _Reader:
     ) -> tuple[DeclaredPort, ...] | None:
         if written is None or (isinstance(written, ast.Constant) and written.value is None):
             return ()
+        if isinstance(written, ast.Dict):
+            return None  # its keys are the ports
         is_list = isinstance(written, ast.List | ast.Tuple | ast.Set)
         entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
         ports = [self._port(function, entry, is_input=is_input) for entry in entries]

@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import neuros.hooks
 from neuros.errors import HookError, ProjectError
 from neuros.project.load import Loaded, load_project
-from neuros.project.plugin_files import read_plugin
+from neuros.project.plugin_files import PUBLIC_NAMES, read_plugin
 from neuros.testing import PluginHarness
 
 INT = "std_msgs/msg/Int32"
@@ -75,9 +76,6 @@ def doubts(check: Check, text: str, overrides: Sequence[str] = ()) -> list[str]:
     """What is said of a project that is valid, but for what is not connected."""
     loaded = check(text, overrides=overrides)
     return [str(each) for each in loaded.warnings if "is not connected" not in each.text]
-
-
-HOOK = "brain.py:2:1: hook 'f'"
 
 
 @pytest.mark.parametrize(
@@ -165,6 +163,10 @@ def test_a_mistake_is_said_with_its_line(check: Check, text: str, expected: str)
     assert found.startswith(expected)
 
 
+def test_the_names_that_plugins_may_import_are_known() -> None:
+    assert {*PUBLIC_NAMES} == {*neuros.hooks.__all__}
+
+
 @pytest.mark.parametrize(
     ("head", "text", "expected"),
     [
@@ -233,6 +235,8 @@ def test_all_mistakes_of_a_project_are_said_at_once(check: Check, tmp_path: Path
         "@neuros_function('imu')\ndef f(node, imu, factor=2.0, **more): pass",
         "@neuros_tick(1)\ndef f(node):\n  def values(): yield 1\n  return None",
         "@neuros_tick(1e-3 * 20)\ndef f(node): pass",
+        "@neuros_tick({(): 1}[()])\ndef f(node): pass",
+        "@neuros_function(inputs={'imu': 1})\ndef f(node, imu): pass",
         "@neuros_tick(1)\n@neuros_function('imu')\ndef f(node, imu=None): pass",
         "Optional = print\n@neuros_function(Optional(3))\ndef f(node, x): pass",
         "@neuros_function(inputs=Optional(All('loose')))\ndef f(node, x): pass",
@@ -274,6 +278,13 @@ def test_what_is_no_python_at_all_is_no_crash(tmp_path: Path, content: bytes) ->
     plugin = read_plugin(tmp_path / "p.py")
     assert plugin is not None
     assert plugin.mistakes
+
+
+@pytest.mark.parametrize("name", ["brain.cpython-311-x86_64-linux-gnu.so", "brain.pyc", "gone.py"])
+def test_what_is_no_source_is_left_to_the_node(tmp_path: Path, name: str) -> None:
+    if name != "gone.py":
+        (tmp_path / name).write_bytes(b"\x7fELF")
+    assert read_plugin(tmp_path / name) is None
 
 
 # ------------------------------------------------------------------ as a node says it
