@@ -155,42 +155,37 @@ class _Reader:
             self._bind(node)
 
     def read(self) -> None:
-        plugin, previous = self._plugin, dict[str, int]()
-        for statement, is_certain in _module_level(self._tree.body):
-            if isinstance(statement, (*_FUNCTIONS, ast.ClassDef)) and is_certain:
-                if statement.name in previous:
-                    self._plugin.doubts.append(
-                        Remark(
-                            previous[statement.name],
-                            1,
-                            f"hook '{statement.name}' is lost: line {statement.lineno} defines"
-                            f" another '{statement.name}'",
-                        )
-                    )
-                previous.pop(statement.name, None)
-            if isinstance(statement, _FUNCTIONS) and is_certain:
-                before = len(plugin.hooks)
-                self._read_function(statement)
-                if len(plugin.hooks) > before:
-                    previous[statement.name] = statement.lineno
+        plugin, nodes = self._plugin, self._nodes
+        self._read_statements()
         if not plugin.hooks and not plugin.mistakes and not self._may_have_hooks():
-            plugin.mistakes.append(
-                Remark(
-                    1,
-                    1,
-                    "declares no hooks",
-                    "mark functions with @neuros_function or @neuros_tick from neuros.hooks",
-                )
-            )
-        constants = (node for node in self._nodes if isinstance(node, ast.Constant))
-        plugin.texts = frozenset(c.value for c in constants if isinstance(c.value, str))
+            hint = "mark functions with @neuros_function or @neuros_tick from neuros.hooks"
+            plugin.mistakes.append(Remark(1, 1, "declares no hooks", hint))
+        constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+        plugin.texts = frozenset(value for value in constants if isinstance(value, str))
         plugin.model_arguments = tuple(self._model_arguments())
+        attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
         plugin.sets_timestep = any(
-            isinstance(node, ast.Attribute)
-            and (node.attr in ("opt", "option") or isinstance(node.ctx, ast.Store))
-            and node.attr in ("opt", "option", "timestep")
-            for node in self._nodes
+            node.attr in ("opt", "option")
+            or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
+            for node in attributes
         )
+
+    def _read_statements(self) -> None:
+        """What is executed in any case when the plugin is imported."""
+        lines: dict[str, int] = {}  # of the last hook of each name
+        for statement in (
+            each for each, is_certain in _module_level(self._tree.body) if is_certain
+        ):
+            if isinstance(statement, ast.ImportFrom):
+                self._check_import(statement)
+            if not isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
+                continue
+            name, line = statement.name, statement.lineno
+            if name in lines:
+                text = f"hook '{name}' is lost: line {line} defines another '{name}'"
+                self._plugin.doubts.append(Remark(lines.pop(name), 1, text))
+            if isinstance(statement, _FUNCTIONS) and self._read_function(statement):
+                lines[name] = line
 
     # ------------------------------------------------------------------ what names mean
 
@@ -211,16 +206,16 @@ class _Reader:
                     self._stars.append(module)
                 else:
                     bind(alias.asname or alias.name, f"{module}.{alias.name}")
-                    self._check_import(node, module, alias.name)
         elif isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
             bind(node.id, "")
         elif isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
             bind(node.name, "")
 
-    def _check_import(self, node: ast.ImportFrom, module: str, name: str) -> None:
-        if module == _HOOKS and name not in PUBLIC_NAMES:
-            hint = did_you_mean(name, PUBLIC_NAMES)
-            self._mistake(node, f"neuros.hooks has no '{name}'", hint)
+    def _check_import(self, node: ast.ImportFrom) -> None:
+        for alias in node.names if node.module == _HOOKS and not node.level else ():
+            if alias.name not in ("*", *PUBLIC_NAMES):
+                hint = did_you_mean(alias.name, PUBLIC_NAMES)
+                self._mistake(node, f"neuros.hooks has no '{alias.name}'", hint)
 
     def _meaning(self, expression: ast.expr) -> str:
         """The dotted name behind an expression, empty if it is not known."""
@@ -286,7 +281,8 @@ class _Reader:
 
     # ------------------------------------------------------------------ hooks
 
-    def _read_function(self, function: _Function) -> None:
+    def _read_function(self, function: _Function) -> bool:
+        """Read the hooks that a function is; returns whether it is any."""
         marks = [(each, self._kind(each)) for each in function.decorator_list]
         is_plain = all(kind for _, kind in marks)
         for decorator, kind in marks:
@@ -298,6 +294,7 @@ class _Reader:
                 self._check_signature(function, hook.inputs)
         if is_plain and marks:
             self._check_kind_of_function(function)
+        return any(kind for _, kind in marks)
 
     def _kind(self, decorator: ast.expr) -> str:
         called = decorator.func if isinstance(decorator, ast.Call) else decorator

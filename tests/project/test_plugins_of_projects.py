@@ -229,6 +229,7 @@ def test_all_mistakes_of_a_project_are_said_at_once(check: Check, tmp_path: Path
         "from common import step",
         "from common import *",
         "globals()['f'] = 1",
+        "try:\n  from neuros.hooks import neuros_new\nexcept ImportError: pass\n" + FINE,
         "@neuros_function(*['imu'])\ndef f(node): pass",
         "@neuros_function(**{'inputs': 'imu'})\ndef f(node): pass",
         "@neuros_function('imu')\ndef f(*packets): pass",
