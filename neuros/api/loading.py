@@ -9,10 +9,12 @@ from pathlib import Path
 
 from neuros.api.workspace import WORKSPACE
 from neuros.errors import Problem, ProjectError
-from neuros.launch.containers import misspelt
+from neuros.launch.containers import find_container, misspelt
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
+from neuros.project.message_types import unknown_type
+from neuros.project.scanner import display_name, place_of
 
 
 def load_with_messages(
@@ -45,7 +47,8 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    return replace(loaded, warnings=(*loaded.warnings, *_misspelt(loaded))), messages
+    doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces))
+    return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
 
 def _misspelt(loaded: Loaded) -> Iterator[Problem]:
@@ -54,6 +57,23 @@ def _misspelt(loaded: Loaded) -> Iterator[Problem]:
         if meant := misspelt(node.container, loaded.project.folder):
             text = f"there is no container '{node.container}'"
             yield Problem(f"node '{node.name}'", 0, 0, "", text, f"did you mean '{meant}'?")
+
+
+def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
+    """Message types that are not here, nor named in the folder of the node's container."""
+    for node in loaded.project.nodes:
+        container = find_container(node.container, loaded.project.folder)
+        if container is None or container.is_own:  # an image of the user's; or it was a mistake
+            continue
+        files = (file for file in container.folder.glob("*") if file.is_file())
+        recipe = "".join(file.read_text("utf-8", "replace") for file in files).replace("-", "_")
+        for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
+            for index, port in enumerate(ports):
+                unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
+                if unknown and port.type.partition("/")[0] not in recipe:
+                    pointer = f"{node.pointer}/{side}/{index}/type"
+                    place = place_of(node.file, pointer)
+                    yield Problem(display_name(node.file), *place, pointer, *unknown)
 
 
 def workspaces_of(project: Path) -> Workspaces:

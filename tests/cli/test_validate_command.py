@@ -139,3 +139,25 @@ def test_a_sweep_over_what_nothing_reads_says_so_once(capsys: pytest.CaptureFixt
         "warning: --set nodes.robot.environment.SPEDE=1:1:1: nothing in the plugin of node 'robot'"
         " reads SPEDE (did you mean 'SPEED'?)\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("recipe", "is_said"),
+    [
+        ({"requirements.txt": "numpy\n"}, True),
+        ({"Dockerfile": "RUN add ros-jazzy-arm-msgs\n"}, False),
+    ],
+    ids=["not named", "named"],
+)
+def test_a_message_type_of_which_a_container_of_ones_own_says_nothing_is_a_warning(
+    recipe: dict[str, str], is_said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path("containers/arm")
+    folder.mkdir(parents=True)
+    for name, text in recipe.items():
+        (folder / name).write_text(text)
+    port = {"name": "joints", "type": "arm_msgs/msg/Joints", "external_topic": "joints"}
+    write(f"{HEAD}@neuros_function('joints')\ndef f(node, x): ...", container="arm", inputs=[port])
+    assert main(["validate", "."]) == 0
+    said = "/nodes/0/inputs/0/type: unknown message type 'arm_msgs/msg/Joints': there is no message"
+    assert (said in capsys.readouterr().err) is is_said
