@@ -16,6 +16,9 @@ from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
 from neuros.project.scanner import display_name, place_of
 
+_LONG_BYTES = 1 << 20
+"""A file of a container's folder from this size on is data, not a recipe."""
+
 
 def load_with_messages(
     path: Path,
@@ -65,15 +68,21 @@ def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
         container = find_container(node.container, loaded.project.folder)
         if container is None or container.is_own:  # an image of the user's; or it was a mistake
             continue
-        files = (file for file in container.folder.glob("*") if file.is_file())
-        recipe = "".join(file.read_text("utf-8", "replace") for file in files).replace("-", "_")
         for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
             for index, port in enumerate(ports):
                 unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
-                if unknown and port.type.partition("/")[0] not in recipe:
+                package = port.type.partition("/")[0]
+                if unknown and not _names_package(container.folder, package):
                     pointer = f"{node.pointer}/{side}/{index}/type"
                     place = place_of(node.file, pointer)
                     yield Problem(display_name(node.file), *place, pointer, *unknown)
+
+
+def _names_package(folder: Path, package: str) -> bool:
+    """Whether a file of a container's folder names a package, as ROS or as Debian and pip do."""
+    files = [file for file in folder.iterdir() if file.is_file()]
+    short = (file for file in files if file.stat().st_size < _LONG_BYTES)
+    return any(package in file.read_text("utf-8", "replace").replace("-", "_") for file in short)
 
 
 def workspaces_of(project: Path) -> Workspaces:

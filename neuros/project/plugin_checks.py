@@ -120,7 +120,7 @@ def unread_variables(
         plugin, sources = read_plugin(node.plugin), _sources(node, draft.roots.project)
         if plugin is None or sources is None:
             continue
-        word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)")
+        word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)", re.IGNORECASE)
         if any(word.search(source) or _COMPUTED.search(source) for source in sources):
             continue
         candidates = {text for text in plugin.texts if _VARIABLE.fullmatch(text)}
