@@ -11,9 +11,11 @@ from describing import CUBE, Folder, link, positions
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuros.convert.find import Finder
 from neuros.convert.flat import _convex_hull
 from neuros.convert.output import write_mjcf
 from neuros.convert.poses import from_rpy
+from neuros.convert.urdf import read_urdf
 
 CORNERS = np.array([(-2, -1, 0), (2, -1, 0), (2, 1, 0), (-2, 1, 0)], float)
 FACES = "f 1 2 3\nf 1 3 4\n"
@@ -109,6 +111,23 @@ def test_a_flat_mesh_that_had_to_be_converted_is_not_written(folder: Folder) -> 
     assert write_mjcf(converted, folder.path / "model.sdf", output) == [output]
     model = mujoco.MjModel.from_xml_path(str(output))
     assert model.geom("floor/hull").type == mujoco.mjtGeom.mjGEOM_BOX
+
+
+def test_the_same_in_urdf(folder: Folder) -> None:
+    folder.write("floor.obj", obj(CORNERS))
+    mesh = '<geometry><mesh filename="floor.obj"/></geometry>'
+    file = folder.write(
+        "hall.urdf",
+        f"""<robot name="hall">
+        <link name="floor"><visual>{mesh}</visual><collision>{mesh}</collision></link>
+        </robot>""",
+    )
+    converted = read_urdf(file, Finder(()))
+    model = converted.spec.compile()
+    (note,) = converted.not_taken
+    assert note.path == "link[floor]"
+    assert note.why == WHY
+    assert sorted(model.geom_type) == [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH]
 
 
 def test_another_mesh_that_cannot_be_used_is_still_an_error(folder: Folder) -> None:
