@@ -84,9 +84,10 @@ def test_a_ball_lies_on_it(folder: Folder) -> None:
 
 
 def test_a_mesh_with_two_faces_has_its_box_around_it(folder: Folder) -> None:
-    folder.write("wall.obj", obj(CORNERS, BOTH))
+    place = from_rpy(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    folder.write("wall.obj", obj(CORNERS @ place.rotation.T + place.position, BOTH))
     model = folder.model(STATIC + link("wall", shape("collision", "hull", "wall.obj")))
-    assert model.geom("wall/hull").pos == pytest.approx([0, 0, 0], abs=1e-6)
+    assert model.geom("wall/hull").pos == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
 
 
 def test_a_box_that_covers_more_than_the_mesh_is_listed_as_such(folder: Folder) -> None:
