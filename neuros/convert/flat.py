@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.convert.meshes import Triangles, add_mesh, compile_alone
+from neuros.convert.meshes import SHELL, Triangles, compile_alone
 from neuros.convert.poses import Pose, Vector, from_quaternion
 
 _FLAT = 1e-4  # how thick, at most, by how long
@@ -41,7 +41,7 @@ def has_flat_meshes(model: Any) -> bool:
 
 
 def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
-    """Turn the colliding geoms of flat meshes into boxes.
+    """Turn the colliding geoms of flat meshes into boxes, in a spec that was never compiled.
 
     ``made`` are the triangles of meshes that have no file. Returns the geoms; those that only show
     a flat mesh stay as they are.
@@ -58,12 +58,11 @@ def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Sl
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_BOX, ""
             geom.size, geom.pos, geom.quat = slab.half_lengths, pose.position, pose.quaternion
             boxed.append((geom, slab))
-        name, file, scale = mesh.name, mesh.file, mesh.scale.copy()
-        spec.delete(mesh)  # it would remember that it has collided
         if len(colliding) < len(geoms):
-            add_mesh(spec, name, file, scale, made.get(name), is_solid=False)
+            mesh.inertia = SHELL
         else:
-            made.pop(name, None)
+            made.pop(mesh.name, None)
+            spec.delete(mesh) if hasattr(spec, "delete") else mesh.delete()  # until MuJoCo 3.3
     return boxed
 
 
