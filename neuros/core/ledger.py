@@ -14,6 +14,7 @@ from neuros.core.engine import Engine
 from neuros.core.flow import Outlet
 from neuros.core.hook import Hook
 from neuros.core.inputs import Inlet
+from neuros.hooks import HookKind
 
 _T = TypeVar("_T")
 
@@ -31,7 +32,8 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
         ``incoming``: the same; an external topic is ``/topic -> b.in``.
-        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals.
+        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
+        those that initialise, how many of the seconds that took.
         ``accounting``: seconds by cause; ``total`` is the sum of all others.
     """
     hooks = tuple(engine.all_hooks)
@@ -105,6 +107,8 @@ def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
         entry["executions"] += hook.executions
         entry["busy_s"] += hook.busy_ns / 1e9
         entry["missed_ticks"] += hook.missed_ticks
+        if hook.spec.kind is HookKind.INITIALISE:
+            entry["initialise_s"] = entry.get("initialise_s", 0.0) + hook.busy_ns / 1e9
         if hook.ticks is not None:
             entry["ticks"] = steadily(hook.ticks.figures, None)
     return books

@@ -61,6 +61,7 @@ class RosLoop:
     ``on_failure`` gets whatever an event raises, in the loop's thread.
 
     Attributes:
+        has_taken_in: whether all that ROS had waiting when a hook or callback ended is handled.
         turns: how many turns the events of engines have had.
     """
 
@@ -72,7 +73,7 @@ class RosLoop:
         self._turn = Turn(self._take_turn)
         self._has_posted_turn = False
         self._is_turn_stale = False
-        self._has_taken_in = True
+        self.has_taken_in = True
         self._has_arrivals = False
         self.turns = 0
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
@@ -102,18 +103,14 @@ class RosLoop:
         """From now on, ROS brings what hooks wait for, and not the nodes of this process alone."""
         self._has_arrivals = True
 
-    def has_taken_in(self) -> bool:
-        """Whether all that ROS had waiting when a hook or callback ended has been handled."""
-        return self._has_taken_in
-
     def note_execution(self) -> None:
         """A hook or callback has ended: what has arrived until now comes before the next hook.
 
         Callbacks that are taken in then put that off no further, however many keep coming.
         """
-        if not (self._has_arrivals and self._has_taken_in):
+        if not (self._has_arrivals and self.has_taken_in):
             return
-        self._has_taken_in = False
+        self.has_taken_in = False
         if self._has_posted_turn:
             self._is_turn_stale = True
         else:
@@ -217,7 +214,7 @@ class RosLoop:
             self._is_turn_stale = False
             self._post_turn()
             return
-        self._has_taken_in = True
+        self.has_taken_in = True
         self.turns += 1
         events = self._events
         begin_ns = now_ns = time.monotonic_ns()
@@ -233,7 +230,7 @@ class RosLoop:
                 event()
             except BaseException as error:
                 self._on_failure(error)
-            if not self._has_taken_in:
+            if not self.has_taken_in:
                 break
             since_ns, now_ns = now_ns, time.monotonic_ns()
             if now_ns - begin_ns > length_ns:

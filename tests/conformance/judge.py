@@ -296,7 +296,9 @@ class Judge:
         for log in together:
             for a, b in itertools.pairwise(log):
                 if b.start_ns < a.end_ns:
-                    yield Violation("single thread", f"{b.node}.{b.hook} starts in {a.node}.{a.hook}")
+                    yield Violation(
+                        "single thread", f"{b.node}.{b.hook} starts in {a.node}.{a.hook}"
+                    )
 
     def _phases(self) -> Iterator[Violation]:
         for node in self.project.nodes:
@@ -311,7 +313,9 @@ class Judge:
                     yield Violation("finalise", f"{node.name}.{hook.name} ran {count} times")
             if main and any(kind == "initialise" for kind in kinds[main[0] :]):
                 yield Violation("initialise", f"{node.name}: another hook ran before")
-            if "finalise" in kinds and any(kind != "finalise" for kind in kinds[kinds.index("finalise") :]):
+            if "finalise" in kinds and any(
+                kind != "finalise" for kind in kinds[kinds.index("finalise") :]
+            ):
                 yield Violation("finalise", f"{node.name}: another hook ran after")
 
     def _gaps(self) -> Iterator[Violation]:
@@ -413,7 +417,9 @@ class Judge:
             for other in intakes:
                 # What is taken next, and what was there all along: with limit 0 the very next one.
                 position = other.position(each.start_ns)
-                later = position + 1 if other.connection.discard_limit == 0 else other.after(position)
+                later = (
+                    position + 1 if other.connection.discard_limit == 0 else other.after(position)
+                )
                 times = self.sent_ns[other.connection.origin]
                 if other is taken or later is None or later > len(times):
                     continue
@@ -479,7 +485,9 @@ class Judge:
             return
         required = [declared for declared in hook.inputs if not declared.is_optional]
         sources = self._feeding(node, hook)
-        is_free = len(required) <= 1 and len(sources) == 1 and not self._reliable_outputs(node, hook)
+        is_free = (
+            len(required) <= 1 and len(sources) == 1 and not self._reliable_outputs(node, hook)
+        )
         if not is_free or sources[0].queue_size > 1:
             return
         intake = self.intakes[node.name, hook.name, sources[0]]
@@ -569,7 +577,9 @@ class Judge:
                     f"{node.name}.{hook.name} {how} {waited_ms:.0f} ms after it was ready, and"
                     f" {name} ran {count} times in between",
                 )
-        busy_ns = self.busy[node.name].within(since_ns, now_ns) + self._others_ns(node.name, since_ns, now_ns)
+        busy_ns = self.busy[node.name].within(since_ns, now_ns) + self._others_ns(
+            node.name, since_ns, now_ns
+        )
         rested_ns = now_ns - since_ns - busy_ns
         if rested_ns > self.tolerance_ns:
             yield Violation(
@@ -672,7 +682,9 @@ class Judge:
             yield f"{unread} unread with queue_size {c.queue_size}"
         yield from self._consumed(c, received, consumed, discarded)
 
-    def _consumed(self, c: Connection, received: int, consumed: int, discarded: int) -> Iterator[str]:
+    def _consumed(
+        self, c: Connection, received: int, consumed: int, discarded: int
+    ) -> Iterator[str]:
         node = self.project.by_name[c.destination_node]
         takers = node.takers(c.destination_input)
         if any(hook.kind == "initialise" for hook in takers):
@@ -688,7 +700,9 @@ class Judge:
             yield f"every taker started on {both}, run.json says {consumed} were consumed"
         if c.is_reliable:
             passed = min(max(each, default=0) for each in taken)
-            skipped = sum(number not in each for number in range(1, passed + 1) for each in taken[:1])
+            skipped = sum(
+                number not in each for number in range(1, passed + 1) for each in taken[:1]
+            )
             if len(takers) == 1 and discarded < skipped:
                 yield f"{skipped} were skipped, run.json says {discarded} were discarded"
 
@@ -770,7 +784,9 @@ class Judge:
                     yield Violation("drain", f"{node}.{name} started {late_s:.1f} s after the end")
 
     def _longest_ns(self, node: str) -> int:
-        logs: Iterable[list[Execution]] = self.log.values() if self.is_one_process else [self.log[node]]
+        logs: Iterable[list[Execution]] = (
+            self.log.values() if self.is_one_process else [self.log[node]]
+        )
         return sum(max((e.end_ns - e.start_ns for e in log), default=0) for log in logs)
 
 

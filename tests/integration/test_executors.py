@@ -332,20 +332,20 @@ def test_what_has_arrived_while_a_hook_ran_is_taken_in_before_the_next(
 
     def receive(message: Int32) -> None:
         hooked.seen.append(message.data)
-        taken_in.append(loop.loop.has_taken_in())
+        taken_in.append(loop.loop.has_taken_in)
 
     hooked.node.create_subscription(Int32, "data", loop.loop.guarded(receive), 10)
     hooked.publisher("data")
 
     def first() -> None:
-        assert loop.loop.has_taken_in()
+        assert loop.loop.has_taken_in
         hooked.send("data", 1, 2, 3)
         hooked.execute("hook")
-        assert not loop.loop.has_taken_in()
+        assert not loop.loop.has_taken_in
         loop.loop.post_loop_back(second)
 
     def second() -> None:
-        assert loop.loop.has_taken_in()
+        assert loop.loop.has_taken_in
         hooked.seen.append("next")
         loop.loop.stop()
 

@@ -71,6 +71,12 @@ class TestBuildLog:
             ("E: Unable to locate package ros-jazzy-rviz2", "have no ros-jazzy-rviz2: correct"),
             ("E: Package 'rviz' has no installation candidate", "have no rviz: correct"),
             ("COPY failed: file not found in build context", "is not beside it"),
+            ('failed to compute cache key: "/x" not found: not found', "is not beside it"),
+            (
+                "docker.io/library/nest:9: pull access denied, repository does not exist or may",
+                "there is no image docker.io/library/nest:9 to begin from",
+            ),
+            ("dockerfile parse error line 2: Unknown flag: link", "uses the option --link"),
             ("E: Could not open lock file - open (13: Permission denied)", "put USER 0 above it"),
             ("/bin/sh: 1: python3: not found", "its base has no Python"),
             ("ensurepip is not available", "add the package python3-venv"),

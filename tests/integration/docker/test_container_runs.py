@@ -20,7 +20,8 @@ from launching import EXAMPLES, Finished, Running, launch, start
 from containers import require_containers, wait_until
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.launcher import DockerLauncher, engine_socket, find_containers
+from neuros.launch.docker.engine import engine_socket
+from neuros.launch.docker.launcher import DockerLauncher, find_containers
 from neuros.launch.docker.settings import container_name, shared_memory
 from neuros.launch.run_processes import RUN_ID, environ_of
 from neuros.launch.sessions import Session, guardian_environment
@@ -64,6 +65,35 @@ NEEDS_MEMORY = """
 @neuros_tick(seconds=0.1)
 def grow(node):
     node.set_user_data(bytearray(400 << 20))
+"""
+INTRUDES = """
+@neuros_initialise()
+def intrude(node):
+    def answer(action, *paths):
+        try:
+            action(*paths)
+        except OSError as error:
+            return errno.errorcode[error.errno]
+        return "done"
+    run = node.run_dir.parent
+    tries = {
+        "overwrite": answer((run / "b/node.json").write_text, "{}"),
+        "remove": answer(os.remove, run / "b/node.json"),
+        "add": answer((run / "b/x").touch),
+        "move": answer(os.rename, run / "b", run / "c"),
+        "project": answer((run / "project.json").write_text, "{}"),
+        "own": answer((node.run_dir / "x").touch),
+        "run folder": answer((run / "x").touch),
+    }
+    node.shutdown(json.dumps(tries))
+"""
+FAILS_AT_ITS_END = """
+@neuros_initialise()
+def leave(node):
+    node.shutdown("done")
+@neuros_finalise()
+def fail(node):
+    raise OSError(__file__)
 """
 WRITES = """
 @neuros_tick(seconds=0.1)
@@ -126,6 +156,21 @@ def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.M
     assert "init" in seen["init"]
 
 
+def test_a_node_writes_nothing_of_another_nodes_nor_of_the_runs(bench: ContainerBench) -> None:
+    bench.project({"a": INTRUDES, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 0, finished.output
+    said = last_line(finished).partition("a ended the project: ")[2]
+    assert json.loads(said) == {
+        **dict.fromkeys(("overwrite", "remove", "add", "project"), "EROFS"),
+        "move": "EBUSY",
+        **dict.fromkeys(("own", "run folder"), "done"),
+    }
+    assert finished.run_folder is not None
+    assert json.loads((finished.run_folder / "b/node.json").read_text())["node"]["name"] == "b"
+    assert bench.has_saved("a", "b")
+
+
 def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
     if not Path("/dev/net/tun").exists():
         pytest.skip("there is no device here to let a container in to")
@@ -173,7 +218,7 @@ def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     assert "a script in Python" in finished.output
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.needs("root")
 def test_an_ordinary_user_of_the_engine_leaves_files_of_nobody_else(bench: ContainerBench) -> None:
     uid, group = 1000, os.stat(engine_socket(bench.engine)).st_gid
     # May read what root has installed, and use the engine; nothing else that is not its own.
@@ -212,6 +257,16 @@ def test_what_a_node_may_not_write_is_named_as_it_is_called_here(bench: Containe
     assert "Read-only file system: '/usr/log'" in last_line(finished)
     assert str(bench.folder / "a.py") in finished.output
     assert finished.record["reason"] == last_line(finished)
+
+
+@pytest.mark.parametrize("plugin", [WRITES, FAILS_AT_ITS_END], ids=["running", "at its end"])
+def test_what_ended_a_run_is_said_once(bench: ContainerBench, plugin: str) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 1, finished.output
+    said = [text for text in finished.said("neuros") if "'a' failed" in text]
+    assert said == [last_line(finished)]
+    assert "/neuros/project" not in finished.output
 
 
 def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -> None:
@@ -254,6 +309,19 @@ def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     running.process.wait()
     wait_until(lambda: not bench.left(), GONE_WITHIN_S)
     assert bench.has_saved("b") or bench.has_saved("a", "b")
+
+
+@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
+def test_no_paused_container_outlives_a_killed_launcher_either(
+    bench: ContainerBench, plugin: str
+) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    pause(bench, running)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+    assert bench.has_saved("b") or bench.has_saved("a", "b"), "it was resumed, and ended by itself"
 
 
 @pytest.mark.acceptance
@@ -443,6 +511,13 @@ def neuros(*arguments: str) -> str:
         text=True,
         timeout=30.0,
     ).stdout
+
+
+def pause(bench: ContainerBench, running: Running) -> None:
+    """Pause all containers of a run."""
+    run = bench.session(running).run
+    for container in bench.engine.containers.list(filters={"label": f"neuros.run={run}"}):
+        container.pause()
 
 
 def guardian_of(session: Session) -> int:
