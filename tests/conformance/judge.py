@@ -400,8 +400,16 @@ class Judge:
     def _waiting_since(self, c: Connection, intake: _Intake, position: int) -> int:
         """When the packet was sent for which the mailbox is no longer empty; ``_NEVER``: unknown."""
         sent = self.sent_ns[c.origin]
-        number = position + 1 if c.is_reliable else intake.after(position)
+        number = position + 1 if self._lost(c) == 0 else intake.after(position)
         return sent[number - 1] if number is not None and number <= len(sent) else _NEVER
+
+    def _lost(self, c: Connection) -> int | None:
+        """How many packets of a connection were lost in transport, ``None`` if that is not known."""
+        if c.is_reliable:
+            return 0
+        counters = self.seen.connection(str(c))
+        lost: int | None = counters["lost"] if counters else None
+        return lost
 
     def _oldest_first(self, node: Node, hook: Hook, each: Execution) -> Iterator[Violation]:
         for declared in hook.inputs:
@@ -466,11 +474,11 @@ class Judge:
             arrived = bisect.bisect_left(self.sent_ns[c.origin], known_ns)
             newer = arrived - number
             if not c.is_reliable:  # some may have been lost: what was taken later was not
-                counters = self.seen.connection(str(c))
                 later = bisect.bisect_right(intake.numbers, arrived) - bisect.bisect_right(
                     intake.numbers, number
                 )
-                newer = max(later, newer - counters["lost"] if counters else 0)
+                lost = self._lost(c)
+                newer = later if lost is None else max(later, newer - lost)
             if newer >= c.queue_size:
                 age_ms = (each.start_ns - self.sent_ns[c.origin][number - 1]) / 1e6
                 yield Violation(
