@@ -742,7 +742,7 @@ class Judge:
         elif code == 1:
             yield Violation("end", f"failed: {reason}")
         elif code == 130:
-            if self.project.end != "interrupt":
+            if self.project.end != "interrupt" and self.last_start_ns:
                 yield Violation("end", f"exit code 130: {reason}")
         elif code != 0:
             yield Violation("end", f"exit code {code}: {reason}")
