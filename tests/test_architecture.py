@@ -39,6 +39,7 @@ def is_within(module: str, package: str) -> bool:
 
 
 SUPERVISOR = (
+    "backlog",
     "supervisor",
     "channels",
     "declarations",

@@ -31,7 +31,8 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``state``: what it does now, ``{"state", "cause"}``.
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
-        ``incoming``: the same; an external topic is ``/topic -> b.in``.
+        ``incoming``: the same; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
+        is ready to start on the oldest unread packet.
         ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
         those that initialise, how many of the seconds that took.
         ``accounting``: seconds by cause; ``total`` is the sum of all others.
@@ -97,7 +98,14 @@ def _incoming(inlet: Inlet) -> dict[str, Any]:
         "longest_discard": inlet.longest_discard,
         "unread": received - consumed - discarded,
         "acknowledged": inlet.acknowledged,
+        "taker": steadily(lambda: _taker(inlet), None),
     }
+
+
+def _taker(inlet: Inlet) -> str | None:
+    """A hook that could start now, and would take a packet of this inlet."""
+    hooks = (each.slot.hook for each in inlet.mailboxes if each.slot.would_take(each))
+    return next((hook.name for hook in hooks if hook.is_ready()), None)
 
 
 def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
