@@ -122,10 +122,7 @@ class Engine:
 
     def on_timer(self) -> None:
         """The time of :attr:`next_due_ns` has come."""
-        now_ns = self._wake()
-        for hook in self._ticks:
-            if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
-                hook.is_due = True
+        self._wake()
         self._pass()
 
     def on_loop_back(self) -> None:
@@ -282,8 +279,12 @@ class Engine:
     # ------------------------------------------------------------------ inside
 
     def _wake(self) -> int:
-        """Book the time since the last event; returns the time now."""
+        """Book the time since the last event, and note the ticks due by now; returns the time."""
         now_ns = self._clock()
+        if self._ticks and not self._gate.is_closed:
+            for hook in self._ticks:
+                if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
+                    hook.is_due = True
         if self.executing is None:  # else it is the hook's, and booked when that ends
             self._spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns

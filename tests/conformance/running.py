@@ -23,6 +23,8 @@ from .description import Project
 LONGEST_S = 30.0
 """After so long a run that has not ended by itself is ended, and judged as one that did not."""
 
+_UNBEGUN_S = 6.0
+_PATIENCE_S = 15.0
 _POLL_S = 0.02
 
 
@@ -154,23 +156,31 @@ def run_in(
 def _wait(
     live: LiveRun, project: Project, run_folder: Path, seconds: float, observed: Observed
 ) -> None:
-    """Until it has ended, by itself or since it was interrupted in time."""
+    """Until it has ended, by itself or since it was interrupted in time.
+
+    A duration counts from the first hook. Where none can start before an external topic brings
+    something, and so perhaps never, it is interrupted, too.
+    """
     deadline_s = time.monotonic() + LONGEST_S
-    if project.end == "interrupt":
-        while live.is_running and time.monotonic() < deadline_s and not _has_begun(run_folder):
-            time.sleep(_POLL_S)
-        with contextlib.suppress(TimeoutError):
-            live.wait(seconds)
-        if live.is_running:
-            observed.ending_ns = time.monotonic_ns()
-            live.interrupt()
-    try:
-        live.wait(max(0.0, deadline_s - time.monotonic()))
-    except TimeoutError:
+    patience_s = _UNBEGUN_S if any(c.is_external for c in project.all_connections) else LONGEST_S
+    unbegun_s = time.monotonic() + patience_s
+    while live.is_running and time.monotonic() < unbegun_s and not _has_begun(run_folder):
+        time.sleep(_POLL_S)
+    is_interrupted = project.end == "interrupt" or not _has_begun(run_folder)
+    if is_interrupted and not _has_ended(live, seconds):
+        observed.ending_ns = time.monotonic_ns()
+        live.interrupt()
+    if not _has_ended(live, max(_PATIENCE_S, deadline_s - time.monotonic())):
         observed.is_overdue = True
         observed.ending_ns = observed.ending_ns or time.monotonic_ns()
         live.interrupt()
-        live.wait(LONGEST_S)
+    live.wait(LONGEST_S)
+
+
+def _has_ended(live: LiveRun, within_s: float) -> bool:
+    with contextlib.suppress(TimeoutError):
+        live.wait(within_s)
+    return not live.is_running
 
 
 def _has_begun(run_folder: Path) -> bool:
