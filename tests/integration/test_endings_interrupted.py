@@ -169,10 +169,12 @@ def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
 
 
 def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(bench: Bench) -> None:
+    holds = {"gil": HOLDS.format("ctypes.PyDLL(None).sleep(30)")}
     bench.project(
         "a.o -> b.x",
         "b.o -> c.x",
         "d.o -> c.y",
+        **(holds if bench.back_end == "process" else {}),
         a="@neuros_initialise(outputs='o')\ndef think(node):\n"
         "    time.sleep(6.5)\n    return node.make_packet('o')\n",
         b=RELAY,
@@ -186,11 +188,15 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
         running.wait_for("c waits for `x` from b", 3.0)
         running.wait_for("b waits for `x` from a", 3.0)
         running.wait_for("d waits for the next tick of 'rarely'", 3.0)
+        running.wait_for("gil has been executing 'hold' for 5 s, and cannot report", 5.0)
+        running.wait_for(f'"{bench.folder}/gil.py", line ', 1.0)
     running.signal(signal.SIGINT)
     finished = running.finish()
     assert_ended(finished, 130, "ended by Ctrl\\+C")
     said = finished.said("neuros")
-    assert len([text for text in said if "has been executing" in text]) == 1
+    named = [text for text in said if text.startswith("a has been executing")]
+    assert named == ["a has been executing 'think' for 5 s:"]
+    assert f'  File "{bench.folder}/a.py", line ' in finished.output
     if bench.back_end == "process":
         assert not any(text.startswith("a executes") for text in said), "that was said before"
 
