@@ -2,7 +2,7 @@
 
 === ===========================================================
 0   ended normally
-1   a node failed, or a deadlock
+1   a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
 2   wrong usage of the command line
 3   invalid project
 4   something is missing on this machine (package, engine, image), or what was to be recorded
@@ -51,7 +51,7 @@ EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 
 _EXIT_CODES = """\
 exit codes:
   0    ended normally
-  1    a node failed, or a deadlock
+  1    a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
   2    wrong usage
   3    invalid project: every problem is listed with its file and line
   4    something is missing on this machine, or a record could not be written

@@ -126,10 +126,11 @@ def test_a_node_whose_process_ends_is_a_failure(bench: Bench, act: str, how: str
 
 
 def test_a_finalise_hook_that_fails_makes_the_project_fail(bench: Bench) -> None:
-    fails = "@neuros_finalise()\ndef close(node):\n    raise ValueError('stuck')\n"
+    fails = "@neuros_finalise()\ndef close(node):\n    raise ValueError('stuck \\udc80')\n"
     bench.project("b.o -> a.x", a=COUNTS, b=SOURCE + fails)
     finished = bench.launch()
-    assert_ended(finished, 1, "node 'b' failed: .*: hook 'close': ValueError: stuck")
+    assert_ended(finished, 1, r"node 'b' failed: .*: hook 'close': ValueError: stuck \\udc80")
+    assert "in close" in finished.output, "half a character is no obstacle"
     assert bench.saved("a", "b"), "the other finalise hooks have run"
 
 
