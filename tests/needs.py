@@ -6,8 +6,8 @@ A test says it with a marker, ``@pytest.mark.needs("git")``, a fixture or a help
 root, who can install it, and on a machine for continuous integration (``CI`` is set), the test
 fails: what is skipped there is a test that is missing.
 
-As a program it names the packages that this machine lacks, and installs them where root asks for
-that. It runs on a bare Python.
+As a program it names the packages of Debian that this machine lacks; with ``--install`` root gets
+them. It runs on a bare Python.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ COMPILER = ("gcc", "g++", "Python.h")
 
 _INSTALL = ("install", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
 _SKIPPED = re.compile(r"needs (?P<what>.+?)(: |$)")
+_EGL = ("libegl1", "libegl-mesa0", "libgl1", "libgl1-mesa-dri", "libgles2")
 
 
 class Need(NamedTuple):
@@ -46,10 +47,13 @@ def _has_headers() -> bool:
     return Path(sysconfig.get_path("include"), "Python.h").is_file()
 
 
-def _can_draw() -> bool:
-    """Whether a camera can draw: PyOpenGL takes EGL together with OpenGL, or OSMesa alone."""
-    egl = _loads("libEGL.so.1") and (_loads("libGLESv2.so.2") or _loads("libGL.so.1"))
-    return egl or _loads("libOSMesa.so.8", "libOSMesa.so.6")
+def _has_egl() -> bool:
+    """PyOpenGL takes it together with OpenGL only."""
+    return _loads("libEGL.so.1") and _loads("libGLESv2.so.2", "libGL.so.1")
+
+
+def _has_osmesa() -> bool:
+    return _loads("libOSMesa.so.8", "libOSMesa.so.6")
 
 
 def _loads(*libraries: str) -> bool:
@@ -68,10 +72,9 @@ NEEDS = {
     "gcc": Need(_program("gcc"), ("gcc",)),
     "g++": Need(_program("g++"), ("g++",)),
     "Python.h": Need(_has_headers, ("python3-dev",)),
-    "OpenGL": Need(
-        _can_draw,
-        ("libegl1", "libegl-mesa0", "libgl1", "libgl1-mesa-dri", "libgles2", "libosmesa6"),
-    ),
+    "EGL": Need(_has_egl, _EGL),
+    "OSMesa": Need(_has_osmesa, ("libosmesa6",)),
+    "OpenGL": Need(lambda: _has_egl() or _has_osmesa(), _EGL),
     "Xvfb": Need(_program("Xvfb"), ("xvfb",)),
     "Chromium": Need(_program("chromium", "google-chrome"), ("chromium",)),
     "ip": Need(_program("ip"), ("iproute2",)),
@@ -112,7 +115,7 @@ def summary(reasons: Iterable[str]) -> Iterator[str]:
 
 def packages_of(names: Iterable[str]) -> list[str]:
     """The packages of Debian that bring all these."""
-    return [package for name in names for package in NEEDS[name].packages]
+    return list(dict.fromkeys(package for name in names for package in NEEDS[name].packages))
 
 
 def main(arguments: list[str]) -> int:
@@ -121,11 +124,8 @@ def main(arguments: list[str]) -> int:
     if not packages:
         return 0
     what = " ".join(packages)
-    if arguments != ["--install"]:
-        print(what)
-        return 0
-    if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        print(f"the tests that need {what} are left out, and counted at the end", flush=True)
+    if arguments != ["--install"] or os.geteuid() != 0 or shutil.which("apt-get") is None:
+        print(f"this machine lacks {what}: tests that need them say so", flush=True)
         return 0
     print(f"installing what the tests need: {what}", flush=True)
     _apt_get("update")
