@@ -52,7 +52,13 @@ def run(tests: Path, *, user: int = 1000, **environment: str) -> tuple[int, list
     clean = {key: value for key, value in os.environ.items() if key != "CI"}
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", str(tests)],
-        env={**clean, "USER_ID": str(user), "PROGRAMS": "apt-get", **environment},
+        env={
+            **clean,
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+            "USER_ID": str(user),
+            "PROGRAMS": "apt-get",
+            **environment,
+        },
         cwd=tests,
         capture_output=True,
         text=True,
@@ -80,7 +86,7 @@ def test_where_it_could_be_had_they_fail_in_one_line(
     code, lines = run(tests, user=user, **environment)
     assert code == 1
     assert "needs git, iptables: apt-get install -y git iptables" in lines
-    assert lines[-1].startswith(("1 failed, 1 passed, 2 errors", "3 failed, 1 passed"))
+    assert lines[-1].startswith("1 passed, 3 errors")
     assert not any("it does not begin" in line or "left out" in line for line in lines)
 
 
