@@ -18,8 +18,10 @@ def load_with_messages(
     overrides: Sequence[str] = (),
     namespace: str | None = None,
     remap: Sequence[str] = (),
+    *,
+    reads_plugins: bool = True,
 ) -> tuple[Loaded, Messages]:
-    """Load the project and find its message packages.
+    """Load the project and find its message packages; ``reads_plugins``: look into plugins, too.
 
     Raises:
         ProjectError: with all its problems, and those of its message files.
@@ -33,6 +35,7 @@ def load_with_messages(
             packages=workspaces,
             namespace=namespace,
             remap=remap,
+            reads_plugins=reads_plugins,
         )
     except ProjectError as error:
         problems = Messages(workspaces, workspaces.own).problems()

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -77,7 +78,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def console_script() -> None:
-    """Entry point of the installed ``neuros`` command."""
+    """Run the command that the process was started with, and end the process."""
     sys.exit(main(sys.argv[1:]))
 
 
@@ -87,8 +88,10 @@ def main(arguments: Sequence[str]) -> int:
     if not arguments:
         parser().print_help(sys.stderr)
         return EXIT_USAGE
-    options = parser().parse_args(arguments)
     try:
+        options = parser().parse_args(arguments)
+        if options.command is not _launch:  # that has Ctrl+C wait until it can heed it
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
         if sys.stdout is not None:
             sys.stdout.flush()  # so that a reader that has gone is noticed here
@@ -195,7 +198,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     launch.add_argument(
         "--no-placement",
         action="store_true",
-        help="leave it to the kernel which node runs on which core; affinity has no effect",
+        help="ignore affinity: the kernel chooses the cores of every node",
     )
     add_observation(launch)
     add_dashboard_options(launch)

@@ -27,19 +27,25 @@ def project_path(options: argparse.Namespace) -> Path:
     return Path(named.pop())
 
 
-def load(options: argparse.Namespace) -> Project:
+def load(options: argparse.Namespace, *, reads_plugins: bool = True) -> Project:
     """Load the project as :func:`load_with_messages` does."""
-    return load_with_messages(options)[0]
+    return load_with_messages(options, reads_plugins=reads_plugins)[0]
 
 
-def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
+def load_with_messages(
+    options: argparse.Namespace, *, reads_plugins: bool = True
+) -> tuple[Project, Messages]:
     """Load the project and find its message packages; warnings go to standard error.
 
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
     loaded, messages = loading.load_with_messages(
-        project_path(options), options.set, options.namespace, options.remap
+        project_path(options),
+        options.set,
+        options.namespace,
+        options.remap,
+        reads_plugins=reads_plugins,
     )
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,6 +19,7 @@ from neuros.convert.report import Report
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
+_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
@@ -65,14 +67,8 @@ class Meshes:
     def blame(self) -> None:
         """Report the meshes that MuJoCo cannot use, once a model with them does not compile."""
         for mesh in self.spec.meshes:
-            trial = mujoco.MjSpec()
-            alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
-            alone.inertia = mesh.inertia
-            if mesh.name in self.made:
-                fill(alone, self.made[mesh.name])
-            trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
             try:
-                trial.compile()
+                compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
                 text = " ".join(str(error).removeprefix("Error: ").split())
                 self.report.problem(self._places[mesh.name], f"MuJoCo cannot use the mesh: {text}")
@@ -91,15 +87,43 @@ class Meshes:
             number += 1
             name = f"{file.stem}_{number}"
         self._places[name] = uri
-        mesh = self.spec.add_mesh(name=name, scale=scale)
-        if not is_solid:  # a thin shell may be open, or flat
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        if triangles is None:
-            mesh.file = str(file)
-        else:
-            fill(mesh, triangles)
+        add_mesh(self.spec, name, file, scale, triangles, is_solid=is_solid)
+        if triangles is not None:
             self.made[name] = triangles
         return name
+
+
+def compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
+    """The ``MjModel`` of one mesh, which collides unless it ``is_shown_only``.
+
+    ``triangles`` are its own, if it has no file. Raises ``ValueError``.
+    """
+    trial = mujoco.MjSpec()
+    is_solid = mesh.inertia != _SHELL and not is_shown_only
+    add_mesh(trial, mesh.name, mesh.file, mesh.scale, triangles, is_solid=is_solid)
+    geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+    if is_shown_only:
+        geom.contype = geom.conaffinity = 0
+    return trial.compile()
+
+
+def add_mesh(
+    spec: Any,
+    name: str,
+    file: Path | str,
+    scale: Sequence[float],
+    triangles: Triangles | None,
+    *,
+    is_solid: bool,
+) -> None:
+    """Add a mesh that MuJoCo reads from its file, or whose ``triangles`` are here."""
+    mesh = spec.add_mesh(name=name, scale=scale)
+    if not is_solid:  # a thin shell may be open, or flat
+        mesh.inertia = _SHELL
+    if triangles is None:
+        mesh.file = str(file)
+    else:
+        fill(mesh, triangles)
 
 
 def why_unread(file: Path) -> str:

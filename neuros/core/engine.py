@@ -4,6 +4,8 @@ Every event (a packet, an acknowledgement, a registration, a due timer, the loop
 of a method here. It changes some counters and is followed by one *pass*: each hook is looked at
 once, least recently executed first, and runs if it is ready at its turn. If one is still ready
 afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
+Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
+the loop-back goes on when that has been taken in. So no hook starts on a backlog.
 All that leaves the engine goes through :class:`~neuros.core.effects.Effects`.
 """
 
@@ -25,7 +27,7 @@ from neuros.core.accounting import (
 from neuros.core.effects import Effects
 from neuros.core.exchange import Exchange
 from neuros.core.gate import Gate, drives
-from neuros.core.hook import Hook, Source
+from neuros.core.hook import Hook, PacketType, Source
 from neuros.core.inputs import Inlet
 from neuros.core.life import Life
 from neuros.core.node_ports import NodePorts, undeclared
@@ -43,7 +45,7 @@ class Engine:
         node: the node, with its ports.
         connections: all connections that begin or end at it, in the project's order.
         specs: its hooks, in the order of declaration.
-        packet_types: message class per output name, for checking what hooks return.
+        packet_types: per output name, what hooks must return; any value will do for others.
         clock: monotonic wall clock in nanoseconds.
 
     Attributes:
@@ -63,10 +65,11 @@ class Engine:
         specs: Sequence[HookSpec],
         effects: Effects,
         clock: Callable[[], int],
-        packet_types: Mapping[str, type] | None = None,
+        packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
         self.node = node
         self._effects = effects
+        self._has_taken_in = effects.has_taken_in
         self._clock = clock
         ports = NodePorts(node, connections, packet_types or {})
         self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
@@ -126,10 +129,10 @@ class Engine:
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself."""
+        """The event that the engine posted to itself; all that waited then has been taken in."""
         self._wake()
         self._has_posted_loop_back = False
-        self._pass()
+        self._pass(may_start=True)
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
         """Send packets as if a hook with those outputs had returned them, once it might run.
@@ -147,10 +150,15 @@ class Engine:
         self._pass()
         return withdraw
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; the others go on."""
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; the others go on.
+
+        Args:
+            last_round: places in :attr:`all_hooks` of hooks that would go on for ever (each of a
+                loop waits for the one before): they start at most once more.
+        """
         self._wake()
-        self._life.drain()
+        self._life.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
         self.resume()
 
@@ -281,10 +289,10 @@ class Engine:
             self.since_ns = now_ns
         return now_ns
 
-    def _pass(self) -> None:
+    def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life, gate = self._life, self._gate
+        life, gate, exchange = self._life, self._gate, self._exchange
         if not life.has_begun:
             return
         if self._schedule.candidates:
@@ -296,6 +304,9 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
+                        if not may_start and (exchange.to_itself or not self._has_taken_in()):
+                            break
+                        may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False
@@ -318,6 +329,8 @@ class Engine:
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._life.tick_start_ns, start_ns)
+        if self._life.last_round and hook in self._life.last_round:
+            self._life.finish_round(hook)
         self._spent_ns[SCHEDULING] += start_ns - self.since_ns
         self.since_ns = start_ns
         self.executing = hook
@@ -347,7 +360,7 @@ class Engine:
             if name not in self.outputs:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
-        source = self._sources[names] = Source(names, self.outputs)
+        source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
         self._life.add_source(source)
         self.all_hooks.append(source)
         return source

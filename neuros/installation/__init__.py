@@ -8,7 +8,6 @@ command that mends it.
 from __future__ import annotations
 
 import argparse
-import ctypes.util
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.containers import build_containers, build_messages
 from neuros.installation.documentation import build_documentation
 from neuros.installation.environment import Environment, extras_of
-from neuros.installation.machine import Machine, system_install
+from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
 from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
 
@@ -159,9 +158,8 @@ def _agrees(folder: Path) -> bool:
 
 def _next_steps(root: Path, extras: Sequence[str]) -> list[str]:
     rows = []
-    if not any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa")):
-        remedy = system_install(apt="libegl1 libgl1-mesa-dri libosmesa6", dnf="mesa-libEGL")
-        rows.append(f"simulated cameras need a graphics library: {remedy}")
+    if not offscreen_opengl():
+        rows.append(f"simulated cameras need a graphics library: {install_opengl()}")
     example = "4_neurorobotics/whiskeye" if "nest" in extras else "3_physics_simulation/elevator"
     is_here = Path.cwd() == root
     launch = "./launch.py examples" if is_here else f"{root / 'launch.py'} {root / 'examples'}"

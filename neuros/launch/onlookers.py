@@ -12,6 +12,7 @@ from typing import Any
 from neuros.control import Lines
 from neuros.launch.channels import Channels
 from neuros.launch.outcome import Outcome, Output, Phase
+from neuros.observe.report import running_s
 
 
 class Pause:
@@ -119,7 +120,13 @@ class Onlookers:
 
     def part(self, outcome: Outcome) -> None:
         """Tell them how it has ended."""
-        self.tell("ended", exit_code=outcome.exit_code, reason=outcome.reason)
+        self.tell(
+            "ended",
+            exit_code=outcome.exit_code,
+            reason=outcome.reason,
+            reports=outcome.reports,
+            running_s=running_s(outcome),
+        )
 
     def _on_watch(self, lines: Lines, _: Mapping[str, Any]) -> None:
         self._count += 1

@@ -52,6 +52,8 @@ class Outcome:
             run that is stopped while it stands still has ended when that pause began.
         paused_s: how long it has stood still since the first hook.
         is_paused: whether it stands still now.
+        stacks: where nodes that were killed stood in their plugins, by name.
+        late_drain: why it was not drained in time, empty if it was.
         ended_s: when all processes had ended.
         is_signalled: whether the user has asked for the end by a signal, be it after another cause.
         faults: what could not be recorded, though the run went on.
@@ -66,6 +68,8 @@ class Outcome:
     elsewhere: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     started_s: float | None = None
     ending_s: float | None = None
+    stacks: dict[str, str] = field(default_factory=dict)
+    late_drain: str = ""
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -90,6 +94,12 @@ class Outcome:
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
         return bool(self.reports.get(name, {}).get("is_final"))
+
+    def end_by_force(self, exit_code: int, name: str) -> None:
+        """The user has had killed what was left of a run, by a signal of this name."""
+        if self.exit_code == 0:
+            self.exit_code = exit_code
+            self.reason = f"killed by {name} before its nodes had ended: {self.reason}"
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """Note a failure; the first one decides, unless the user had ended the run before."""

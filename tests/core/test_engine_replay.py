@@ -84,6 +84,8 @@ class Run:
             bench.engine.resume() if bench.engine.is_paused else bench.engine.pause()
         elif what == 8:
             bench.engine.step(2, is_driven=advance_ns % 2 == 0)
+        elif what == 9:
+            bench.is_taken_in = not bench.is_taken_in
 
 
 class Again:
@@ -120,7 +122,7 @@ class Again:
             player.play(event)
 
 
-steps = st.lists(st.tuples(st.integers(0, 8), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)

@@ -63,8 +63,9 @@ def test_a_packet_that_cannot_be_sent_is_named_with_its_output_and_field(bench: 
         b=SINK,
     )
     finished = bench.launch("--digests")  # in process packets are serialised for these only
-    what = r"packet for output 'o': field 'data' must be int32, but is 'three' \(str\)"
-    assert_ended(finished, 1, f"node 'a' failed: .*a\\.py: {what}")
+    limits = f"{-(2**31)} to {2**31 - 1}"
+    what = rf"packet for output 'o': field 'data' must be int32: {limits}, but is 'three' \(str\)"
+    assert_ended(finished, 1, rf"node 'a' failed: .*a\.py:\d+: hook 'fill': {what}")
     assert "Traceback" not in finished.output
 
 

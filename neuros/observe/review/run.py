@@ -19,6 +19,7 @@ from neuros.observe.packets import FOLDER, Packets, packet_figures, read_packets
 from neuros.observe.past_run import connection_of
 from neuros.observe.report import FORMAT
 from neuros.observe.review.trace import Trace, read_trace
+from neuros.observe.spending import Spending, spending_of
 from neuros.project.model import Connection
 
 
@@ -64,6 +65,12 @@ class Run:
     def ends(self) -> dict[str, Connection]:
         """The connections as a project has them, by name."""
         return {name: connection_of(name, figures) for name, figures in self.connections.items()}
+
+    @cached_property
+    def spending(self) -> dict[str, Spending]:
+        """How each node that has reported spent its time."""
+        found = {name: spending_of(node, self.running_s) for name, node in self.nodes.items()}
+        return {name: spent for name, spent in found.items() if spent is not None}
 
     @cached_property
     def packets(self) -> dict[str, Packets]:

@@ -66,6 +66,35 @@ NEEDS_MEMORY = """
 def grow(node):
     node.set_user_data(bytearray(400 << 20))
 """
+INTRUDES = """
+@neuros_initialise()
+def intrude(node):
+    def answer(action, *paths):
+        try:
+            action(*paths)
+        except OSError as error:
+            return errno.errorcode[error.errno]
+        return "done"
+    run = node.run_dir.parent
+    tries = {
+        "overwrite": answer((run / "b/node.json").write_text, "{}"),
+        "remove": answer(os.remove, run / "b/node.json"),
+        "add": answer((run / "b/x").touch),
+        "move": answer(os.rename, run / "b", run / "c"),
+        "project": answer((run / "project.json").write_text, "{}"),
+        "own": answer((node.run_dir / "x").touch),
+        "run folder": answer((run / "x").touch),
+    }
+    node.shutdown(json.dumps(tries))
+"""
+FAILS_AT_ITS_END = """
+@neuros_initialise()
+def leave(node):
+    node.shutdown("done")
+@neuros_finalise()
+def fail(node):
+    raise OSError(__file__)
+"""
 WRITES = """
 @neuros_tick(seconds=0.1)
 def write(node):
@@ -125,6 +154,21 @@ def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.M
     assert seen["cores"] == [min(os.sched_getaffinity(0))]
     assert not seen["device"]
     assert "init" in seen["init"]
+
+
+def test_a_node_writes_nothing_of_another_nodes_nor_of_the_runs(bench: ContainerBench) -> None:
+    bench.project({"a": INTRUDES, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 0, finished.output
+    said = last_line(finished).partition("a ended the project: ")[2]
+    assert json.loads(said) == {
+        **dict.fromkeys(("overwrite", "remove", "add", "project"), "EROFS"),
+        "move": "EBUSY",
+        **dict.fromkeys(("own", "run folder"), "done"),
+    }
+    assert finished.run_folder is not None
+    assert json.loads((finished.run_folder / "b/node.json").read_text())["node"]["name"] == "b"
+    assert bench.has_saved("a", "b")
 
 
 def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
@@ -213,6 +257,16 @@ def test_what_a_node_may_not_write_is_named_as_it_is_called_here(bench: Containe
     assert "Read-only file system: '/usr/log'" in last_line(finished)
     assert str(bench.folder / "a.py") in finished.output
     assert finished.record["reason"] == last_line(finished)
+
+
+@pytest.mark.parametrize("plugin", [WRITES, FAILS_AT_ITS_END], ids=["running", "at its end"])
+def test_what_ended_a_run_is_said_once(bench: ContainerBench, plugin: str) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 1, finished.output
+    said = [text for text in finished.said("neuros") if "'a' failed" in text]
+    assert said == [last_line(finished)]
+    assert "/neuros/project" not in finished.output
 
 
 def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -> None:
