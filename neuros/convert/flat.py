@@ -77,13 +77,12 @@ def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
     moved = from_quaternion(model.mesh_pos[0], model.mesh_quat[0])
     vertices = model.mesh_vert @ moved.rotation.T + moved.position
     corners = vertices[model.mesh_face]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return _fit(vertices, normals.sum(axis=0))
+    return _fit(vertices, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
-def _fit(vertices: Vector, front: Vector) -> Slab | None:
-    """The slab behind the plane of ``vertices``, or around it where no side is the ``front``."""
-    centre = vertices.mean(axis=0)
+def _fit(vertices: Vector, normals: Vector) -> Slab | None:
+    """The slab behind the plane of ``vertices``, or around it where triangles show both sides."""
+    front, centre = normals.sum(axis=0), vertices.mean(axis=0)
     axes = np.linalg.svd(vertices - centre, full_matrices=False)[2]
     if axes[2] @ front < 0:
         axes[2] = -axes[2]
@@ -95,7 +94,7 @@ def _fit(vertices: Vector, front: Vector) -> Slab | None:
     rotation = np.column_stack((axes[:2].T @ turn, axes[2]))
     sides = high - low
     thickness = min(_THICKNESS_M, float(sides.min()) / 10)
-    is_one_sided = np.linalg.norm(front) > 0
+    is_one_sided = np.linalg.norm(front) > _FLAT * np.linalg.norm(normals, axis=1).sum()
     middle = np.append((low + high) / 2, -thickness / 2 if is_one_sided else 0.0)
     return Slab(
         np.append(sides, thickness) / 2,
