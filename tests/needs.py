@@ -12,6 +12,7 @@ them. It runs on a bare Python.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import re
@@ -24,12 +25,15 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from neuros.installation.machine import OPENGL_PACKAGES, offscreen_opengl
+
 COMPILER = ("gcc", "g++", "Python.h")
 """What builds message packages."""
 
 _INSTALL = ("install", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
 _SKIPPED = re.compile(r"needs (?P<what>.+?)(: |$)")
-_EGL = ("libegl1", "libegl-mesa0", "libgl1", "libgl1-mesa-dri", "libgles2")
 
 
 class Need(NamedTuple):
@@ -47,22 +51,11 @@ def _has_headers() -> bool:
     return Path(sysconfig.get_path("include"), "Python.h").is_file()
 
 
-def _has_egl() -> bool:
-    """PyOpenGL takes it together with OpenGL only."""
-    return _loads("libEGL.so.1") and _loads("libGLESv2.so.2", "libGL.so.1")
-
-
 def _has_osmesa() -> bool:
-    return _loads("libOSMesa.so.8", "libOSMesa.so.6")
-
-
-def _loads(*libraries: str) -> bool:
-    for library in libraries:
-        try:
+    for library in ("libOSMesa.so.8", "libOSMesa.so.6"):
+        with contextlib.suppress(OSError):
             ctypes.CDLL(library)
-        except OSError:
-            continue
-        return True
+            return True
     return False
 
 
@@ -72,9 +65,8 @@ NEEDS = {
     "gcc": Need(_program("gcc"), ("gcc",)),
     "g++": Need(_program("g++"), ("g++",)),
     "Python.h": Need(_has_headers, ("python3-dev",)),
-    "EGL": Need(_has_egl, _EGL),
+    "OpenGL": Need(lambda: bool(offscreen_opengl()), tuple(OPENGL_PACKAGES.split())),
     "OSMesa": Need(_has_osmesa, ("libosmesa6",)),
-    "OpenGL": Need(lambda: _has_egl() or _has_osmesa(), _EGL),
     "Xvfb": Need(_program("Xvfb"), ("xvfb",)),
     "Chromium": Need(_program("chromium", "google-chrome"), ("chromium",)),
     "ip": Need(_program("ip"), ("iproute2",)),

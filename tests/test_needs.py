@@ -37,7 +37,8 @@ def tests(tmp_path: Path) -> Path:
     for name in ("conftest.py", "needs.py"):
         shutil.copy(Path(__file__).parent / name, tmp_path)
     (tmp_path / "needs.py").write_text(
-        Path(needs.__file__).read_text() + "\nfor _name in NEEDS:\n"
+        Path(needs.__file__).read_text().replace("__file__", repr(needs.__file__))
+        + "\nfor _name in NEEDS:\n"
         "    NEEDS[_name] = NEEDS[_name]._replace(is_there=lambda: False)\n"
         "os.geteuid = lambda: int(os.environ['USER_ID'])\n"
         "shutil.which = lambda name: name if name in os.environ['PROGRAMS'] else None\n"
