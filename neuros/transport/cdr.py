@@ -34,7 +34,7 @@ from neuros.transport.cdr_parts import (
     write_text,
     write_wide_text,
 )
-from neuros.transport.schema import Leaf, Schema, Shape, Sort, Type, schema
+from neuros.transport.schema import Leaf, Shape, Sort, Type, schema
 
 Encode: TypeAlias = Callable[[Any], bytes]
 Decode: TypeAlias = Callable[[bytes], Any]
@@ -52,7 +52,7 @@ def cdr(kind: type) -> tuple[Encode, Decode] | None:
         parts = _parts_of(kind)
     except Unusual:
         return None
-    return _encoder(kind, parts), _decoder(schema(kind), parts)
+    return _encoder(kind, parts), _decoder(kind, parts)
 
 
 @cache
@@ -116,21 +116,31 @@ def _item(of: Type) -> tuple[WriteItem, ReadItem]:
 
 def _message(kind: Any) -> tuple[WriteItem, ReadItem]:
     parts = _parts_of(kind)
-    build = schema(kind).build
-    writers, readers = [part.write for part in parts], [part.read for part in parts]
+    writers = [part.write for part in parts]
 
     def write(message: Any, pieces: Pieces, at: int) -> int:
         for write_part in writers:
             at = write_part(message, pieces, at)
         return at
 
+    return (writers[0] if len(writers) == 1 else write), _reader(kind, parts)
+
+
+def _reader(kind: Any, parts: tuple[Part, ...]) -> ReadItem:
+    """All slots are set in one go, without a turn of the interpreter for each."""
+    layout = schema(kind)
+    kinds, fill, fixed = layout.kinds, layout.fill, [value for *_, value in layout.switches]
+    readers = tuple(part.read for part in parts)
+
     def read(data: bytes, at: int) -> tuple[Any, int]:
-        values: list[Any] = []
+        made = list(map(object.__new__, kinds))
+        values = made[1:] + fixed
         for read_part in readers:
             at = read_part(data, at, values)
-        return build(values), at
+        fill(made, values)
+        return made[0], at
 
-    return (writers[0] if len(writers) == 1 else write), read
+    return read
 
 
 def _single(code: str) -> tuple[WriteItem, ReadItem]:
@@ -162,17 +172,13 @@ def _encoder(kind: type, parts: tuple[Part, ...]) -> Encode:
     return encode
 
 
-def _decoder(layout: Schema, parts: tuple[Part, ...]) -> Decode:
-    readers = tuple(part.read for part in parts)
-    build = layout.build
+def _decoder(kind: Any, parts: tuple[Part, ...]) -> Decode:
+    read = _reader(kind, parts)
 
     def decode(data: bytes) -> Any:
         if data[:START] != _HEADER:
             raise Unusual
-        values: list[Any] = []
-        at = 0
-        for read in readers:
-            at = read(data, at, values)
-        return build(values)
+        message, _ = read(data, 0)
+        return message
 
     return decode

@@ -24,6 +24,7 @@ START = 4
 """Bytes of the header."""
 
 _LENGTH = struct.Struct("<I")
+_LENGTHS = tuple(struct.Struct(f"<{padding}xI") for padding in range(4))
 _PADDING = tuple(bytes(size) for size in range(8))
 
 
@@ -199,7 +200,7 @@ def _aligned(codes: list[str], at: int) -> struct.Struct:
 
 def _write_length(length: int, pieces: Pieces, at: int) -> int:
     padding = -at & 3
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length))
+    pieces.append(_LENGTHS[padding].pack(length))
     return at + padding + 4
 
 
@@ -215,18 +216,20 @@ def write_text(text: str, pieces: Pieces, at: int) -> int:
     """Append text in UTF-8 with a NUL behind it; returns the place behind."""
     encoded = text.encode()
     padding, length = -at & 3, len(encoded) + 1
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length) + encoded + b"\0")
+    pieces += (_LENGTHS[padding].pack(length), encoded, b"\0")
     return at + padding + 4 + length
 
 
 def read_text(data: bytes, at: int) -> tuple[str, int]:
     """The text at a place, and the place behind it."""
-    length, at = _read_length(data, at)
+    at += -at & 3
+    (length,) = _LENGTH.unpack_from(data, at + START)
+    at += 4
     end = at + length
     encoded = data[at + START : end + START]
     if len(encoded) != length or encoded.find(0) != length - 1:
         raise Unusual
-    return encoded[:-1].decode(errors="replace"), end
+    return str(encoded[:-1], "utf-8", "replace"), end
 
 
 def write_wide_text(text: str, pieces: Pieces, at: int) -> int:

@@ -194,7 +194,7 @@ def _is_exact_field(field: Field) -> IsExact | None:
         return lambda value: value.typecode == code and len(value) <= bound
     if field.shape is Shape.ARRAY:
         dtype, shape = numpy.dtype(of.code), (field.size,)
-        return lambda value: value.dtype == dtype and value.shape == shape
+        return lambda value: (value.dtype is dtype or value.dtype == dtype) and value.shape == shape
     if field.shape is Shape.LIST:
         return _is_exact_list(field)
     if of.sort in _TEXTS:
