@@ -55,8 +55,8 @@ _TEXT = (
     "Simulated time in per cent of wall time, over the last nine tenths of the readings; packets"
     " that a hook has started on, of those sent; processor load meanwhile, 100 % are all cores. In"
     " the published runs nothing was lost between nodes, and the whole machine was measured. One"
-    " execution of the physics is 1 ms of Gazebo there, asked for by a service call, and 50 ms of"
-    " MuJoCo here. The asynchronous simulation is held to real time, here as there."
+    " execution of the physics is one step of Gazebo there, and 50 ms of MuJoCo here. The"
+    " asynchronous simulation is held to real time."
 )
 
 

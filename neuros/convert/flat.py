@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.convert.meshes import Triangles, add_mesh, compile_alone
+from neuros.convert.meshes import SHELL, Triangles, compile_alone
 from neuros.convert.poses import Pose, Vector, from_quaternion
 
 _FLAT = 1e-4  # how thick, at most, by how long
@@ -41,7 +41,7 @@ def has_flat_meshes(model: Any) -> bool:
 
 
 def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
-    """Turn the colliding geoms of flat meshes into boxes.
+    """Turn the colliding geoms of flat meshes into boxes, in a spec that was never compiled.
 
     ``made`` are the triangles of meshes that have no file. Returns the geoms; those that only show
     a flat mesh stay as they are.
@@ -58,12 +58,11 @@ def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Sl
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_BOX, ""
             geom.size, geom.pos, geom.quat = slab.half_lengths, pose.position, pose.quaternion
             boxed.append((geom, slab))
-        name, file, scale = mesh.name, mesh.file, mesh.scale.copy()
-        spec.delete(mesh)  # it would remember that it has collided
         if len(colliding) < len(geoms):
-            add_mesh(spec, name, file, scale, made.get(name), is_solid=False)
+            mesh.inertia = SHELL
         else:
-            made.pop(name, None)
+            made.pop(mesh.name, None)
+            spec.delete(mesh) if hasattr(spec, "delete") else mesh.delete()  # until MuJoCo 3.3
     return boxed
 
 
@@ -77,13 +76,12 @@ def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
     moved = from_quaternion(model.mesh_pos[0], model.mesh_quat[0])
     vertices = model.mesh_vert @ moved.rotation.T + moved.position
     corners = vertices[model.mesh_face]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return _fit(vertices, normals.sum(axis=0))
+    return _fit(vertices, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
-def _fit(vertices: Vector, front: Vector) -> Slab | None:
-    """The slab behind the plane of ``vertices``, or around it where no side is the ``front``."""
-    centre = vertices.mean(axis=0)
+def _fit(vertices: Vector, normals: Vector) -> Slab | None:
+    """The slab behind the plane of ``vertices``, or around it where triangles show both sides."""
+    front, centre = normals.sum(axis=0), vertices.mean(axis=0)
     axes = np.linalg.svd(vertices - centre, full_matrices=False)[2]
     if axes[2] @ front < 0:
         axes[2] = -axes[2]
@@ -95,7 +93,7 @@ def _fit(vertices: Vector, front: Vector) -> Slab | None:
     rotation = np.column_stack((axes[:2].T @ turn, axes[2]))
     sides = high - low
     thickness = min(_THICKNESS_M, float(sides.min()) / 10)
-    is_one_sided = np.linalg.norm(front) > 0
+    is_one_sided = np.linalg.norm(front) > _FLAT * np.linalg.norm(normals, axis=1).sum()
     middle = np.append((low + high) / 2, -thickness / 2 if is_one_sided else 0.0)
     return Slab(
         np.append(sides, thickness) / 2,

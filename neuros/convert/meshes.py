@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +18,7 @@ from neuros.convert.report import Report
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
-_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
@@ -87,8 +86,13 @@ class Meshes:
             number += 1
             name = f"{file.stem}_{number}"
         self._places[name] = uri
-        add_mesh(self.spec, name, file, scale, triangles, is_solid=is_solid)
-        if triangles is not None:
+        mesh = self.spec.add_mesh(name=name, scale=scale)
+        if not is_solid:  # a thin shell may be open, or flat
+            mesh.inertia = SHELL
+        if triangles is None:
+            mesh.file = str(file)
+        else:
+            fill(mesh, triangles)
             self.made[name] = triangles
         return name
 
@@ -99,31 +103,14 @@ def compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool
     ``triangles`` are its own, if it has no file. Raises ``ValueError``.
     """
     trial = mujoco.MjSpec()
-    is_solid = mesh.inertia != _SHELL and not is_shown_only
-    add_mesh(trial, mesh.name, mesh.file, mesh.scale, triangles, is_solid=is_solid)
+    alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
+    alone.inertia = SHELL if is_shown_only else mesh.inertia
+    if triangles is not None:
+        fill(alone, triangles)
     geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
     if is_shown_only:
         geom.contype = geom.conaffinity = 0
     return trial.compile()
-
-
-def add_mesh(
-    spec: Any,
-    name: str,
-    file: Path | str,
-    scale: Sequence[float],
-    triangles: Triangles | None,
-    *,
-    is_solid: bool,
-) -> None:
-    """Add a mesh that MuJoCo reads from its file, or whose ``triangles`` are here."""
-    mesh = spec.add_mesh(name=name, scale=scale)
-    if not is_solid:  # a thin shell may be open, or flat
-        mesh.inertia = _SHELL
-    if triangles is None:
-        mesh.file = str(file)
-    else:
-        fill(mesh, triangles)
 
 
 def why_unread(file: Path) -> str:

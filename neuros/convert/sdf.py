@@ -163,7 +163,7 @@ def _compiled(building: Building, root: Element) -> Any:
             warnings.simplefilter("always")
             boxed = []
             try:
-                model = building.spec.compile()
+                model = building.spec.copy().compile()  # MuJoCo 3 forgets no mesh of a geom
                 may_be_flat = has_flat_meshes(model)
             except ValueError:
                 may_be_flat = True

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-from neuros.observe.spending import spending_of
+from neuros.core.spending import spending_of
 
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""

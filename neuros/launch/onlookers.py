@@ -12,7 +12,6 @@ from typing import Any
 from neuros.control import Lines
 from neuros.launch.channels import Channels
 from neuros.launch.outcome import Outcome, Output, Phase
-from neuros.observe.report import running_s
 
 
 class Pause:
@@ -125,7 +124,7 @@ class Onlookers:
             exit_code=outcome.exit_code,
             reason=outcome.reason,
             reports=outcome.reports,
-            running_s=running_s(outcome),
+            running_s=outcome.running_s,
         )
 
     def _on_watch(self, lines: Lines, _: Mapping[str, Any]) -> None:

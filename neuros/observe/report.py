@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from neuros.core.spending import spending_of
 from neuros.observe.load_table import load_table
-from neuros.observe.spending import spending_of
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 
@@ -33,6 +33,9 @@ class Ended(Protocol):
     paused_s: float
     stacks: dict[str, str]
 
+    @property
+    def running_s(self) -> float | None: ...
+
 
 def run_record(
     project: Project,
@@ -43,8 +46,7 @@ def run_record(
 ) -> dict[str, Any]:
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
-    sim_s = max(sim_times, default=None)
-    all_ran_s = running_s(ended)
+    sim_s, all_ran_s = max(sim_times, default=None), ended.running_s
     ledgers = {**ended.elsewhere, **{n: r["ledger"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -56,7 +58,9 @@ def run_record(
         "sim_s": sim_s,
         "running_s": all_ran_s,
         "paused_s": ended.paused_s,
-        "real_time_factor": None if sim_s is None or not all_ran_s else sim_s / all_ran_s,
+        "real_time_factor": None
+        if sim_s is None or not ended.running_s
+        else sim_s / ended.running_s,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
@@ -103,26 +107,6 @@ def consumed_percent(connection: Mapping[str, Any]) -> float | None:
     """The share of the packets sent on a connection that were consumed, in per cent."""
     sent, consumed = connection.get("sent"), connection.get("consumed")
     return 100 * consumed / sent if sent and consumed is not None else None
-
-
-def running_s(ended: Ended) -> float | None:
-    """Wall time in which simulated time went on: not initialisation, pauses, draining and the end.
-
-    It counts from when every node had initialised, or, if that was not before the end, from when
-    the node that owns simulated time had.
-    """
-    since = {
-        name: report["running_since_s"]
-        for name, report in ended.reports.items()
-        if report["running_since_s"] is not None
-    }
-    if ended.ending_s is None:
-        return None
-    owners = [since[n] for n in since if ended.reports[n]["sim_time"] is not None]
-    start_s = max(since.values(), default=ended.ending_s)
-    if start_s >= ended.ending_s or len(since) < len(ended.reports):
-        start_s = max(owners, default=ended.ending_s)
-    return max(0.0, float(ended.ending_s - start_s))
 
 
 def _connections(files: Sequence[NodeFile]) -> list[Connection]:

@@ -15,6 +15,7 @@ from neuros.project.scanner import display_name
 from neuros.project.suggest import did_you_mean
 
 _MOST_FILES = 400
+_MOST_FOLDERS = 2000
 _VARIABLE = re.compile(r"[A-Za-z_]\w*")
 # A variable that is not named by a literal may be any.
 _COMPUTED = re.compile(
@@ -119,7 +120,7 @@ def unread_variables(
         plugin, sources = read_plugin(node.plugin), _sources(node, draft.roots.project)
         if plugin is None or sources is None:
             continue
-        word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)")
+        word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)", re.IGNORECASE)
         if any(word.search(source) or _COMPUTED.search(source) for source in sources):
             continue
         candidates = {text for text in plugin.texts if _VARIABLE.fullmatch(text)}
@@ -141,7 +142,8 @@ def _is_read_by_neuros(key: str) -> bool:
 
 
 def _sources(node: Node, project: Path) -> list[str] | None:
-    """The programs of a project; ``None`` where there are too many to look at."""
+    """The programs of a project; ``None`` where there are too many files to look at."""
+    seen = 0
     files = {node.plugin, *([node.script] if node.script else [])}
     for folder in {project, node.plugin.parent}:
         for here, folders, names in os.walk(folder):
@@ -150,6 +152,7 @@ def _sources(node: Node, project: Path) -> list[str] | None:
                 continue
             folders[:] = [name for name in folders if not name.startswith((".", "__"))]
             files |= {Path(here, name) for name in names if name.endswith((".py", ".sh"))}
-            if len(files) > _MOST_FILES:
+            seen += 1
+            if len(files) > _MOST_FILES or seen > _MOST_FOLDERS:
                 return None
     return [file.read_text("utf-8", "replace") for file in files if file.is_file()]

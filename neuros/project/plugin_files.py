@@ -18,7 +18,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
-from neuros import hooks as declarations
 from neuros.project.suggest import did_you_mean
 
 _HOOKS = "neuros.hooks"
@@ -28,6 +27,10 @@ _ARGUMENTS = {
     "neuros_function": ("inputs", "outputs"),
     "neuros_finalise": (),
 }
+_FOR_TOOLS = ("HookKind", "HookSpec", "InputSpec", "OutputSpec", "hook_specs_of")
+PUBLIC_NAMES = ("All", "Optional", *_ARGUMENTS, *_FOR_TOOLS)
+"""What there is in ``neuros.hooks``."""
+
 # Packages whose functions are no hooks; those of any other one may be.
 _WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "numpy", "rclpy", "scipy"}
 # With these, a plugin may make hooks in ways that are not to be seen.
@@ -80,6 +83,7 @@ class PluginFile:
         hooks: those that are known.
         mistakes: what would keep a node from starting, whatever its ports are.
         doubts: what may be a mistake.
+        imports: the modules that it imports.
         texts: all text constants.
         model_arguments: what is given to ``MuJoCo`` as its model.
         sets_timestep: whether it may change the timestep of a model.
@@ -89,13 +93,16 @@ class PluginFile:
     hooks: list[DeclaredHook] = field(default_factory=list)
     mistakes: list[Remark] = field(default_factory=list)
     doubts: list[Remark] = field(default_factory=list)
+    imports: frozenset[str] = frozenset()
     texts: frozenset[str] = frozenset()
     model_arguments: tuple[ast.expr, ...] = ()
     sets_timestep: bool = False
 
 
 def read_plugin(path: Path) -> PluginFile | None:
-    """What a plugin declares; ``None`` if the file cannot be read."""
+    """What a plugin declares; ``None`` if the file cannot be read, or is a compiled one."""
+    if path.suffix != ".py":
+        return None
     try:
         status = path.stat()
         return _read(path, status.st_mtime_ns, status.st_size)
@@ -148,40 +155,37 @@ class _Reader:
             self._bind(node)
 
     def read(self) -> None:
-        plugin, previous = self._plugin, dict[str, int]()
-        for statement, is_certain in _module_level(self._tree.body):
-            if isinstance(statement, (*_FUNCTIONS, ast.ClassDef)) and is_certain:
-                if statement.name in previous:
-                    self._plugin.doubts.append(
-                        Remark(
-                            previous[statement.name],
-                            1,
-                            f"hook '{statement.name}' is lost: line {statement.lineno} defines"
-                            f" another '{statement.name}'",
-                        )
-                    )
-                previous.pop(statement.name, None)
-            if isinstance(statement, _FUNCTIONS) and is_certain:
-                before = len(plugin.hooks)
-                self._read_function(statement)
-                if len(plugin.hooks) > before:
-                    previous[statement.name] = statement.lineno
+        plugin, nodes = self._plugin, self._nodes
+        self._read_statements()
         if not plugin.hooks and not plugin.mistakes and not self._may_have_hooks():
-            plugin.mistakes.append(
-                Remark(
-                    1,
-                    1,
-                    "declares no hooks",
-                    "mark functions with @neuros_function or @neuros_tick from neuros.hooks",
-                )
-            )
-        constants = (node for node in self._nodes if isinstance(node, ast.Constant))
-        plugin.texts = frozenset(c.value for c in constants if isinstance(c.value, str))
+            hint = "mark functions with @neuros_function or @neuros_tick from neuros.hooks"
+            plugin.mistakes.append(Remark(1, 1, "declares no hooks", hint))
+        constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+        plugin.texts = frozenset(value for value in constants if isinstance(value, str))
         plugin.model_arguments = tuple(self._model_arguments())
+        attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
         plugin.sets_timestep = any(
-            isinstance(node, ast.Attribute) and node.attr in ("opt", "option", "timestep")
-            for node in self._nodes
+            node.attr in ("opt", "option")
+            or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
+            for node in attributes
         )
+
+    def _read_statements(self) -> None:
+        """What is executed in any case when the plugin is imported."""
+        lines: dict[str, int] = {}  # of the last hook of each name
+        for statement in (
+            each for each, is_certain in _module_level(self._tree.body) if is_certain
+        ):
+            if isinstance(statement, ast.ImportFrom):
+                self._check_import(statement)
+            if not isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
+                continue
+            name, line = statement.name, statement.lineno
+            if name in lines:
+                text = f"hook '{name}' is lost: line {line} defines another '{name}'"
+                self._plugin.doubts.append(Remark(lines.pop(name), 1, text))
+            if isinstance(statement, _FUNCTIONS) and self._read_function(statement):
+                lines[name] = line
 
     # ------------------------------------------------------------------ what names mean
 
@@ -190,26 +194,28 @@ class _Reader:
             self._origins.setdefault(name, set()).add(origin)
 
         if isinstance(node, ast.Import):
+            self._plugin.imports |= {alias.name for alias in node.names}
             for alias in node.names:
                 top = alias.name.partition(".")[0]
                 bind(alias.asname or top, alias.name if alias.asname else top)
         elif isinstance(node, ast.ImportFrom):
             module = "." * node.level + (node.module or "")
+            self._plugin.imports |= {module}
             for alias in node.names:
                 if alias.name == "*":
                     self._stars.append(module)
                 else:
                     bind(alias.asname or alias.name, f"{module}.{alias.name}")
-                    self._check_import(node, module, alias.name)
         elif isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
             bind(node.id, "")
         elif isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
             bind(node.name, "")
 
-    def _check_import(self, node: ast.ImportFrom, module: str, name: str) -> None:
-        if module == _HOOKS and not hasattr(declarations, name):
-            hint = did_you_mean(name, declarations.__all__)
-            self._mistake(node, f"neuros.hooks has no '{name}'", hint)
+    def _check_import(self, node: ast.ImportFrom) -> None:
+        for alias in node.names if node.module == _HOOKS and not node.level else ():
+            if alias.name not in ("*", *PUBLIC_NAMES):
+                hint = did_you_mean(alias.name, PUBLIC_NAMES)
+                self._mistake(node, f"neuros.hooks has no '{alias.name}'", hint)
 
     def _meaning(self, expression: ast.expr) -> str:
         """The dotted name behind an expression, empty if it is not known."""
@@ -219,7 +225,7 @@ class _Reader:
         if not isinstance(expression, ast.Name):
             return ""
         origins = self._origins.get(expression.id, set())
-        if not origins and self._stars == [_HOOKS] and expression.id in declarations.__all__:
+        if not origins and self._stars == [_HOOKS] and expression.id in PUBLIC_NAMES:
             return f"{_HOOKS}.{expression.id}"
         return next(iter(origins)) if len(origins) == 1 else ""
 
@@ -230,7 +236,7 @@ class _Reader:
             return name
         is_forgotten = (
             isinstance(expression, ast.Name)
-            and expression.id in declarations.__all__
+            and expression.id in PUBLIC_NAMES
             and expression.id not in self._origins
             and not self._stars
         )
@@ -260,11 +266,23 @@ class _Reader:
                 "neuros.simulators.mujoco.simulator.MuJoCo",
             ):
                 given = [k.value for k in node.keywords if k.arg == "model"] or node.args[1:2]
-                yield given[0] if given else ast.Constant(None)
+                yield self._value(given[0]) if given else ast.Constant(None)
+
+    def _value(self, expression: ast.expr) -> ast.expr:
+        """What a name is bound to, once and for all; anything else as it is."""
+        if isinstance(expression, ast.Name):
+            name = expression.id
+            made = [each for each in self._nodes if getattr(each, "targets", None)]
+            values = [a.value for a in made if isinstance(a, ast.Assign) and _binds(a, name)]
+            stores = [n for n in self._nodes if isinstance(n, ast.Name) and n.id == name]
+            if sum(not isinstance(n.ctx, ast.Load) for n in stores) == len(values) == 1:
+                return values[0]
+        return expression
 
     # ------------------------------------------------------------------ hooks
 
-    def _read_function(self, function: _Function) -> None:
+    def _read_function(self, function: _Function) -> bool:
+        """Read the hooks that a function is; returns whether it is any."""
         marks = [(each, self._kind(each)) for each in function.decorator_list]
         is_plain = all(kind for _, kind in marks)
         for decorator, kind in marks:
@@ -276,6 +294,7 @@ class _Reader:
                 self._check_signature(function, hook.inputs)
         if is_plain and marks:
             self._check_kind_of_function(function)
+        return any(kind for _, kind in marks)
 
     def _kind(self, decorator: ast.expr) -> str:
         called = decorator.func if isinstance(decorator, ast.Call) else decorator
@@ -322,7 +341,7 @@ class _Reader:
             return
         try:
             value = ast.literal_eval(seconds)
-        except ValueError:
+        except (TypeError, ValueError):
             return
         if isinstance(value, bool) or not isinstance(value, int | float):
             self._mistake(seconds, f"{who}: seconds={value!r} is not a number")
@@ -334,6 +353,8 @@ class _Reader:
     ) -> tuple[DeclaredPort, ...] | None:
         if written is None or (isinstance(written, ast.Constant) and written.value is None):
             return ()
+        if isinstance(written, ast.Dict):
+            return None  # its keys are the ports
         is_list = isinstance(written, ast.List | ast.Tuple | ast.Set)
         entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
         ports = [self._port(function, entry, is_input=is_input) for entry in entries]
@@ -432,6 +453,10 @@ class _Reader:
         remark = Remark(line, column, text, hint)
         if remark not in self._plugin.mistakes:
             self._plugin.mistakes.append(remark)
+
+
+def _binds(assignment: ast.Assign, name: str) -> bool:
+    return any(isinstance(each, ast.Name) and each.id == name for each in assignment.targets)
 
 
 def _module_level(

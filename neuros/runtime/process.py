@@ -184,7 +184,7 @@ class NodeProcess:
                 return
             try:
                 node.load()
-                self._tell("hooks", node=node.name, **_declared(node.specs))
+                self._tell("hooks", node=node.name, **declared(node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
         if self._is_ending:
@@ -274,7 +274,7 @@ class NodeProcess:
         self._fail(node.name, error)
 
 
-def _declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
+def declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
     """What the supervisor has to know of the hooks of a node."""
     return {
         "hooks": [

@@ -165,7 +165,7 @@ class TestSurroundings:
 
     def test_with_a_wheelhouse_nothing_else_is_asked(self) -> None:
         around = surroundings(engine_with("bridge"), {"HTTP_PROXY": "x"}, None, "http://w/")
-        assert around.arguments == {"SYSTEM_PACKAGES": ""}
+        assert around.arguments == {"SYSTEM_PACKAGES": "", "WINDOWS": "no"}
         assert around.network == "host"
         assert around.lines == "ARG PIP_NO_INDEX=1 PIP_FIND_LINKS=http://w/"
 

@@ -193,12 +193,8 @@ def test_columns_of_no_message_are_those_of_any(messages: Sent) -> None:
 
 def test_columns_of_no_message_of_an_intricate_type_have_its_fields() -> None:
     store = get_typestore(Stores.EMPTY)
-    store.register(
-        get_types_from_msg(
-            "string[2] names\nstd_msgs/Bool on\n================================================================================\nMSG: std_msgs/Bool\nbool data",
-            "a/msg/B",
-        )
-    )
+    definition = f"string[2] names\nstd_msgs/Bool on\n{'=' * 80}\nMSG: std_msgs/Bool\nbool data"
+    store.register(get_types_from_msg(definition, "a/msg/B"))
     assert [*columns_of([], "a/msg/B", store)] == ["names", "on.data"]
 
 

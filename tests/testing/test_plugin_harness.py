@@ -539,7 +539,7 @@ def test_a_plugin_can_look_around(plugin):
     assert harness.node.get_topic_info(topics[0]) == (
         "Type: std_msgs/msg/Int32\nPublisher count: 1\nSubscription count: 1"
     )
-    with pytest.raises(NodeError, match="get_topic_info: there is no topic '/x' now$"):
+    with pytest.raises(NodeError, match=r"get_topic_info: there is no topic '/x' now$"):
         harness.node.get_topic_info("x")
 
 
@@ -567,7 +567,8 @@ def test_a_packet_without_a_name_is_of_the_type_that_alone_can_be_meant(plugin, 
 
 def failing(plugin, body, **arguments):
     """What a hook with this body fails of."""
-    text = f"import rclpy, subprocess\nfrom neuros.hooks import *\n@neuros_initialise()\ndef f(node): {body}"
+    head = "import rclpy, subprocess\nfrom neuros.hooks import *\n"
+    text = f"{head}@neuros_initialise()\ndef f(node): {body}"
     with pytest.raises(HookError) as failed:
         PluginHarness(plugin(text), **arguments).run()
     return failed.value.text

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from neuros.observe.spending import Spending
+from neuros.core.spending import Spending
 from neuros.project.model import Connection
 
 WORTH_NAMING = 0.02

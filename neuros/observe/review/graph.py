@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from neuros.core.spending import Spending
 from neuros.observe.review.run import Run
 from neuros.observe.review.style import BLUE, GREY, RED, STATES, new_figure
-from neuros.observe.spending import Spending
 from neuros.project.graph import guarantee, port_names
 from neuros.project.layout import Place, lay_out
 

@@ -13,13 +13,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from neuros.core.spending import Spending, spending_of
 from neuros.errors import UsageError
 from neuros.observe.load_table import FILE_NAME
 from neuros.observe.packets import FOLDER, Packets, packet_figures, read_packets
 from neuros.observe.past_run import connection_of
 from neuros.observe.report import FORMAT
 from neuros.observe.review.trace import Trace, read_trace
-from neuros.observe.spending import Spending, spending_of
 from neuros.project.model import Connection
 
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from neuros.core.spending import Spending
 from neuros.observe.review.bottleneck import Bottleneck, Gain, Step, find_bottleneck
 from neuros.observe.review.run import Run
-from neuros.observe.spending import Spending
 
 _WORTH_A_TRY = 1.05
 _BUSY = 0.85

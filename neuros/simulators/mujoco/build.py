@@ -48,6 +48,16 @@ def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
     )
 
 
+def timestep_of(model: Path | str) -> float:
+    """The timestep of a model in MJCF, a file or its text, in seconds.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    spec = mujoco.MjSpec.from_file if isinstance(model, Path) else mujoco.MjSpec.from_string
+    return float(spec(str(model)).option.timestep)
+
+
 def _resolve(node: NodeContext, model: str) -> Path:
     """The file, also if it lies in a folder that Gazebo's variables name."""
     try:

@@ -68,14 +68,14 @@ class World:
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
-        if any(sensor.kind == "camera" for sensor in self._sensors):
-            import_opengl()  # what is missing is said now, and not at the first image
         self.data = mujoco.MjData(self.model)
         self.cameras = Cameras(self.model, fine=fine)
         self.time = Timebase(self.model.opt.timestep)
         self.schedule = self._make_schedule(problems)
         self._bound = self._bind(self.model, problems)
         problems.raise_any()
+        if any(sensor.kind == "camera" for sensor in self._sensors):
+            import_opengl()  # what is missing is said now, and not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
         mujoco.mj_forward(self.model, self.data)

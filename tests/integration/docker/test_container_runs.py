@@ -16,6 +16,7 @@ import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
 from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
+from virtual_display import virtual_display
 
 from containers import require_containers, wait_until
 from neuros.control import SOCKET_NAME
@@ -32,6 +33,20 @@ from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES
 
 LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
+DRAWS = """
+from neuros.visualise import VisualiseLines
+
+@neuros_initialise()
+def draw(node):
+    figure = VisualiseLines("speed of light")
+    figure.add_line("c")
+    figure.plot("c", 1.0, 0.0)
+    node.set_user_data(figure)
+
+@neuros_tick(seconds=0.1)
+def live(node):
+    pass
+"""
 LOOKS = """
 @neuros_initialise()
 def look(node):
@@ -208,6 +223,19 @@ def test_a_display_that_is_not_there_is_said(bench: ContainerBench) -> None:
     assert "a asks for a display, and DISPLAY is not set: no windows" in finished.said("neuros")
 
 
+def test_a_figure_has_a_window_on_the_display_that_may_be_closed(bench: ContainerBench) -> None:
+    bench.project({"a": DRAWS}, a={"display": True})
+    with virtual_display() as user:
+        running = bench.start(DISPLAY=user.display)
+        user.close(user.find("speed of light"))
+        running.signal(signal.SIGINT)
+        finished = running.finish(30.0)
+    assert finished.exit_code == 130, finished.output
+    assert finished.run_folder is not None
+    assert "no window" not in finished.output
+    assert (finished.run_folder / "a" / "speed_of_light.png").stat().st_size > 0
+
+
 def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     script = bench.folder / "before"
     script.write_text("#!/usr/bin/env python3\nprint('a script in Python')\n")
@@ -294,7 +322,10 @@ def test_nodes_that_cannot_end_are_killed(bench: ContainerBench) -> None:
     running = bench.start_and_wait("a", "b")
     running.signal(signal.SIGINT)
     finished = running.finish(15.0)
-    assert "'a': not ended after 5 s, killed" in finished.output
+    assert (
+        "node 'a' had to be killed 5 s after the end began: 'a' was still executing 'hold';"
+        " finalise hook 'save' of 'a' did not run" in finished.output
+    )
     assert finished.exit_code == 130
     assert bench.has_saved("b")
 

@@ -11,9 +11,11 @@ from describing import CUBE, Folder, link, positions
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuros.convert.find import Finder
 from neuros.convert.flat import _convex_hull
 from neuros.convert.output import write_mjcf
 from neuros.convert.poses import from_rpy
+from neuros.convert.urdf import read_urdf
 
 CORNERS = np.array([(-2, -1, 0), (2, -1, 0), (2, 1, 0), (-2, 1, 0)], float)
 FACES = "f 1 2 3\nf 1 3 4\n"
@@ -82,9 +84,10 @@ def test_a_ball_lies_on_it(folder: Folder) -> None:
 
 
 def test_a_mesh_with_two_faces_has_its_box_around_it(folder: Folder) -> None:
-    folder.write("wall.obj", obj(CORNERS, BOTH))
+    place = from_rpy(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    folder.write("wall.obj", obj(CORNERS @ place.rotation.T + place.position, BOTH))
     model = folder.model(STATIC + link("wall", shape("collision", "hull", "wall.obj")))
-    assert model.geom("wall/hull").pos == pytest.approx([0, 0, 0], abs=1e-6)
+    assert model.geom("wall/hull").pos == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
 
 
 def test_a_box_that_covers_more_than_the_mesh_is_listed_as_such(folder: Folder) -> None:
@@ -109,6 +112,23 @@ def test_a_flat_mesh_that_had_to_be_converted_is_not_written(folder: Folder) -> 
     assert write_mjcf(converted, folder.path / "model.sdf", output) == [output]
     model = mujoco.MjModel.from_xml_path(str(output))
     assert model.geom("floor/hull").type == mujoco.mjtGeom.mjGEOM_BOX
+
+
+def test_the_same_in_urdf(folder: Folder) -> None:
+    folder.write("floor.obj", obj(CORNERS))
+    mesh = '<geometry><mesh filename="floor.obj"/></geometry>'
+    file = folder.write(
+        "hall.urdf",
+        f"""<robot name="hall">
+        <link name="floor"><visual>{mesh}</visual><collision>{mesh}</collision></link>
+        </robot>""",
+    )
+    converted = read_urdf(file, Finder(()))
+    model = converted.spec.compile()
+    (note,) = converted.not_taken
+    assert note.path == "link[floor]"
+    assert note.why == WHY
+    assert sorted(model.geom_type) == [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH]
 
 
 def test_another_mesh_that_cannot_be_used_is_still_an_error(folder: Folder) -> None:
