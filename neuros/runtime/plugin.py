@@ -65,7 +65,7 @@ def describe(error: BaseException) -> str:
     lines = "".join(traceback.format_exception_only(type(error), error)).splitlines()
     # A syntax error shows the place first, indented.
     line = next(line for line in lines if line and not line.startswith(" ")).strip()
-    hint = _hint(error) or nest2_hint(error, line.partition(": ")[2])
+    hint = nest2_hint(error, line.partition(": ")[2]) or _hint(error)
     return f"{line} ({hint})" if hint else line
 
 
