@@ -1,15 +1,16 @@
 """A packet there and one back: hook to hook with NeuROS, and without it, placed alike.
 
-Every measurement returns ``median`` and ``p99`` of the durations in microseconds, after
+Every measurement returns ``median``, ``p90`` and ``p99`` of the durations in microseconds, after
 :data:`WARM_UP` that do not count.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ STRING, IMU, IMAGE = "std_msgs/msg/String", "sensor_msgs/msg/Imu", "sensor_msgs/
 
 UNPINNED, CORE_EACH, ONE_CORE = "unpinned", "a core each", "one core"
 KERNEL = "left to the kernel"
-"""What *unpinned* means without NeuROS; with it, its launcher places the nodes by default."""
+"""``--no-placement``: what *unpinned* means as long as the default pins nothing."""
 
 _TIMEOUT_S = 120.0
 
@@ -59,16 +60,27 @@ def neuros(
     connection: dict[str, Any] | None = None,
 ) -> dict[str, float]:
     """From hook to hook and back, lossless if ``connection`` says nothing else."""
-    if connection is None:
-        connection = {"discard_limit": 0}
-    project = _project(packet, count + WARM_UP, connection)
+    with placed_project(packet, count + WARM_UP, place, connection) as folder:
+        launch(folder, folder / "run", backend, options=options_of(place))
+        return _figures(json.loads((folder / "run" / "ping" / "result.json").read_text()))
+
+
+@contextlib.contextmanager
+def placed_project(
+    packet: Packet, round_trips: int, place: str, connection: dict[str, Any] | None = None
+) -> Iterator[Path]:
+    """The folder of a project that makes so many round trips, and then ends."""
+    project = _project(packet, round_trips, connection or {"discard_limit": 0})
     if place in (CORE_EACH, ONE_CORE):
         for node, chosen in zip(project["nodes"], _cores_of_two(place), strict=True):
             node["affinity"] = list(chosen)
     with project_of_plugins(project) as folder:
-        options = ["--no-placement"] if place == KERNEL else []
-        launch(folder, folder / "run", backend, options=options)
-        return _figures(json.loads((folder / "run" / "ping" / "result.json").read_text()))
+        yield folder
+
+
+def options_of(place: str) -> list[str]:
+    """What ``neuros launch`` is told about it."""
+    return ["--no-placement"] if place == KERNEL else []
 
 
 def bare(
@@ -123,8 +135,8 @@ def _cores_of_two(place: str) -> tuple[Sequence[int], Sequence[int]]:
 
 def _figures(durations_us: Sequence[float]) -> dict[str, float]:
     counted = sorted(durations_us[WARM_UP:])
-    rank = math.ceil(0.99 * len(counted)) - 1
-    return {"median": statistics.median(counted), "p99": counted[rank]}
+    p90, p99 = (counted[math.ceil(share * len(counted)) - 1] for share in (0.9, 0.99))
+    return {"median": statistics.median(counted), "p90": p90, "p99": p99}
 
 
 def _project(packet: Packet, round_trips: int, connection: dict[str, Any]) -> dict[str, Any]:

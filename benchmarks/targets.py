@@ -142,6 +142,16 @@ TARGETS = (
         ),
     ),
     Target(
+        "a node that cannot follow, process: greatest age of a command beside a camera",
+        "overload",
+        "bare rclpy, the better one of its executors",
+        "overload",
+        (
+            Bound("overload-age", 1.1, label="age of a command"),
+            Bound("overload-wait", 1.1, label="longest wait of one of two inputs"),
+        ),
+    ),
+    Target(
         "WhiskEye from the command to its first hook",
         "first hook of WhiskEye",
         "",

@@ -76,6 +76,9 @@ class Transport(Protocol):
         Whoever reads them takes them away. Connections of which none are kept are left out.
         """
 
+    def has_taken_in(self) -> bool:
+        """Whether all that has reached this node, from wherever, has been handled."""
+
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""
 
@@ -120,6 +123,13 @@ class EventLoop(Protocol):
     @property
     def has_waiting_events(self) -> bool:
         """Whether events of engines wait."""
+
+    @property
+    def has_taken_in(self) -> bool:
+        """Whether all that had come from outside has been handled; at a loop-back it has."""
+
+    def note_execution(self) -> None:
+        """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Handle ``event`` after everything that already waits. Loop thread only."""
@@ -196,6 +206,12 @@ class Middleware(Protocol):
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
+
+    def checker(self, kind: type) -> Callable[[Packet], Packet]:
+        """What checks packets of a class before they are sent.
+
+        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
+        """
 
     def close(self) -> None:
         """Let what was sent last leave, then give up everything."""

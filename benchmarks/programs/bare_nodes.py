@@ -1,4 +1,4 @@
-"""Nodes without NeuROS: rclpy publishers, subscriptions and timers, all in one ``rclpy.spin``.
+"""Nodes without NeuROS: rclpy publishers, subscriptions and timers, all in one executor.
 
 ``python -m benchmarks.programs.bare_nodes '[{"role": "relay", "from": "a", "to": "b"}, ...]'``
 prints ``matched`` as soon as every topic has its ``senders`` and ``receivers`` (1 each unless
@@ -8,22 +8,26 @@ measures prints what as a line of JSON.
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import Imu
-from std_msgs.msg import String
+from std_msgs.msg import Int64, String
 
 from benchmarks.plugins.arrivals import Arrivals, flood, paced
+from benchmarks.plugins.waits import Waits
 from benchmarks.programs import MARK
 
 QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE)
@@ -154,7 +158,55 @@ class Exchange(Part):
         self._node.create_timer(0.1, lambda: self._publisher.publish(Imu()))
 
 
+class TooFast(Part):
+    """Sends the time on the topics ``fast`` and ``other``, at their periods."""
+
+    def __init__(self, node: Node, description: Description) -> None:
+        self._node, self._periods_s = node, description["periods_s"]
+        self._publishers = [
+            node.create_publisher(Int64, name, qos)
+            for name, qos in _overload_topics(description["reliable"])
+        ]
+
+    def is_matched(self) -> bool:
+        return all(each.get_subscription_count() for each in self._publishers)
+
+    def begin(self) -> None:
+        for publisher, period_s in zip(self._publishers, self._periods_s, strict=True):
+            self._node.create_timer(
+                period_s, lambda p=publisher: p.publish(Int64(data=time.monotonic_ns()))
+            )
+
+
+class TooSlow(Part):
+    """Takes its time for what :class:`TooFast` sends; prints what ``Waits`` says of it."""
+
+    def __init__(self, node: Node, description: Description) -> None:
+        takes_s = dict(zip(("fast", "other"), description["takes_s"], strict=True))
+        self._waits, self._is_done = Waits(takes_s, float(description["seconds"])), False
+        self._subscriptions = [
+            node.create_subscription(Int64, name, functools.partial(self._take, name), qos)
+            for name, qos in _overload_topics(description["reliable"])
+        ]
+
+    def is_matched(self) -> bool:
+        return all(each.get_publisher_count() for each in self._subscriptions)
+
+    def _take(self, name: str, packet: Int64) -> None:
+        if not self._is_done and self._waits.take(name, packet.data):
+            self._is_done = True
+            show(self._waits.result())
+
+
+def _overload_topics(reliable: Sequence[bool]) -> Iterator[tuple[str, QoSProfile]]:
+    for name, is_reliable in zip(("fast", "other"), reliable, strict=True):
+        kind = QoSReliabilityPolicy.RELIABLE if is_reliable else QoSReliabilityPolicy.BEST_EFFORT
+        yield name, QoSProfile(depth=8 if is_reliable else 1, reliability=kind)
+
+
 ROLES = {
+    "too fast": TooFast,
+    "too slow": TooSlow,
     "relay": Relay,
     "ball": Ball,
     "source": Source,
@@ -183,9 +235,11 @@ def end_with_input() -> None:
 def main() -> None:
     """Command line."""
     rclpy.init()
-    executor = SingleThreadedExecutor()
+    descriptions = json.loads(sys.argv[1])
+    has_events = any(each.get("executor") == "events" for each in descriptions)
+    executor = EventsExecutor() if has_events else SingleThreadedExecutor()
     parts = []
-    for number, description in enumerate(json.loads(sys.argv[1])):
+    for number, description in enumerate(descriptions):
         node = rclpy.create_node(description.get("name", f"bare_{number}"))
         executor.add_node(node)
         parts.append(ROLES[description["role"]](node, description))
@@ -198,7 +252,8 @@ def main() -> None:
     for part in parts:
         part.begin()
     try:
-        executor.spin()
+        # Without a timeout, the executor of events spins hot.
+        executor.spin_until_future_complete(Future(), timeout_sec=3600)
     except (ExternalShutdownException, RCLError):
         if rclpy.ok():
             raise

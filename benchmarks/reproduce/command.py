@@ -19,8 +19,9 @@ from benchmarks.reproduce.running import run_all
 from benchmarks.results import utc_time
 from neuros.errors import EnvironmentFault, UsageError
 
-DURATION_S = 20.0
-_KINDS = {name: f"benchmarks.reproduce.{name}" for name in ("tick", "whiskeye")}
+_KINDS = {
+    name: f"benchmarks.reproduce.{name}" for name in ("elevator", "tick", "voting", "whiskeye")
+}
 
 
 def run(options: argparse.Namespace) -> int:
@@ -35,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         experiment = Experiment.open(Path(options.source), options.experiment)
         _finish(experiment, kind)
         return 0
-    names, duration_s = _chosen(kind, options.only), options.duration or DURATION_S
+    names, duration_s = _chosen(kind, options.only), options.duration or kind.duration_s
     if duration_s < kind.shortest_s:
         raise UsageError(f"--duration {duration_s:g}: a run lasts at least {kind.shortest_s:g} s")
     folder = Path(options.output) if options.output else _new_folder(options.experiment)

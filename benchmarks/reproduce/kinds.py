@@ -42,6 +42,7 @@ class Kind:
         read: what a run has left behind.
         show: draws figures into a folder; returns the sections of the page.
         shortest_s: what a run has to last at least.
+        duration_s: how long it lasts unless somebody says otherwise.
     """
 
     title: str
@@ -51,3 +52,4 @@ class Kind:
     read: Callable[[Path, Entry], Reading]
     show: Callable[[Readings, Path], Sequence[Section]]
     shortest_s: float = 0.0
+    duration_s: float = 20.0

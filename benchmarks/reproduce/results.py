@@ -13,7 +13,7 @@ from benchmarks.results import write_whole
 from neuros.errors import UsageError
 
 ELSEWHERE = (
-    "Published numbers are those of the dissertation that NeuROS 1.0 comes from. They were measured"
+    "Published numbers are the results in the published sources of NeuROS 1.0. They were measured"
     " on other machines and with another simulator (Gazebo; the Neurorobotics Platform beside it),"
     " and with other implementations of the network. They are here to show what was claimed and"
     " in what shape; the difference between them and the figures of this page is not a measure of"

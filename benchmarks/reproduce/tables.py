@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.reproduce.published import Known
-
 if TYPE_CHECKING:
     from benchmarks.reproduce.kinds import Reading, Readings
 
@@ -39,7 +37,7 @@ class Published:
     """A column of published figures, by part."""
 
     header: str
-    known: Mapping[str, Known]
+    known: Mapping[str, float]
 
 
 Column = Ours | Remark | Published
@@ -84,7 +82,7 @@ class Layout:
 
 def _cell(column: Column, name: str, readings: Sequence[Reading]) -> str:
     if isinstance(column, Published):
-        return str(column.known.get(name, NOTHING))
+        return f"{column.known[name]:g}" if name in column.known else NOTHING
     if isinstance(column, Remark):
         found = dict.fromkeys(each.remarks.get(column.key, "") for each in readings)
         return ", ".join(found) or NOTHING

@@ -14,12 +14,15 @@ Ticks = Mapping[str, Any]
 
 _BEYOND_MS = 5.0
 """What is shown to both sides of the period; intervals further away are in the outermost bars."""
+_COLUMNS = 3
 
 
 def draw_ticks(parts: Mapping[str, Sequence[Ticks]], file: Path) -> Path:
     """How often an interval was off its period by how much: a panel per part, of all its runs."""
-    with figure(file, 10.0, 3.2) as drawn:
-        every = panels(drawn, len(parts), len(parts))
+    columns = min(_COLUMNS, len(parts))
+    rows = -(-len(parts) // columns)
+    with figure(file, 10.0, 0.4 + 2.8 * rows) as drawn:
+        every = panels(drawn, len(parts), columns)
         for (title, several), axes in zip(parts.items(), every, strict=True):
             period_ms = several[0]["period_ms"]
             bins, percents = histogram(several)

@@ -8,9 +8,9 @@ from statistics import median
 from typing import Any
 
 from benchmarks.reproduce import published
-from benchmarks.reproduce.drawing import PUBLISHED, SERIES, THEIRS, bars, figure
+from benchmarks.reproduce.drawing import PUBLISHED, SERIES, bars, figure
 from benchmarks.reproduce.kinds import Readings
-from benchmarks.reproduce.published import NRP, Known
+from benchmarks.reproduce.published import NRP
 from benchmarks.reproduce.tables import values_of
 from benchmarks.reproduce.tick_figures import draw_ticks
 from benchmarks.reproduce.whiskeye_curves import Titles, head_direction, heading_error
@@ -66,20 +66,19 @@ def _speed(titles: Titles, readings: Readings, file: Path) -> Path:
 
 
 def _delivery(titles: Titles, readings: Readings, file: Path) -> Path:
-    keys = [("all", "delivery_percent")]
-    keys += [(short, f"delivery_percent.{short}") for short in CONNECTIONS.values()]
+    keys = [("all", "consumed_percent")]
+    keys += [(short, f"consumed_percent.{short}") for short in CONNECTIONS.values()]
     names = list(titles)
     with figure(file, 10.0, 3.6) as drawn:
         every = drawn.subplots(1, len(keys), sharex=True, sharey=True)
-        known = {"all": published.DELIVERY_PERCENT, "imu": published.IMU_DELIVERY_PERCENT}
         for (label, key), axes in zip(keys, every, strict=True):
             shares = [_middle(readings, name, key) for name in names]
             bars(axes, list(titles.values()), [("here", shares)])
-            _mark(axes, names, known.get(label, {}))
+            _mark(axes, names, published.DELIVERY_PERCENT.get(label, {}))
             axes.set_xlim(0, 105)
             axes.set_title(label, loc="left", fontsize=9)
         drawn.legend(*every[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-        drawn.supxlabel("packets delivered, of those sent (%)", fontsize=9)
+        drawn.supxlabel("packets consumed, of those sent (%)", fontsize=9)
     return file
 
 
@@ -90,7 +89,7 @@ def _packets(titles: Titles, readings: Readings, file: Path) -> Path:
         for (connection, short), axes in zip(CONNECTIONS.items(), every, strict=True):
             counts = [
                 (what, [_middle(readings, name, f"{what}.{short}") for name in names])
-                for what in ("sent", "delivered")
+                for what in ("sent", "consumed")
             ]
             bars(axes, list(titles.values()), counts)
             axes.set_title(connection.replace(" -> ", "\n-> "), loc="left", fontsize=9)
@@ -151,21 +150,13 @@ def _stack(axes: Any, labels: Sequence[str], parts: Mapping[str, Sequence[float]
     axes.set_axisbelow(True)
 
 
-def _mark(axes: Any, names: Sequence[str], known: Mapping[str, Known]) -> None:
-    """Put published figures into a chart of bars; an arrow says that it was less."""
+def _mark(axes: Any, names: Sequence[str], known: Mapping[str, float]) -> None:
+    """Put published figures into a chart of bars."""
     label = "published"
     for place, name in enumerate(names):
         if name in known:
-            axes.plot(known[name].value, place, **PUBLISHED, linestyle="", label=label)
+            axes.plot(known[name], place, **PUBLISHED, linestyle="", label=label)
             label = "_published"  # once in the legend
-            if known[name].is_below:
-                axes.annotate(
-                    "<",
-                    (known[name].value, place),
-                    xytext=(-14, -3),
-                    textcoords="offset points",
-                    color=THEIRS,
-                )
 
 
 def _middle(readings: Readings, name: str, key: str) -> float | None:

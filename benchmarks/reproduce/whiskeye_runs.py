@@ -17,10 +17,15 @@ from benchmarks.launching import RUN_S, launch
 from benchmarks.reproduce.experiment import Entry
 from benchmarks.reproduce.intervals import interval_figures
 from benchmarks.reproduce.kinds import Reading
-from benchmarks.reproduce.load import load_between
+from benchmarks.reproduce.packets import (
+    after_the_start,
+    load_meanwhile,
+    packet_figures,
+    speed_percent,
+)
 from benchmarks.subjects.whiskeye import IMU, WHISKEYE
 from neuros.observe.packets import read_packets
-from neuros.observe.past_run import PastRun, open_run
+from neuros.observe.past_run import open_run
 
 FILES = {
     "tick_20ms": "tick_20ms.json",
@@ -31,6 +36,10 @@ FILES = {
     "asynchronous": "asynchronous.json",
     "hybrid": "project.json",
 }
+WITH_1_MS = "_1ms"
+"""Behind the name of a part with a tick: it steps 1 ms of physics, as published."""
+SHARE_WITH_1_MS = 20
+"""Such a part simulates this much less: it takes as long as the others of its tick."""
 POSE = "robot.pose -> visualiser.truth"
 ESTIMATE = "snn.estimate -> visualiser.estimate"
 CONNECTIONS = {IMU: "imu", POSE: "pose", ESTIMATE: "estimate"}
@@ -61,11 +70,17 @@ class Series:
 
 def run(name: str, folder: Path, simulated_s: float, backend: str) -> None:
     """Run one orchestration through the command line."""
+    settings = {"nodes.robot.environment.DURATION": simulated_s}
+    if name.endswith(WITH_1_MS):
+        settings = {
+            "nodes.robot.environment.DURATION": simulated_s / SHARE_WITH_1_MS,
+            "nodes.robot.environment.STEP_SECONDS": 0.001,
+        }
     launch(
-        WHISKEYE / FILES[name],
+        WHISKEYE / FILES[name.removesuffix(WITH_1_MS)],
         folder,
         backend,
-        settings={"nodes.robot.environment.DURATION": simulated_s},
+        settings=settings,
         options=["-m", "--digests"],
         timeout_s=RUN_S + _SLOWEST * simulated_s,
     )
@@ -79,16 +94,16 @@ def read(folder: Path, entry: Entry) -> Reading:
     estimates, truths = _headings(folder / "visualiser" / "head_direction.csv")
     comparison = heading.compare(estimates, truths)
     error_deg = np.degrees(comparison.error_rad)
-    sent_ns = _after_the_start(read_packets(folder, past.connection(IMU)).sent_ns)
+    sent_ns = after_the_start(read_packets(folder, past.connection(IMU)).sent_ns)
     ticks = record["nodes"]["robot"]["hooks"].get(TIMED_HOOK, {}).get("ticks")
     figures: dict[str, float | None] = {
-        "speed_percent": _speed_percent(sent_ns),
+        "speed_percent": speed_percent(sent_ns, IMU_PERIOD_S),
         "wall_s": record["wall_s"],
         "simulated_s": record["sim_s"],
-        **_packets(past),
+        **packet_figures(past, CONNECTIONS),
         **_errors(heading.heading_error(comparison), error_deg),
         **interval_figures(ticks),
-        **_load(folder, sent_ns, entry.unix_minus_monotonic_s),
+        **load_meanwhile(folder, sent_ns, entry.unix_minus_monotonic_s),
     }
     digests = past.connections[ESTIMATE]["digests"]
     remarks = {
@@ -126,25 +141,6 @@ def _headings(file: Path) -> tuple[dict[int, float], dict[int, float]]:
     return estimates, truths
 
 
-def _packets(past: PastRun) -> dict[str, float | None]:
-    """Packets sent and delivered (a hook started on them), by connection and in all."""
-    figures: dict[str, float | None] = {}
-    whole = dict.fromkeys(("sent", "delivered"), 0)
-    for name, short in CONNECTIONS.items():
-        counts = past.connections[name]
-        sent, delivered = counts["sent"] or 0, counts["consumed"] or 0
-        figures |= {f"sent.{short}": sent, f"delivered.{short}": delivered}
-        figures[f"delivery_percent.{short}"] = _percent(delivered, sent)
-        whole["sent"] += sent
-        whole["delivered"] += delivered
-    figures |= whole
-    return {**figures, "delivery_percent": _percent(whole["delivered"], whole["sent"])}
-
-
-def _percent(part: float, whole: float) -> float | None:
-    return 100 * part / whole if whole else None
-
-
 def _errors(summary: Any, error_deg: Any) -> dict[str, float | None]:
     return {
         "estimates": summary.samples,
@@ -153,24 +149,3 @@ def _errors(summary: Any, error_deg: Any) -> dict[str, float | None]:
         "max_deg": summary.max_deg,
         "gain": summary.gain,
     }
-
-
-def _after_the_start(sent_ns: Any) -> Any:
-    """When the last nine tenths of the packets of the IMU were sent, (n,).
-
-    In the first tenth the robot may wait for nodes that are starting.
-    """
-    return sent_ns[len(sent_ns) // 10 :]
-
-
-def _speed_percent(sent_ns: Any) -> float | None:
-    if len(sent_ns) < 2:
-        return None
-    return float(100 * (len(sent_ns) - 1) * IMU_PERIOD_S * 1e9 / (sent_ns[-1] - sent_ns[0]))
-
-
-def _load(folder: Path, sent_ns: Any, unix_minus_monotonic_s: float) -> dict[str, float]:
-    if not len(sent_ns):
-        return {}
-    first, last = (float(ns) * 1e-9 + unix_minus_monotonic_s for ns in sent_ns[[0, -1]])
-    return load_between(folder, first, last)

@@ -59,6 +59,9 @@ class Surroundings:
         return hook.spec.function(self, *arguments)
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None: ...
+    def has_taken_in(self) -> bool:
+        return True
+
     def send_external(self, port: Port, packet: Any) -> None: ...
     def acknowledge(self, connection: Connection, position: int) -> None: ...
 

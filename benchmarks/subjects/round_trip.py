@@ -13,7 +13,6 @@ from benchmarks.measure import Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import (
     CORE_EACH,
     IMU_PACKET,
-    KERNEL,
     LARGE,
     ONE_CORE,
     SMALL,
@@ -57,10 +56,6 @@ def _between_processes(
         _case(what, "rclpy.spin", bound),
         _case(f"{what}, against dora-rs", "dora-rs", bound_against_dora),
     ]
-    if place == UNPINNED:
-        name = "NeuROS, left to the kernel"
-        candidates[name] = functools.partial(neuros, SMALL, "process", count, KERNEL)
-        cases.append(_case(f"round trip, {SMALL.name}, {KERNEL}", "rclpy.spin", None, name))
     if place == CORE_EACH:
         tuned = "rclpy.spin with NeuROS's settings of Fast DDS"
         candidates[tuned] = functools.partial(bare, SMALL, count, place, PROFILES)
@@ -89,11 +84,11 @@ def _large(count: int) -> Group:
     return Group(candidates, (_case(what, "dora-rs", "large-packet"), p99))
 
 
-def _case(name: str, reference: str, bound: str | None, candidate: str = "NeuROS") -> Case:
+def _case(name: str, reference: str, bound: str | None) -> Case:
     return Case(
         name,
         "us",
-        Figure(candidate, "median"),
+        Figure("NeuROS", "median"),
         Figure(reference, "median"),
         reference,
         bound,

@@ -168,6 +168,7 @@ class Execution:
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
+            outcome.failures = [self._as_here(text) for text in outcome.failures]
             outcome.stacks = {name: self._as_here(s) for name, s in outcome.stacks.items()}
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
@@ -268,7 +269,7 @@ class Execution:
     def _supervisor(self, guardian: Guardian) -> Supervisor:
         return Supervisor(
             self._files,
-            self._plan.launcher(self._domain.id, guardian),
+            self._plan.launcher(guardian),
             self._environment(),
             self.folder,
             self._console,

@@ -12,10 +12,9 @@ from neuros.api.back_end import BackEnd, choose_back_end
 from neuros.api.network import THIS_MACHINE, Network, chosen_network
 from neuros.api.request import Duration, Request
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
-from neuros.launch.affinity import usable_cores
 from neuros.launch.environments.pythons import Pythons, require_one_python
 from neuros.launch.guardian import Guardian
-from neuros.launch.placement import Cores, place
+from neuros.launch.placement import place, usable_cores
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.ports import Launcher
@@ -72,23 +71,9 @@ class Plan:
         paths = self.messages.paths if self.messages else ()
         return [replace(f, messages=paths) for f in files if f.node.name in self.names]
 
-    def placement(self, domain_id: int) -> Mapping[str, Cores]:
-        """The cores of the nodes that are to be started, where that is not up to the kernel.
-
-        What runs elsewhere is not known: the other nodes of a project that is started in parts may
-        be on the same cores. In one process there is nothing to spread. Runs at the same time are
-        mostly in different domains, and so begin with different cores.
-        """
-        if not self.is_placed:
-            return {}
-        nodes = [node for node in self.project.nodes if node.name in self.names]
-        is_spread = self.backend != "in-process" and not self.is_partial
-        cores = usable_cores() if is_spread else ()
-        # The first domain that runs pick is 1.
-        return place(nodes, cores, os.environ, begin=max(domain_id - 1, 0))
-
-    def launcher(self, domain_id: int, guardian: Guardian | None = None) -> Launcher:
-        """The launcher of the back end in a ROS domain; ``guardian`` hears of all it starts."""
+    def launcher(self, guardian: Guardian | None = None) -> Launcher:
+        """The launcher of the back end; ``guardian`` hears of all it starts."""
+        nodes = [self.project.node(name) for name in self.names]
         options: list[str] = []
         if self.duration.sim_s is not None:
             options += ["--duration-sim", repr(self.duration.sim_s)]
@@ -99,7 +84,7 @@ class Plan:
         if self.recording is not None:
             options.append("--record")
         return self.back_end.launcher(
-            options, self.placement(domain_id), self.pythons.paths, guardian
+            options, place(nodes) if self.is_placed else {}, self.pythons.paths, guardian
         )
 
 

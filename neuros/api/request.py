@@ -28,7 +28,7 @@ class Request:
         domain_id: the ROS domain, chosen if ``None``.
         network, peers: how far nodes look for others, as the options of the same names.
         output: the run folder; ``None``: ``runs/<project>/<utc time>`` in the current folder.
-        is_placed: whether nodes get cores of their own.
+        is_placed: whether nodes get the cores that they ask for.
         has_digests: whether digests of packets are kept in process, too.
         monitors_load: whether to write what the run takes of the machine.
         shows_progress: whether to show how far it has come; ``None``: if its end is known.

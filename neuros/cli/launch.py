@@ -65,7 +65,7 @@ def _dry_run(plan: Plan, request: Request) -> int:
         print(line)
     for _, notice in plan.back_end.notices:
         print(notice)
-    for line in plan.launcher(domain.id).describe(plan.node_files(folders_of(plan, folder))):
+    for line in plan.launcher().describe(plan.node_files(folders_of(plan, folder))):
         print(line)
     if recording is not None:
         names = ", ".join([*(topic.name for topic in recording.topics), *recording.listen])

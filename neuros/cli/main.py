@@ -144,6 +144,7 @@ def parser() -> argparse.ArgumentParser:
     add_benchmark(commands)
     add_reproduce(commands)
     _add_node(commands)
+    _add_import_plugin(commands)
     add_recorder(commands)
     add_dashboard(commands)
     add_view(commands)
@@ -198,7 +199,7 @@ def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     launch.add_argument(
         "--no-placement",
         action="store_true",
-        help="leave it to the kernel which node runs on which core; affinity has no effect",
+        help="ignore affinity: the kernel chooses the cores of every node",
     )
     add_observation(launch)
     add_dashboard_options(launch)
@@ -219,9 +220,17 @@ def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     validate = commands.add_parser(
         "validate",
         help="check a project without running it",
-        description="Check a project and list every problem with its file, line and column.",
+        description="Check a project and list every problem with its file, line and column."
+        " Plugins are read, and not run.",
     )
     _add_project(validate)
+    validate.add_argument(
+        "--import",
+        dest="imports",
+        action="store_true",
+        help="import the plugin of each node, too, as its process would: their code is run, but no"
+        " hook",
+    )
     validate.set_defaults(command=_validate)
 
 
@@ -252,6 +261,16 @@ def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     node.add_argument("--debug", action="store_true")
     node.add_argument("--record", action="store_true")
     node.set_defaults(command=_node)
+
+
+def _add_import_plugin(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """What ``validate --import`` runs for each node."""
+    command = commands.add_parser("import-plugin", add_help=False)
+    command.add_argument("name")
+    command.add_argument("project")
+    command.add_argument("--set", action="append", default=[])
+    command.add_argument("--answer", type=int, required=True)
+    command.set_defaults(command=_import_plugin)
 
 
 def _add_project(command: argparse.ArgumentParser) -> None:
@@ -293,14 +312,15 @@ def _launch(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import load
+    from neuros.cli.projects import validate
 
-    project = load(options)
-    print(
-        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
-        f" {_count(len(project.connections), 'connection')}"
-    )
-    return 0
+    return validate(options)
+
+
+def _import_plugin(options: argparse.Namespace) -> int:
+    from neuros.cli.projects import import_plugin
+
+    return import_plugin(options)
 
 
 def _graph(options: argparse.Namespace) -> int:
@@ -313,10 +333,6 @@ def _node(options: argparse.Namespace) -> int:
     from neuros.cli.node import run_node
 
     return run_node(options)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _complain(text: str) -> None:

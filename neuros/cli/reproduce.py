@@ -31,23 +31,26 @@ def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     add = reproduce.add_argument
     add(
         "experiment",
-        choices=("whiskeye", "tick"),
+        choices=("whiskeye", "tick", "voting", "elevator"),
         help="whiskeye: the robot in its seven orchestrations; tick: how regular ticks are, beside"
-        " a timer of rclpy",
+        " a timer of rclpy; voting: what is added to three tasks of 5 s at once; elevator: how fast"
+        " a simulation is in three orchestrations",
     )
     add("--repeat", type=positive_number, metavar="N", help="runs of each part (default: 1)")
     add(
         "--only",
         nargs="+",
         metavar="NAME",
-        help="only these parts: tick_20ms, tick_60ms, tick_100ms, strict, no_discard_limit,"
-        " asynchronous, hybrid; or neuros, rclpy",
+        help="only these parts: tick_20ms, tick_60ms, tick_100ms, the same with _1ms behind it,"
+        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); neuros, rclpy (tick); strict,"
+        " no_discard_limit, asynchronous (elevator)",
     )
     add(
         "--duration",
         type=_seconds,
         metavar="SECONDS",
-        help="of a run: simulated seconds of whiskeye, wall seconds of ticks (default: 20)",
+        help="of a run: simulated seconds of whiskeye, else wall seconds (default: 20 for whiskeye"
+        " and elevator, 60 for tick and voting)",
     )
     add(
         "--backend",

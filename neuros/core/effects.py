@@ -12,6 +12,12 @@ from neuros.project.model import Connection, Port
 class Effects(Protocol):
     """What an engine does to the world."""
 
+    def has_taken_in(self) -> bool:
+        """Whether all that had reached the node has become an event, so that a hook may start.
+
+        Where it says no, a loop-back comes after that.
+        """
+
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook of the plugin; raises ``HookError``."""
 

@@ -4,6 +4,8 @@ Every event (a packet, an acknowledgement, a registration, a due timer, the loop
 of a method here. It changes some counters and is followed by one *pass*: each hook is looked at
 once, least recently executed first, and runs if it is ready at its turn. If one is still ready
 afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
+Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
+the loop-back goes on when that has been taken in. So no hook starts on a backlog.
 All that leaves the engine goes through :class:`~neuros.core.effects.Effects`.
 """
 
@@ -25,7 +27,7 @@ from neuros.core.accounting import (
 from neuros.core.effects import Effects
 from neuros.core.exchange import Exchange
 from neuros.core.gate import Gate, drives
-from neuros.core.hook import Hook, Source
+from neuros.core.hook import Hook, PacketType, Source
 from neuros.core.inputs import Inlet
 from neuros.core.life import Life
 from neuros.core.node_ports import NodePorts, undeclared
@@ -43,7 +45,7 @@ class Engine:
         node: the node, with its ports.
         connections: all connections that begin or end at it, in the project's order.
         specs: its hooks, in the order of declaration.
-        packet_types: message class per output name, for checking what hooks return.
+        packet_types: per output name, what hooks must return; any value will do for others.
         clock: monotonic wall clock in nanoseconds.
 
     Attributes:
@@ -63,10 +65,11 @@ class Engine:
         specs: Sequence[HookSpec],
         effects: Effects,
         clock: Callable[[], int],
-        packet_types: Mapping[str, type] | None = None,
+        packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
         self.node = node
         self._effects = effects
+        self._has_taken_in = effects.has_taken_in
         self._clock = clock
         ports = NodePorts(node, connections, packet_types or {})
         self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
@@ -119,17 +122,14 @@ class Engine:
 
     def on_timer(self) -> None:
         """The time of :attr:`next_due_ns` has come."""
-        now_ns = self._wake()
-        for hook in self._ticks:
-            if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
-                hook.is_due = True
+        self._wake()
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself."""
+        """The event that the engine posted to itself; all that waited then has been taken in."""
         self._wake()
         self._has_posted_loop_back = False
-        self._pass()
+        self._pass(may_start=True)
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
         """Send packets as if a hook with those outputs had returned them, once it might run.
@@ -279,17 +279,21 @@ class Engine:
     # ------------------------------------------------------------------ inside
 
     def _wake(self) -> int:
-        """Book the time since the last event; returns the time now."""
+        """Book the time since the last event, and note the ticks due by now; returns the time."""
         now_ns = self._clock()
+        if self._ticks and not self._gate.is_closed:
+            for hook in self._ticks:
+                if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
+                    hook.is_due = True
         if self.executing is None:  # else it is the hook's, and booked when that ends
             self._spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns
         return now_ns
 
-    def _pass(self) -> None:
+    def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life, gate = self._life, self._gate
+        life, gate, exchange = self._life, self._gate, self._exchange
         if not life.has_begun:
             return
         if self._schedule.candidates:
@@ -301,6 +305,9 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
+                        if not may_start and (exchange.to_itself or not self._has_taken_in()):
+                            break
+                        may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False
@@ -354,7 +361,7 @@ class Engine:
             if name not in self.outputs:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
-        source = self._sources[names] = Source(names, self.outputs)
+        source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
         self._life.add_source(source)
         self.all_hooks.append(source)
         return source

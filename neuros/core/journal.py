@@ -2,7 +2,7 @@
 
 An engine decides by its events, and, where hooks have a period, by what its clock says. So both
 are noted, in their order, and each start of a hook besides, to check against. A number below zero
-is an event (its complement has the kind in 4 bits, a place in 20 and a position in 39), any other
+is an event (its complement has the kind in 5 bits, a place in 20 and a position in 38), any other
 one a reading of the clock. An entry costs some 0.1 us.
 """
 
@@ -18,7 +18,7 @@ from neuros.core.hook import Hook
 from neuros.hooks import HookKind
 from neuros.project.model import Connection
 
-_KIND_BITS, _PLACE_BITS = 4, 20
+_KIND_BITS, _PLACE_BITS = 5, 20
 _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
 
 
@@ -40,16 +40,21 @@ class What(IntEnum):
     PAUSE = 12
     RESUME = 13
     STEP = 14  # place: 1 if some node of the project drives it; position: how many
-    LAST_ROUND = 15  # place: of a hook that starts at most once more when the node drains: next
+    DEFERRED = 15  # the pass ended, for what had arrived; position: how many hooks it had started
+    LAST_ROUND = 16  # place: of a hook that starts at most once more when the node drains: next
 
 
 class Event(NamedTuple):
-    """An event, and what the clock said from then to the next one."""
+    """An event, and what the clock said from then to the next one.
+
+    ``limit``: after so many starts its pass ended, for what had arrived; ``None``: it did not.
+    """
 
     what: What
     place: int
     position: int
     readings: list[int]
+    limit: int | None = None
 
 
 class JournalledEngine(Engine):
@@ -65,6 +70,8 @@ class JournalledEngine(Engine):
         has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
         own_clock = self._noting(clock) if has_ticks else clock
         super().__init__(node, connections, specs, effects, own_clock, types)
+        self._has_taken_in = self._noting_deferral(effects.has_taken_in)
+        self._starts = 0
         self._hook_entries = {
             hook: _entry(What.HOOK, place) for place, hook in enumerate(self.all_hooks)
         }
@@ -126,11 +133,26 @@ class JournalledEngine(Engine):
         super().stop_hooks()
         self._note(_entry(What.STOP))
 
+    def _pass(self, *, may_start: bool = False) -> None:
+        if not self._is_passing:
+            self._starts = 0
+        super()._pass(may_start=may_start)
+
     def _run(self, hook: Hook) -> None:
+        self._starts += 1
         entry = self._hook_entries.get(hook)  # packets from a plugin's thread have none
         if entry is not None:
             self._note(entry)
         super()._run(hook)
+
+    def _noting_deferral(self, has_taken_in: Callable[[], bool]) -> Callable[[], bool]:
+        def noted() -> bool:
+            is_in = has_taken_in()
+            if not is_in:
+                self._note(_entry(What.DEFERRED, position=self._starts))
+            return is_in
+
+        return noted
 
     def _noting(self, clock: Callable[[], int]) -> Callable[[], int]:
         note = self._note
@@ -151,7 +173,9 @@ def events_of(journal: Iterable[int]) -> Iterator[Event]:
             event.readings.append(number)
             continue
         what, place, position = _parts(number)
-        if what is not What.HOOK:
+        if what is What.DEFERRED:
+            event = event._replace(limit=position)
+        elif what is not What.HOOK:
             yield event
             event = Event(what, place, position, [])
     yield event

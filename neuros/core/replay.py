@@ -68,6 +68,8 @@ class Script:
         self._next = next(self._starts, _NO_START)
         self._readings: Iterator[int] = iter(next(self._events).readings)
         self._now_ns = 0
+        self._limit: int | None = None
+        self._in_event = 0
         self.started = 0
         self.deliveries: deque[Callable[[], None]] = deque()
         self.loop_back: Callable[[], None] | None = None
@@ -77,10 +79,19 @@ class Script:
         self._now_ns = next(self._readings, self._now_ns)
         return self._now_ns
 
+    def may_start(self) -> bool:
+        """Whether a ready hook starts now, rather than after what had arrived at this point."""
+        return self._limit is None or self._in_event < self._limit
+
+    def note_start(self) -> None:
+        """A hook starts, or packets from a thread of the plugin leave."""
+        self._in_event += 1
+
     def events(self) -> Iterator[Event]:
         """The events, in their order."""
         for event in self._events:
             self._readings = iter(event.readings)
+            self._limit, self._in_event = event.limit, 0
             yield event
 
     @property
@@ -112,6 +123,7 @@ class ReplayedEngine(Engine):
     def __init__(self, script: Script, *arguments: Any) -> None:
         node, connections, specs, effects, _, types = arguments
         super().__init__(node, connections, specs, effects, script.clock, types)
+        self._has_taken_in = script.may_start
         self._script = script
         self._places = {hook: place for place, hook in enumerate(self.all_hooks)}
         self._names = {place: hook.name for hook, place in self._places.items()}
@@ -125,6 +137,7 @@ class ReplayedEngine(Engine):
         place = self._places.get(hook)
         if place is not None:
             self._script.check_start(place, self._names)
+        self._script.note_start()
         super()._run(hook)
 
 

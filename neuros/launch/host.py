@@ -14,9 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.affinity import children_on
 from neuros.launch.host_command import script_failure
-from neuros.launch.placement import Cores
+from neuros.launch.placement import Cores, children_on
 
 
 class HostProcess:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from neuros.launch.placement import THREAD_VARIABLES
 from neuros.launch.wheels import with_libraries, without_mark
 from neuros.project.model import NodeFile
 
@@ -17,9 +18,7 @@ from neuros.project.model import NodeFile
 # simulators differ in the last bit with their number.
 DEFAULTS = {
     "PYTHONUNBUFFERED": "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
+    **dict.fromkeys(THREAD_VARIABLES, "1"),
 }
 # Runs the scripts one after another, each with the log of its node for output, by themselves where
 # they may be executed (seen from where they run, which may be a container); the shell passes

@@ -77,6 +77,26 @@ class Outcome:
     paused_s: float = 0.0
     is_paused: bool = False
 
+    @property
+    def running_s(self) -> float | None:
+        """Wall time in which all nodes ran: without initialisation, pauses, draining and the end.
+
+        It counts from when every node had initialised, or, if that was not before the end, from
+        when the node that owns simulated time had.
+        """
+        since = {
+            name: report["running_since_s"]
+            for name, report in self.reports.items()
+            if report.get("running_since_s") is not None
+        }
+        if self.ending_s is None:
+            return None
+        owners = [since[name] for name in since if self.reports[name].get("sim_time") is not None]
+        start_s = max(since.values(), default=self.ending_s)
+        if start_s >= self.ending_s or len(since) < len(self.reports):
+            start_s = max(owners, default=self.ending_s)
+        return max(0.0, float(self.ending_s - start_s))
+
     def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
         if not self.has_final_report(name):

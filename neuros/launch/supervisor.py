@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines
+from neuros.launch.backlog import Backlog
 from neuros.launch.channels import Channels
 from neuros.launch.declarations import Declarations
 from neuros.launch.ending import STOP_S, Ending
@@ -89,9 +90,11 @@ class Supervisor:
         self._watch = Watch(names, time.monotonic(), run_folder)
         self._processes = Processes(self._watch, self.outcome)
         self._sides.speak_through(lambda text: self._channels.send("say", text=text))
+        connections = connections_among(files)
+        self._backlog = Backlog(connections)
         self._probing = Probing(
             names,
-            connections_among(files),
+            connections,
             self._channels.send,
             self._sides if self._sides.exist else None,
         )
@@ -178,6 +181,7 @@ class Supervisor:
         name, now_s = message["node"], time.monotonic()
         self.outcome.take(name, message, now_s)
         self._watch.report(name, message, now_s)
+        self._backlog.report(message, now_s)
         self._probing.take(name, message)
 
     def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
@@ -267,13 +271,15 @@ class Supervisor:
             return
         if self.pause.is_on:
             self._watch.begin_anew(now_s)
+            self._backlog.begin_anew()
             return
         end_s = self._end_s
         if end_s is not None and now_s >= end_s:
             self._ending.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
-        for severity, text in (*self._watch.remarks(now_s), *self._sides.remarks(now_s)):
-            self._output.log(severity, text)
+        for source in (self._watch, self._backlog, self._sides):
+            for severity, text in source.remarks(now_s):
+                self._output.log(severity, text)
         if self._watch.has_just_stalled(now_s):
             self._channels.send("explain")
         if self._sides.exist or not self._watch.is_complete:  # then not all can be asked

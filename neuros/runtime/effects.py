@@ -17,7 +17,6 @@ from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import describe, last_line
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
-from neuros.runtime.wrong_fields import wrong_field
 
 
 class NodeEffects:
@@ -56,6 +55,7 @@ class NodeEffects:
         self._clock_outputs = time.clock_outputs
         # Nothing is to be added to these: each call that is left out counts.
         self.acknowledge = transport.acknowledge
+        self.has_taken_in = transport.has_taken_in
         self._keeper = keeper
         self._sampler = sampler
         self._enter = enter
@@ -70,6 +70,7 @@ class NodeEffects:
             self.has_run = True
             self._on_first_hook()
         box = [self.run(hook.spec, arguments)]
+        self._loop.note_execution()
         del arguments  # else a packet that the hook passes on would count as held
         if hook.spec.kind is HookKind.INITIALISE:
             self._on_initialised()
@@ -99,11 +100,7 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(connections[0].source_output, packet)
-        try:
-            data = self._transport.send(connections, packet)
-        except Exception:
-            self._blame_plugin(connections[0].source_output, packet)
-            raise
+        data = self._transport.send(connections, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
 
@@ -113,11 +110,7 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(port.name, packet)
-        try:
-            self._transport.send_external(port, packet)
-        except Exception:
-            self._blame_plugin(port.name, packet)
-            raise
+        self._transport.send_external(port, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, port.name, packet)
 
@@ -136,9 +129,3 @@ class NodeEffects:
         if self._keeper is not None:
             self._keeper.keep(Way.TO_ITSELF, str(connection), packet)
         return self._copy(packet)
-
-    def _blame_plugin(self, output: str, packet: Any) -> None:
-        """Where a packet could not be sent since the plugin has filled it wrongly, say so."""
-        if wrong := wrong_field(packet):
-            where = str(self._handle.description.plugin)
-            raise HookError(f"packet for output '{output}': {wrong}", where=where) from None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
+from neuros.core.hook import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap, Way
@@ -146,7 +147,7 @@ class NodeRuntime:
         self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
         node = self.file.node
         self.specs = load_plugin(node.plugin, self.name)
-        types = {port.name: self._middleware.message_class(port.type) for port in node.outputs}
+        types = {port.name: self._packet_type(port) for port in node.outputs}
         self.engine = self._host.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
@@ -240,6 +241,10 @@ class NodeRuntime:
         self._guard(self._loaded.on_timer)
 
     # ------------------------------------------------------------------ inside
+
+    def _packet_type(self, port: Port) -> PacketType:
+        kind = self._middleware.message_class(port.type)
+        return PacketType(kind, self._middleware.checker(kind))
 
     @property
     def _loaded(self) -> Engine:

@@ -25,6 +25,8 @@ class StepLoop:
     after everything that waits.
     """
 
+    has_taken_in = True
+
     def __init__(self, clock: ManualClock) -> None:
         self._clock = clock
         self._events: deque[Event] = deque()
@@ -43,6 +45,9 @@ class StepLoop:
     def post_loop_back(self, event: Event) -> None:
         """The same."""
         self._events.append(event)
+
+    def note_execution(self) -> None:
+        """Nothing has arrived meanwhile."""
 
     def post_from_thread(self, event: Event) -> None:
         """The same, from any thread; nobody is woken, since nobody waits."""

@@ -10,40 +10,45 @@ from __future__ import annotations
 import functools
 import inspect
 import types
+from collections import deque
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any, TypeAlias
 
+from rclpy.subscription import Subscription
+
 from neuros.errors import NodeError
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.plain_node import PlainNode
+from neuros.transport.plain_node import PlainNode, not_in_hooks
+from neuros.transport.ros_loop import RosLoop
 
 Fail: TypeAlias = Callable[[Any, BaseException], None]
 
 # What takes a callback, and at which place of its arguments.
-_CREATORS = (("create_subscription", 2), ("create_timer", 1), ("create_service", 2))
+_CREATORS = (("create_timer", 1), ("create_service", 2))
 
 
 class PluginCallbacks:
     """Wraps the callbacks of all that a plugin creates on its ROS node from now on.
 
     Args:
+        loop: serves the node.
         enter: called before each part of a callback that runs in one go.
         fail: is given a callback and what it has raised; no other is called from then on.
-        is_limited: whether the executor is one without guard conditions and coroutines of services.
     """
 
     def __init__(
-        self, ros_node: PlainNode, enter: Callable[[], None], fail: Fail, *, is_limited: bool
+        self, ros_node: PlainNode, loop: RosLoop, enter: Callable[[], None], fail: Fail
     ) -> None:
+        self._loop = loop
         self._enter = enter
         self._fail = fail
-        self._is_limited = is_limited
         self._is_over = False
         for name, place in _CREATORS:
             setattr(ros_node, name, self._creating(getattr(ros_node, name), name, place))
+        ros_node.create_subscription = self._subscribing(ros_node.create_subscription)
         ros_node.create_client = self._creating_client(ros_node.create_client)
         ros_node.add_waitable = self._adding(ros_node.add_waitable)
-        if is_limited:
+        if loop.is_limited:
             ros_node.create_guard_condition = _refuse_guard_condition
         ros_node.wrap_tasks(self.wrapped)
 
@@ -66,6 +71,8 @@ class PluginCallbacks:
                     return callback(*arguments, **keywords)
                 except BaseException as error:
                     self._give_up(callback, error)
+                finally:
+                    self._loop.note_execution()
             return arguments[-1] if arguments else None
 
         return entering
@@ -83,14 +90,29 @@ class PluginCallbacks:
             else:
                 callback = keywords.get("callback")
                 keywords["callback"] = self.wrapped(callback)
-            if is_service and self._is_limited and inspect.iscoroutinefunction(callback):
+            if is_service and self._loop.is_limited and inspect.iscoroutinefunction(callback):
                 raise NodeError(_not_served(name, "a coroutine as its callback"))
+            self._loop.expect_arrivals()
             made = create(*arguments, **keywords)
             if is_service:
                 made.send_response = self._answering(made.send_response)
             return made
 
         return creating
+
+    def _subscribing(self, create: Callable[..., Subscription]) -> Any:
+        @functools.wraps(create)
+        def subscribing(
+            msg_type: Any, topic: str, callback: Any, qos_profile: Any, *rest: Any, **keywords: Any
+        ) -> Subscription:
+            self._loop.expect_arrivals()
+            wrapped = self.wrapped(callback)
+            if callable(callback) and not inspect.iscoroutinefunction(callback):
+                depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
+                wrapped = _Rationed(wrapped, self._loop, depth).receive(callback)
+            return create(msg_type, topic, wrapped, qos_profile, *rest, **keywords)
+
+        return subscribing
 
     def _answering(self, send_response: Callable[..., None]) -> Any:
         """What has failed answers nothing."""
@@ -104,8 +126,10 @@ class PluginCallbacks:
     def _creating_client(self, create: Callable[..., Any]) -> Any:
         @functools.wraps(create)
         def creating(*arguments: Any, **keywords: Any) -> Any:
+            self._loop.expect_arrivals()
             client = create(*arguments, **keywords)
             client.call_async = self._calling(client.call_async)
+            client.call = not_in_hooks(client.call, "client.call")
             return client
 
         return creating
@@ -125,6 +149,7 @@ class PluginCallbacks:
 
         @functools.wraps(add_waitable)
         def adding(waitable: Any) -> None:
+            self._loop.expect_arrivals()
             waitable.execute = self.wrapped(waitable.execute)
             add_waitable(waitable)
 
@@ -150,13 +175,61 @@ class PluginCallbacks:
         try:
             while True:
                 self._enter()
-                yield steps.send(None)
+                try:
+                    step = steps.send(None)
+                finally:
+                    self._loop.note_execution()
+                yield step
         except StopIteration as end:
             return end.value
 
     def _give_up(self, callback: Any, error: BaseException) -> None:
         self._is_over = True
         self._fail(callback, error)
+
+
+class _Rationed:
+    """A callback of a subscription, called for at most ``depth`` messages in one turn of the loop.
+
+    rclpy queues an event for each message, and each event takes the newest there is. So with a
+    callback that takes longer than there is between two messages, hooks and timers would wait
+    ever longer. What comes beyond ``depth`` in a turn waits here for the next one, and takes the
+    place of what is older, as it would in DDS. A depth of 0 (KEEP_ALL) drops nothing.
+    """
+
+    def __init__(self, callback: Callable[..., Any], loop: RosLoop, depth: int) -> None:
+        self._callback = callback
+        self._loop = loop
+        self._depth = depth
+        self._waiting: deque[tuple[Any, ...]] = deque(maxlen=depth or None)
+        self._turn = -1
+        self._left = 0
+
+    def receive(self, callback: Any) -> Any:
+        """What to hand to rclpy, which asks for the signature of the plugin's ``callback``."""
+
+        @functools.wraps(callback)
+        def receive(*message: Any) -> None:
+            if self._waiting or not self._may_call():
+                if not self._waiting:
+                    self._loop.post(self._catch_up)
+                self._waiting.append(message)
+            else:
+                self._callback(*message)
+
+        return receive
+
+    def _may_call(self) -> bool:
+        if self._turn != self._loop.turns:
+            self._turn, self._left = self._loop.turns, max(self._depth, 1)
+        self._left -= 1
+        return self._left >= 0
+
+    def _catch_up(self) -> None:
+        while self._waiting and self._may_call():
+            self._callback(*self._waiting.popleft())
+        if self._waiting:
+            self._loop.post(self._catch_up)
 
 
 def _refuse_guard_condition(*_: Any, **__: Any) -> Any:

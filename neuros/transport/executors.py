@@ -28,7 +28,7 @@ from neuros.errors import EnvironmentFault
 EXECUTOR_VARIABLE = "NEUROS_EXECUTOR"
 """``events`` or ``wait_set``; unset, the first that works."""
 
-_FLOOD_S = 0.01
+_SERVICE_DEPTH = 10
 
 OnFailure: TypeAlias = Callable[[BaseException], None]
 
@@ -204,13 +204,22 @@ class WaitSetExecutor:
 
     def _run_what_ros_has(self) -> None:
         """Until nothing waits; tasks get their turn also while more keeps coming."""
-        end_s = time.monotonic() + _FLOOD_S
-        has_run = True
-        while not self._is_woken and time.monotonic() < end_s:
+        left, has_run = self._most_that_waits(), True
+        while not self._is_woken and left > 0:
             had_run, has_run = has_run, self._run_one_of_ros(0.0)
             # What ended with a callback says "timeout" once, whatever has come meanwhile.
             if not (has_run or had_run):
                 return
+            left -= has_run
+
+    def _most_that_waits(self) -> int:
+        """How many callbacks can have been waiting at one moment."""
+        return sum(
+            sum(each.qos_profile.depth or _SERVICE_DEPTH for each in node.subscriptions)
+            + len([*node.timers])
+            + _SERVICE_DEPTH * sum(len([*e]) for e in (node.services, node.clients, node.waitables))
+            for node in self._ros.get_nodes()
+        )
 
     def _run_one_of_ros(self, wait_s: float) -> bool:
         """Run one callback; returns False if there was none, or a task or a waker came first."""

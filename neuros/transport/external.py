@@ -50,6 +50,7 @@ class ExternalTopics:
             if port.external_topic is not None
         }
         if heard:
+            self._loop.expect_arrivals()
             warn_of_silence(self._ros_node, heard, self._loop)
 
     def send(self, port: Port, packet: Any) -> None:

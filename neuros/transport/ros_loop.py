@@ -9,6 +9,12 @@ Events of the engines wait in a deque of their own, since passing each of them t
 cost more than the engine itself. One turn in the executor's queue stands for them, so that both
 queues take turns. A loop-back is only handled first thing in a turn: then everything
 that ROS had waiting when it was posted has been seen.
+
+Arrivals come first. While a hook runs, rclpy queues an event for each packet, acknowledgement and
+callback. If each of them let the next hook start, more would arrive than are handled, and hooks
+would work on what is older and older. So after a hook, or a callback of a plugin, a turn is put
+behind all that has arrived meanwhile, and no hook starts before it. Where nothing has arrived it
+comes at once, while the node waits for others: a round trip takes no longer for it.
 """
 
 from __future__ import annotations
@@ -53,6 +59,10 @@ class RosLoop:
     """Runs events of ROS, engines and timers, one at a time, oldest first.
 
     ``on_failure`` gets whatever an event raises, in the loop's thread.
+
+    Attributes:
+        has_taken_in: whether all that ROS had waiting when a hook or callback ended is handled.
+        turns: how many turns the events of engines have had.
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
@@ -62,8 +72,13 @@ class RosLoop:
         self._events: deque[tuple[Event, bool]] = deque()
         self._turn = Turn(self._take_turn)
         self._has_posted_turn = False
+        self._is_turn_stale = False
+        self.has_taken_in = True
+        self._has_arrivals = False
+        self.turns = 0
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
+        self._has_older_events = False
         self._is_stopping = False
 
     @property
@@ -83,6 +98,23 @@ class RosLoop:
         """Handle ``event`` again and again, by a timer of ROS that no simulated time stops."""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         return node.create_timer(seconds, lambda: self.guard(event), clock=steady)
+
+    def expect_arrivals(self) -> None:
+        """From now on, ROS brings what hooks wait for, and not the nodes of this process alone."""
+        self._has_arrivals = True
+
+    def note_execution(self) -> None:
+        """A hook or callback has ended: what has arrived until now comes before the next hook.
+
+        Callbacks that are taken in then put that off no further, however many keep coming.
+        """
+        if not (self._has_arrivals and self.has_taken_in):
+            return
+        self.has_taken_in = False
+        if self._has_posted_turn:
+            self._is_turn_stale = True
+        else:
+            self._post_turn()
 
     @property
     def has_waiting_events(self) -> bool:
@@ -129,15 +161,21 @@ class RosLoop:
         return guarded
 
     def run(self) -> None:
-        """Run until :meth:`stop`."""
+        """Run until :meth:`stop`.
+
+        Where a timer is overdue, and one may always be, all that waits is handled before it.
+        """
         while not self._is_stopping:
             self._planned_ns = self._next_due_ns()
             if self._planned_ns is None:
                 wait_s = _LONG_S
             else:
                 wait_s = (self._planned_ns - time.monotonic_ns()) / 1e9
-            if wait_s > 0:
-                self._executor.spin_until_future_complete(self._waker, wait_s)
+            if wait_s <= 0:
+                wait_s = _LONG_S
+                self._has_older_events = True
+                self.post(self._end_older_events)
+            self._executor.spin_until_future_complete(self._waker, wait_s)
             self._run_due_timers()
 
     def run_for(self, seconds: float) -> None:
@@ -161,12 +199,23 @@ class RosLoop:
     def _wake(self) -> None:
         self._waker.wake(None)
 
+    def _end_older_events(self) -> None:
+        """All that waited when a timer was overdue has been handled: now it is the timer's turn."""
+        self._has_older_events = False
+        self._waker.wake(None)
+
     def _post_turn(self) -> None:
         self._has_posted_turn = True
         self._executor.create_task(self._turn)
 
     def _take_turn(self) -> None:
         self._has_posted_turn = False
+        if self._is_turn_stale:
+            self._is_turn_stale = False
+            self._post_turn()
+            return
+        self.has_taken_in = True
+        self.turns += 1
         events = self._events
         begin_ns = now_ns = time.monotonic_ns()
         length_ns = _TURN_NS
@@ -181,6 +230,8 @@ class RosLoop:
                 event()
             except BaseException as error:
                 self._on_failure(error)
+            if not self.has_taken_in:
+                break
             since_ns, now_ns = now_ns, time.monotonic_ns()
             if now_ns - begin_ns > length_ns:
                 length_ns = max(length_ns, self._fair_turn_ns(now_ns - since_ns))
@@ -198,6 +249,8 @@ class RosLoop:
 
     def _check_timers(self) -> None:
         """Leave the executor if a timer is due, or due at another time than was planned for."""
+        if self._has_older_events:
+            return
         next_ns = self._next_due_ns()
         if next_ns != self._planned_ns or (next_ns and next_ns <= time.monotonic_ns()):
             self._waker.wake(None)

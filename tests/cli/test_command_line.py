@@ -22,6 +22,7 @@ from neuros.project.model import Node, Project
 from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS
 
 PORT = "std_msgs/msg/Int32"
+PLUGIN = "from neuros.hooks import *\n@neuros_initialise()\ndef begin(node): pass\n"
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +34,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """Two connected nodes, ``a`` and ``b``."""
-    (tmp_path / "plugin.py").write_text("")
+    (tmp_path / "plugin.py").write_text(PLUGIN)
     nodes = [
         {
             "name": name,
@@ -234,20 +235,19 @@ def test_a_dry_run_in_process_is_one_process(
     assert capsys.readouterr().out.splitlines()[1].startswith("one process for a, b: ")
 
 
-def test_a_dry_run_shows_the_cores_and_no_placement_leaves_them_to_the_kernel(
+def test_a_dry_run_shows_the_cores_that_nodes_ask_for(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def shown(*options: str) -> list[str]:
-        # The domain decides with which core it begins; others may use the first one now.
-        assert main(["launch", ".", "--dry-run", "-d", "1", *options]) == 0
+        assert main(["launch", ".", "--dry-run", *options]) == 0
         return [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()[1:]]
 
     monkeypatch.setattr("neuros.api.plan.usable_cores", lambda: frozenset({2, 3, 5, 7}))
     affinity = ("--set", "nodes.b.affinity=[3]")
-    assert shown() == ["process a on cores 2, 3", "process b on cores 5, 7"]
-    assert shown(*affinity) == ["process a on cores 2, 5, 7", "process b on core 3"]
+    assert shown() == ["process a", "process b"]
+    assert shown(*affinity) == ["process a", "process b on core 3"]
     assert shown("--no-placement", *affinity) == ["process a", "process b"]
-    assert shown("-n", "a") == ["process a"], "the others may run on the same cores"
+    assert shown("-n", "b", *affinity) == ["process b on core 3"]
     assert shown("--backend", "in-process") == ["one process for a, b"]
     assert shown("--backend", "in-process", *affinity) == ["one process for a, b on core 3"]
 

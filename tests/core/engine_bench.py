@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.hook import Hook
+from neuros.core.hook import Hook, PacketType
 from neuros.hooks import (
     HookSpec,
     Optional,
@@ -109,6 +109,7 @@ class Bench:
         sent: ``(connection, packet)`` to other nodes; ``external`` the same with topics' ports.
         acknowledged: ``(connection, position)`` sent to other nodes.
         log: all these together.
+        is_taken_in: whether all that has reached the node has been handled.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class Bench:
         external_inputs: Sequence[str] = (),
         external_outputs: Sequence[str] = (),
         packet_types: dict[str, type] | None = None,
+        check: Callable[[Any], Any] = lambda packet: packet,
         is_started: bool = True,
         is_registered: bool = True,
         make_engine: Callable[..., Engine] = Engine,
@@ -130,10 +132,12 @@ class Bench:
         self.log: list[tuple[Any, ...]] = []
         self.during_call: Callable[[], None] | None = None
         self.hook_s = 0.0
+        self.is_taken_in = True
         self.posted: deque[tuple[str, Callable[[], None]]] = deque()
         node = node_for("node", specs, connections, external_inputs, external_outputs)
         self.by_name: dict[str, Any] = {str(c): c for c in connections}
-        self.engine = make_engine(node, connections, specs, self, self.clock, packet_types)
+        types = {name: PacketType(kind, check) for name, kind in (packet_types or {}).items()}
+        self.engine = make_engine(node, connections, specs, self, self.clock, types)
         if is_registered:
             for connection in self.engine.outlets:
                 self.engine.on_registered(connection)
@@ -211,6 +215,9 @@ class Bench:
         for connection in connections:
             self.sent.append((str(connection), packet))
             self.log.append(("send", str(connection)))
+
+    def has_taken_in(self) -> bool:
+        return self.is_taken_in
 
     def send_external(self, port: Port, packet: Any) -> None:
         self.external.append((port.name, packet))

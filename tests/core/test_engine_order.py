@@ -195,3 +195,73 @@ def test_the_external_topic_of_an_all_input_is_last_in_the_list():
     bench = Bench(function("f", All("x")), external_inputs=["x"])
     bench.packet("x", 1)
     assert bench.calls == [("f", ([1],))]
+
+
+# ------------------------------------------------------------------ arrivals first
+
+
+def after_a_hook_something_may_have_arrived(bench: Bench) -> None:
+    """As a node with neighbours has it: a loop-back comes when that has been handled."""
+
+    def ran() -> None:
+        bench.is_taken_in = False
+
+    bench.during_call = ran
+
+
+def test_where_something_may_have_arrived_the_next_hook_is_chosen_after_that():
+    bench = Bench(function("f"), function("g"), is_started=False)
+    after_a_hook_something_may_have_arrived(bench)
+    bench.engine.start()
+    assert bench.ran == ["f"]
+    assert bench.waiting == ["loop-back"]
+    bench.is_taken_in = True
+    assert bench.posted_event() == ["g"]
+
+
+def test_what_arrives_meanwhile_starts_no_hook_but_is_there_for_the_next():
+    bench = Bench(
+        function("look", "x"), function("obey", "y"), connections=[wire(A), wire("b.o -> node.y")]
+    )
+    after_a_hook_something_may_have_arrived(bench)
+    assert bench.packet(A, 1) == ["look"]
+    assert bench.packet(A, 2) == bench.packet(A, 3) == bench.packet("b.o -> node.y", 1) == []
+    assert bench.waiting == ["loop-back"]
+    bench.is_taken_in = True
+    assert bench.posted_event() == ["obey"]
+    bench.is_taken_in = True
+    assert bench.posted_event() == ["look"]
+    assert bench.calls[-1] == ("look", (3,))
+
+
+def test_acknowledgements_that_have_piled_up_start_a_main_loop_once():
+    """Else it would run once more for each, and what its input gets would grow older and older."""
+    receivers = [wire(f"node.o -> {name}.x", 0, queue_size=8) for name in ("b", "c", "d")]
+    bench = Bench(
+        function("step", Optional("x"), "o", returns=1), connections=[wire(A), *receivers]
+    )
+    after_a_hook_something_may_have_arrived(bench)
+    bench.is_taken_in = False
+    for receiver in receivers:
+        assert bench.acknowledge_to_node(str(receiver), 1) == []
+    bench.is_taken_in = True
+    assert bench.posted_event() == ["step"]
+
+
+def test_what_a_node_sends_itself_is_taken_in_before_the_next_hook_too():
+    """Else each event would let a hook start, and more would be sent than is handled."""
+    bench = Bench(
+        function("send", outputs="o", returns=1),
+        function("take", "x"),
+        connections=[wire("node.o -> node.x"), wire("a.o -> node.y")],
+        is_started=False,
+    )
+    after_a_hook_something_may_have_arrived(bench)
+    bench.engine.start()
+    for _ in range(50):
+        bench.is_taken_in = True
+        bench.packet("a.o -> node.y")
+        bench.is_taken_in = True
+        bench.posted_event()
+        assert len(bench.waiting) <= 3
+    assert {"send", "take"} <= set(bench.ran[-3:])

@@ -283,7 +283,7 @@ def test_a_port_that_the_node_does_not_declare_is_an_error_that_says_what_there_
     node = Node("node", "c", Path("p.py"), inputs=(port,), outputs=(port,))
     spec = function("f", **{f"{side}s": "unknown"})
     with pytest.raises(HookError) as caught:
-        Engine(node, [wire("a.o -> node.known")], [spec], None, Clock())  # type: ignore[arg-type]
+        Engine(node, [wire("a.o -> node.known")], [spec], Bench(), Clock())
     assert caught.value.hook == "f"
     assert caught.value.where == spec.where
     assert f"declares no {side} 'unknown' (it has known)" in str(caught.value)

@@ -89,6 +89,8 @@ class Run:
             self.is_draining = True
             places = range(len(bench.engine.all_hooks))
             bench.engine.drain([place for place in places if advance_ns >> place & 1])
+        elif what == 10:
+            bench.is_taken_in = not bench.is_taken_in
 
 
 class Again:
@@ -125,7 +127,7 @@ class Again:
             player.play(event)
 
 
-steps = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 10), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)

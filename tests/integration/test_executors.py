@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,14 +14,17 @@ import pytest
 import rclpy
 from launching import EXAMPLES, launch
 from rclpy.node import Node as RosNode
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import choose_domain
 from neuros.transport import ros_loop
+from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
 from neuros.transport.messages import message_class
+from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
 
 EVENTS = "rclpy.experimental.events_executor"
@@ -282,3 +286,123 @@ def test_ros_waits_a_millisecond_or_as_long_as_a_few_of_the_long_events(
     loop.loop.post(begin)
     loop.run()
     assert waited_ns == [round(turn_ms * 1e6)]
+
+
+# ------------------------------------------------------------------ arrivals first
+
+
+class Hooked:
+    """A node whose hooks and callbacks are played by the test; ``seen`` is what has happened.
+
+    ``send`` publishes a number and waits until it has reached the node, which nobody is told.
+    """
+
+    def __init__(self, loop: RosLoop, context: rclpy.Context) -> None:
+        self.loop, self.node = loop, PlainNode("node", context)
+        self.seen: list[object] = []
+        loop.add_node(self.node)
+        loop.expect_arrivals()
+        self._publishers: dict[str, Publisher] = {}
+
+    def publisher(self, topic: str) -> None:
+        self._publishers[topic] = self.node.create_publisher(Int32, topic, 10)
+
+    def send(self, topic: str, *numbers: int) -> None:
+        for number in numbers:
+            self._publishers[topic].publish(Int32(data=number))
+        time.sleep(0.2)  # nothing can be asked whether it has arrived without taking it
+
+    def begin(self, event: Callable[[], None]) -> None:
+        """Once all are connected."""
+        if all(each.get_subscription_count() for each in self._publishers.values()):
+            event()
+        else:
+            self.loop.post(lambda: self.begin(event))
+
+    def execute(self, name: str) -> None:
+        self.seen.append(name)
+        self.loop.note_execution()
+
+
+def test_what_has_arrived_while_a_hook_ran_is_taken_in_before_the_next(
+    loop: Loop, context: rclpy.Context
+) -> None:
+    hooked = Hooked(loop.loop, context)
+    taken_in: list[bool] = []
+
+    def receive(message: Int32) -> None:
+        hooked.seen.append(message.data)
+        taken_in.append(loop.loop.has_taken_in)
+
+    hooked.node.create_subscription(Int32, "data", loop.loop.guarded(receive), 10)
+    hooked.publisher("data")
+
+    def first() -> None:
+        assert loop.loop.has_taken_in
+        hooked.send("data", 1, 2, 3)
+        hooked.execute("hook")
+        assert not loop.loop.has_taken_in
+        loop.loop.post_loop_back(second)
+
+    def second() -> None:
+        assert loop.loop.has_taken_in
+        hooked.seen.append("next")
+        loop.loop.stop()
+
+    loop.loop.post(lambda: hooked.begin(first))
+    loop.run()
+    hooked.node.destroy_node()
+    assert hooked.seen == ["hook", 1, 2, 3, "next"]
+    assert taken_in == [False] * 3
+
+
+def test_callbacks_that_keep_coming_do_not_put_off_the_next_hook(
+    loop: Loop, context: rclpy.Context
+) -> None:
+    """A callback that takes longer than there is between two of its messages starves nothing."""
+    hooked = Hooked(loop.loop, context)
+    PluginCallbacks(hooked.node, loop.loop, lambda: None, lambda *_: None)
+    hooked.publisher("data")
+
+    def callback(message: Int32) -> None:
+        hooked.seen.append("callback")
+        hooked.send("data", message.data + 1, message.data + 2)  # meanwhile
+
+    hooked.node.create_subscription(Int32, "data", callback, 1)
+
+    def hook() -> None:
+        hooked.execute("hook")
+        if hooked.seen.count("hook") == 4:
+            loop.loop.stop()
+        loop.loop.post_loop_back(hook)
+
+    def first() -> None:
+        hooked.send("data", 1)
+        hook()
+
+    loop.loop.post(lambda: hooked.begin(first))
+    loop.run()
+    hooked.node.destroy_node()
+    assert hooked.seen[0] == "hook"
+    hooks = [place for place, name in enumerate(hooked.seen) if name == "hook"]
+    assert len(hooks) == 4
+    assert all(after - before <= 3 for before, after in itertools.pairwise(hooks)), hooked.seen
+    assert "callback" in hooked.seen
+
+
+def test_a_timer_that_is_always_overdue_keeps_no_event_waiting(loop: Loop) -> None:
+    """All that waited when its turn came is handled before it, loop-backs included."""
+    seen: list[str] = []
+
+    def on_due() -> None:
+        seen.append("timer")
+        if seen.count("timer") == 3:
+            loop.loop.stop()
+        for kind in ("event", "other"):
+            loop.loop.post(lambda kind=kind: seen.append(kind))  # type: ignore[misc]
+            loop.loop.post_loop_back(lambda: seen.append("loop-back"))
+
+    loop.loop.add_timer(lambda: 1, on_due)
+    loop.run()
+    a_round = ["timer", "event", "loop-back", "other", "loop-back"]
+    assert seen == [*a_round, *a_round, "timer"]

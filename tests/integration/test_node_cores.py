@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from launching import BACKENDS, launch
 
+from neuros.launch.placement import THREAD_VARIABLES
+
 CORES = sorted(os.sched_getaffinity(0))
 PORT = "std_msgs/msg/Int32"
 HEAD = """
@@ -85,12 +87,13 @@ def every(thread_masks: list[list[int]]) -> list[int]:
     return thread_masks[0]
 
 
-@several_cores
-def test_sender_and_receiver_are_kept_apart_with_all_their_threads(tmp_path: Path) -> None:
-    a, b = found(tmp_path)
-    assert len(a["masks"]) > 3, "those of DDS are among them"
-    assert sorted(every(a["masks"]) + every(b["masks"])) == CORES
-    assert a["limits"] == {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_without_affinity_every_core_is_there_and_thread_pools_have_one_thread(
+    tmp_path: Path, backend: str
+) -> None:
+    a, b = found(tmp_path, "--backend", backend)
+    assert every(a["masks"]) == every(b["masks"]) == CORES
+    assert a["limits"] == dict.fromkeys(THREAD_VARIABLES, "1")
 
 
 @several_cores
@@ -101,6 +104,7 @@ def test_affinity_is_kept_and_the_environment_of_a_node_wins_over_its_limits(
     a, b = found(
         tmp_path, a={"affinity": two}, b={"affinity": last, "environment": {"MKL_NUM_THREADS": 7}}
     )
+    assert len(a["masks"]) > 3, "the threads of DDS are among them"
     assert every(a["masks"]) == two
     assert every(b["masks"]) == last
     assert a["limits"]["OMP_NUM_THREADS"] == a["limits"]["NUMBA_NUM_THREADS"] == "2"
@@ -123,11 +127,6 @@ def test_in_process_all_nodes_share_the_cores_that_some_ask_for(tmp_path: Path) 
     a, b = found(tmp_path, "--backend", "in-process", a={"affinity": [CORES[-1]]})
     assert every(a["masks"]) == every(b["masks"]) == [CORES[-1]]
     assert a["limits"]["OMP_NUM_THREADS"] == "1"
-
-
-def test_in_process_without_affinity_every_core_is_there(tmp_path: Path) -> None:
-    a, _ = found(tmp_path, "--backend", "in-process")
-    assert every(a["masks"]) == CORES
 
 
 def test_a_core_that_this_machine_lacks_is_no_mistake_in_the_project(tmp_path: Path) -> None:

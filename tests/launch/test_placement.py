@@ -1,10 +1,9 @@
-"""Who gets which cores: decided from the project alone, and what a process really has."""
+"""Who gets which cores, and what a process really has."""
 
 from __future__ import annotations
 
 import json
 import os
-from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -12,124 +11,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.affinity import children_on, usable_cores
 from neuros.launch.host import HostProcess
-from neuros.launch.placement import THREAD_VARIABLES, place, thread_limits
-from neuros.project.model import Node, Port
-
-CAMERA = Port("image", "sensor_msgs/msg/Image", mujoco={"sensor": "camera", "element": "eye"})
-
-
-def node(name: str, *affinity: int, outputs: tuple[Port, ...] = (), **environment: str) -> Node:
-    return Node(
-        name,
-        "neuros_python",
-        Path("plugin.py"),
-        outputs=outputs,
-        environment=environment,
-        affinity=affinity,
-    )
+from neuros.launch.placement import (
+    THREAD_VARIABLES,
+    children_on,
+    place,
+    thread_limits,
+    usable_cores,
+)
+from neuros.project.model import Node
 
 
-# ------------------------------------------------------------------ the pure function
-@st.composite
-def machines(draw: st.DrawFn) -> tuple[list[Node], set[int]]:
-    cores = draw(st.sets(st.integers(0, 40), min_size=1, max_size=12))
-    count = draw(st.integers(1, 8))
-    nodes = []
-    for i in range(count):
-        asks = draw(st.sets(st.sampled_from(sorted(cores)), max_size=2))
-        threads = draw(st.sampled_from([{}, {}, {"OMP_NUM_THREADS": "2"}]))
-        nodes.append(node(f"node{i}", *asks, **threads))
-    return nodes, cores
+def node(name: str, *affinity: int) -> Node:
+    return Node(name, "neuros_python", Path("plugin.py"), affinity=affinity)
 
 
-@given(machines())
-def test_a_node_with_affinity_has_exactly_that(machine: tuple[list[Node], set[int]]) -> None:
-    nodes, cores = machine
-    chosen = place(nodes, cores)
-    for each in nodes:
-        if each.affinity:
-            assert chosen[each.name] == tuple(sorted(each.affinity))
-
-
-@given(machines())
-def test_no_other_node_shares_a_core_or_leaves_those_that_may_be_used(
-    machine: tuple[list[Node], set[int]],
+@given(st.lists(st.sets(st.integers(0, 40), max_size=3), min_size=1, max_size=8))
+def test_a_node_has_the_cores_that_it_asks_for_and_the_kernel_places_the_others(
+    asked: list[set[int]],
 ) -> None:
-    nodes, cores = machine
-    chosen = place(nodes, cores)
-    assert all(set(each) <= cores for each in chosen.values())
-    for a, b in combinations(nodes, 2):
-        if {a.name, b.name} <= set(chosen) and not (a.affinity and b.affinity):
-            assert not set(chosen[a.name]) & set(chosen[b.name])
-
-
-@given(machines())
-def test_where_every_thread_can_have_a_core_all_are_placed_and_no_core_is_left_over(
-    machine: tuple[list[Node], set[int]],
-) -> None:
-    nodes, cores = machine
-    chosen = place(nodes, cores)
-    others = [each for each in nodes if not each.affinity]
-    threads = {each.name: int(each.environment.get("OMP_NUM_THREADS", "1")) for each in others}
-    free = cores.difference(*(each.affinity for each in nodes))
-    if others and sum(threads.values()) <= len(free):
-        assert {core for each in others for core in chosen[each.name]} == free
-        assert all(len(chosen[name]) >= count for name, count in threads.items())
-    else:
-        assert not any(each.name in chosen for each in others), "left to the kernel"
-
-
-@given(machines())
-def test_the_answer_is_the_same_every_time(machine: tuple[list[Node], set[int]]) -> None:
-    nodes, cores = machine
-    assert place(nodes, cores) == place(nodes, sorted(cores, reverse=True))
-
-
-def test_two_nodes_divide_a_machine_and_three_on_two_cores_do_not() -> None:
-    ping, echo, third = node("ping"), node("echo"), node("third")
-    assert place([ping, echo], {0, 1}) == {"ping": (0,), "echo": (1,)}
-    assert place([ping, echo], range(5)) == {"ping": (0, 1), "echo": (2, 3, 4)}
-    assert place([ping, echo, third], {0, 1}) == {}
-    assert place([ping, node("echo", 0)], {0, 1}) == {"echo": (0,), "ping": (1,)}
-
-
-@given(machines(), st.integers(0, 100))
-def test_where_the_count_begins_changes_who_has_which_cores_and_nothing_else(
-    machine: tuple[list[Node], set[int]], begin: int
-) -> None:
-    nodes, cores = machine
-    here, there = place(nodes, cores), place(nodes, cores, begin=begin)
-    assert {name: len(each) for name, each in here.items()} == {
-        name: len(each) for name, each in there.items()
-    }
-    assert all(list(each) == sorted(each) for each in there.values())
-    assert all(there[node.name] == here[node.name] for node in nodes if node.affinity)
-    assert {core for each in there.values() for core in each} == {
-        core for each in here.values() for core in each
-    }
-
-
-def test_the_first_nodes_of_two_runs_have_different_cores() -> None:
-    nodes = [node("ping"), node("echo")]
-    assert place(nodes, {0, 1}, begin=1) == {"ping": (1,), "echo": (0,)}
-    assert place(nodes, range(4), begin=1) == {"ping": (1, 2), "echo": (0, 3)}
-    assert place(nodes, range(4), begin=4) == place(nodes, range(4))
-
-
-def test_a_node_with_threads_is_counted_with_all_of_them() -> None:
-    nodes = [node("net", OMP_NUM_THREADS="3"), node("robot")]
-    assert place(nodes, range(4)) == {"net": (0, 1, 2), "robot": (3,)}
-    assert place(nodes, range(3)) == {}
-    assert place([node("a"), node("b")], range(2), {"OMP_NUM_THREADS": "4"}) == {}
-
-
-def test_next_to_a_camera_which_may_take_every_core_nothing_is_spread() -> None:
-    assert place([node("robot", outputs=(CAMERA,)), node("brain")], range(8)) == {}
-    assert place([node("robot", 0, outputs=(CAMERA,)), node("brain")], {0, 1}) == {
-        "robot": (0,),
-        "brain": (1,),
+    nodes = [node(f"node{number}", *cores) for number, cores in enumerate(asked)]
+    assert place(nodes) == {
+        f"node{number}": tuple(sorted(cores)) for number, cores in enumerate(asked) if cores
     }
 
 

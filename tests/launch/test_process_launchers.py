@@ -121,6 +121,7 @@ def test_a_node_has_its_environment_and_that_of_the_run(
         "OMP_NUM_THREADS": "2",
         "OPENBLAS_NUM_THREADS": "3",
         "MKL_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
     }
     assert expected.items() <= environment.items()
 

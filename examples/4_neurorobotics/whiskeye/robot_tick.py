@@ -1,10 +1,12 @@
-"""WhiskEye in MuJoCo, one IMU period of physics (20 ms) every TICK_SECONDS of wall time."""
+"""WhiskEye in MuJoCo, STEP_SECONDS of physics every TICK_SECONDS of wall time."""
 
 import os
 
 from turning_robot import start_turning
 
 from neuros.hooks import Optional, neuros_initialise, neuros_tick
+
+STEP_SECONDS = float(os.environ.get("STEP_SECONDS", "0.02"))  # at most one IMU period
 
 
 @neuros_initialise()
@@ -18,7 +20,7 @@ def start(node):
 )
 def simulate(node):
     robot = node.get_user_data()
-    robot.sim.step_to_next()
+    robot.sim.step_synchronous(round(STEP_SECONDS / robot.sim.timestep))
     if robot.is_done:
         robot.end(node)
     return robot.sim.read("imu"), robot.sim.read("pose")
