@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,25 @@ from launching import EXAMPLES, Finished, launch
 from neuros.cli.main import main
 
 PROJECT = EXAMPLES / "3_physics_simulation/elevator"
+PLAYER = """
+import os, time
+from neuros.hooks import Optional, neuros_function, neuros_initialise
+
+@neuros_initialise(outputs=Optional("ball"))
+def serve(node):
+    return node.make_packet("ball") if node.name == "ann" else None
+
+@neuros_function(inputs="ball", outputs="ball")
+def hit(node, ball):
+    end_s = time.thread_time() + float(os.environ["STEP_S"])
+    while time.thread_time() < end_s:
+        pass
+    answer = node.make_packet("ball")
+    answer.data = ball.data + 1
+    if ball.data == 150:
+        node.shutdown("enough")
+    return answer
+"""
 STRICT = ("--duration", "2sim")
 
 
@@ -66,7 +86,8 @@ def test_another_project_is_told_by_its_first_packet_and_the_field(
 def test_in_process_without_digests_there_is_nothing_to_compare(
     tmp_path: Path, reference: Finished, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = run(tmp_path / "other", "--backend", "in-process")
+    lossy = "connections.elevator.cabin.controller.cabin.discard_limit=1"
+    other = run(tmp_path / "other", "--backend", "in-process", "--set", lossy)
     code, text = verify(reference, other, capsys)
     assert code == 2
     assert "--digests" in text
@@ -85,6 +106,40 @@ def test_in_process_what_was_recorded_is_compared(
     code, text = verify(first, other, capsys)
     assert code == 0, text
     assert text == f"identical: {sum(c['sent'] for c in first.record['connections'])} packets\n"
+
+
+@pytest.mark.parametrize(("step_s", "are_kept"), [(0.005, True), (0.0, False)])
+def test_in_process_digests_of_a_lossless_project_are_kept_where_they_are_cheap(
+    tmp_path: Path, step_s: float, are_kept: bool
+) -> None:
+    """Some 10 us each, of 5 ms or of next to nothing."""
+    project = tmp_path / "loop"
+    project.mkdir()
+    (project / "player.py").write_text(PLAYER)
+    ends = [("ann", "bob"), ("bob", "ann")]
+    nodes = [
+        {
+            "name": name,
+            "container": "neuros_python",
+            "plugin": "player.py",
+            "environment": {"STEP_S": str(step_s)},
+            "inputs": [{"name": "ball", "type": "std_msgs/msg/Int32"}],
+            "outputs": [{"name": "ball", "type": "std_msgs/msg/Int32"}],
+        }
+        for name, _ in ends
+    ]
+    connections = [
+        {"source_node": a, "source_output": "ball", "destination_node": b,
+         "destination_input": "ball", "discard_limit": 0}
+        for a, b in ends
+    ]  # fmt: skip
+    (project / "project.json").write_text(json.dumps({"nodes": nodes, "connections": connections}))
+    finished = launch(project, "--backend", "in-process", cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    for connection in finished.record["connections"]:
+        digests = connection["digests"]
+        assert (digests is not None) == are_kept
+        assert digests is None or digests["sent_packets"] == connection["sent"]
 
 
 def test_latencies_are_there_with_and_without_digests(reference: Finished) -> None:
