@@ -6,12 +6,13 @@ A test says it with a marker, ``@pytest.mark.needs("git")``, a fixture or a help
 root, who can install it, and on a machine for continuous integration (``CI`` is set), the test
 fails: what is skipped there is a test that is missing.
 
-As a program it names the packages that this machine lacks, and installs them where root asks for
-that. It runs on a bare Python.
+As a program it names the packages of Debian that this machine lacks; with ``--install`` root gets
+them. It runs on a bare Python.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import re
@@ -23,6 +24,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple, NoReturn
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from neuros.installation.machine import OPENGL_PACKAGES, offscreen_opengl
 
 COMPILER = ("gcc", "g++", "Python.h")
 """What builds message packages."""
@@ -46,19 +51,11 @@ def _has_headers() -> bool:
     return Path(sysconfig.get_path("include"), "Python.h").is_file()
 
 
-def _can_draw() -> bool:
-    """Whether a camera can draw: PyOpenGL takes EGL together with OpenGL, or OSMesa alone."""
-    egl = _loads("libEGL.so.1") and (_loads("libGLESv2.so.2") or _loads("libGL.so.1"))
-    return egl or _loads("libOSMesa.so.8", "libOSMesa.so.6")
-
-
-def _loads(*libraries: str) -> bool:
-    for library in libraries:
-        try:
+def _has_osmesa() -> bool:
+    for library in ("libOSMesa.so.8", "libOSMesa.so.6"):
+        with contextlib.suppress(OSError):
             ctypes.CDLL(library)
-        except OSError:
-            continue
-        return True
+            return True
     return False
 
 
@@ -68,10 +65,8 @@ NEEDS = {
     "gcc": Need(_program("gcc"), ("gcc",)),
     "g++": Need(_program("g++"), ("g++",)),
     "Python.h": Need(_has_headers, ("python3-dev",)),
-    "OpenGL": Need(
-        _can_draw,
-        ("libegl1", "libegl-mesa0", "libgl1", "libgl1-mesa-dri", "libgles2", "libosmesa6"),
-    ),
+    "OpenGL": Need(lambda: bool(offscreen_opengl()), tuple(OPENGL_PACKAGES.split())),
+    "OSMesa": Need(_has_osmesa, ("libosmesa6",)),
     "Xvfb": Need(_program("Xvfb"), ("xvfb",)),
     "Chromium": Need(_program("chromium", "google-chrome"), ("chromium",)),
     "ip": Need(_program("ip"), ("iproute2",)),
@@ -112,7 +107,7 @@ def summary(reasons: Iterable[str]) -> Iterator[str]:
 
 def packages_of(names: Iterable[str]) -> list[str]:
     """The packages of Debian that bring all these."""
-    return [package for name in names for package in NEEDS[name].packages]
+    return list(dict.fromkeys(package for name in names for package in NEEDS[name].packages))
 
 
 def main(arguments: list[str]) -> int:
@@ -121,11 +116,8 @@ def main(arguments: list[str]) -> int:
     if not packages:
         return 0
     what = " ".join(packages)
-    if arguments != ["--install"]:
-        print(what)
-        return 0
-    if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        print(f"the tests that need {what} are left out, and counted at the end", flush=True)
+    if arguments != ["--install"] or os.geteuid() != 0 or shutil.which("apt-get") is None:
+        print(f"this machine lacks {what}: tests that need them say so", flush=True)
         return 0
     print(f"installing what the tests need: {what}", flush=True)
     _apt_get("update")

@@ -15,11 +15,9 @@ from typing import Any
 
 import pytest
 
-from neuros.api.loading import workspaces_of
-from neuros.api.workspace import WORKSPACE
+from neuros.api.loading import load_with_messages
 from neuros.cli.main import parser
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
-from neuros.project.load import load_project
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -193,7 +191,7 @@ def test_every_project_shown_is_valid(page: Path, tmp_path: Path) -> None:
         for name in files_named_in(project):
             (tmp_path / name).write_text("")
         (tmp_path / "project.json").write_text(json.dumps(project))
-        load_project(tmp_path, workspace=WORKSPACE, packages=workspaces_of(tmp_path))
+        load_with_messages(tmp_path, reads_plugins=False)
 
 
 @pages

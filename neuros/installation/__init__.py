@@ -38,6 +38,8 @@ def main(arguments: Sequence[str], root: str) -> int:
         environment = Environment(folder, options.extras, progress, pip_settings(options))
         if not (options.yes or environment.is_installed or _agrees(environment.folder)):
             return 130
+        if options.test:
+            prepare_tests(folder)
         environment.install()
         if code := build_messages(environment.python, folder):
             progress.fail("install.py: NeuROS is installed, but not all message packages are built")
@@ -87,7 +89,11 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
     parser.add_argument(
         "--docs", action="store_true", help="install what builds the documentation, and build it"
     )
-    parser.add_argument("--test", action="store_true", help="then run all checks and tests")
+    parser.add_argument(
+        "--test",
+        action="store_true",
+        help="then run all checks and tests, for which root installs packages of Debian",
+    )
     _add_container_options(parser)
     options = parser.parse_args(arguments)
     extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
@@ -135,6 +141,11 @@ def _add_container_options(parser: argparse.ArgumentParser) -> None:
     offline.add_argument(
         "--ca-bundle", metavar="FILE", help="certificates (PEM) to trust, also in containers"
     )
+
+
+def prepare_tests(root: Path) -> None:
+    """Install what the tests need of the operating system; who is not root, reads what it is."""
+    subprocess.call([sys.executable, str(root / "tests" / "needs.py"), "--install"])
 
 
 def _agrees(folder: Path) -> bool:

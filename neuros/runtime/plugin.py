@@ -79,10 +79,10 @@ def _hint(error: BaseException) -> str:
     if isinstance(error, FileNotFoundError) and _is_relative(error.filename):
         if _innermost_file(error).endswith("/subprocess.py"):
             return ""  # it is a program, and is looked for on the PATH
-        name = os.fsdecode(error.filename)
+        name, folder = os.fsdecode(error.filename), os.path.realpath("/proc/self/cwd")
         return (
-            f"relative to the current folder, which is {os.getcwd()}; a file beside the plugin,"
-            f" or of the project, is node.resolve_path({name!r})"
+            f"relative to the current folder, which is {folder}; a file beside the plugin, or of"
+            f" the project, is node.resolve_path({name!r})"
         )
     return ""
 

@@ -5,13 +5,13 @@ layout of a message class is worked out once: runs of numbers become one ``struc
 strings and sequences are looked at one by one. The encoding is the same (plain CDR, little-
 endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
 What is written has been checked (:mod:`neuros.transport.values`). Whatever is out of the ordinary,
-in a class or in bytes, is left to rclpy, and so are errors: wide strings, messages without fields,
-more items than a bound allows, senders of the other byte order.
+in a class or in bytes, is left to rclpy, and so are errors: single characters, more items than a
+bound allows, senders of the other byte order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from struct import Struct
 from typing import Any, TypeAlias
@@ -21,6 +21,7 @@ from neuros.transport.cdr_parts import (
     Array,
     Buffer,
     Items,
+    Nothing,
     Numbers,
     Part,
     Pieces,
@@ -29,9 +30,11 @@ from neuros.transport.cdr_parts import (
     Unusual,
     WriteItem,
     read_text,
+    read_wide_text,
     write_text,
+    write_wide_text,
 )
-from neuros.transport.schema import Leaf, Schema, Shape, Sort, Type, schema
+from neuros.transport.schema import Leaf, Shape, Sort, Type, schema
 
 Encode: TypeAlias = Callable[[Any], bytes]
 Decode: TypeAlias = Callable[[bytes], Any]
@@ -49,27 +52,36 @@ def cdr(kind: type) -> tuple[Encode, Decode] | None:
         parts = _parts_of(kind)
     except Unusual:
         return None
-    return _encoder(kind, parts), _decoder(schema(kind), parts)
+    return _encoder(kind, parts), _decoder(kind, parts)
 
 
 @cache
 def _parts_of(kind: Any) -> tuple[Part, ...]:
-    layout = schema(kind)
-    if any(not schema(each).fields for each in layout.kinds):
-        raise Unusual  # CDR has a byte of its own for it
-    return tuple(_parts(layout.leaves))
+    return tuple(_parts(_entries(kind, iter(schema(kind).leaves))))
 
 
-def _parts(leaves: Sequence[Leaf]) -> Iterator[Part]:
+def _entries(kind: Any, leaves: Iterator[Leaf]) -> Iterator[Leaf | None]:
+    """The leaves of a message, in their order; ``None`` for a message without fields."""
+    fields = schema(kind).fields
+    if not fields:
+        yield None
+    for field in fields:
+        if field.is_message:
+            yield from _entries(field.type.message, leaves)
+        else:
+            yield next(leaves)
+
+
+def _parts(entries: Iterable[Leaf | None]) -> Iterator[Part]:
     run: list[Leaf] = []
-    for leaf in leaves:
-        if leaf.field.shape is Shape.SINGLE and leaf.field.type.code:
+    for leaf in entries:
+        if leaf and leaf.field.shape is Shape.SINGLE and leaf.field.type.code:
             run.append(leaf)
             continue
         if run:
             yield Numbers(run)
         run = []
-        yield _part(leaf)
+        yield _part(leaf) if leaf else Nothing()
     if run:
         yield Numbers(run)
 
@@ -83,7 +95,9 @@ def _part(leaf: Leaf) -> Part:
     if field.shape is Shape.LIST:
         return Items(leaf, *_item(field.type))
     if field.type.sort is Sort.TEXT:
-        return Text(leaf)
+        return Text(leaf, write_text, read_text)
+    if field.type.sort is Sort.WIDE_TEXT:
+        return Text(leaf, write_wide_text, read_wide_text)
     raise Unusual
 
 
@@ -93,6 +107,8 @@ def _item(of: Type) -> tuple[WriteItem, ReadItem]:
         return _message(of.message)
     if of.sort is Sort.TEXT:
         return write_text, read_text
+    if of.sort is Sort.WIDE_TEXT:
+        return write_wide_text, read_wide_text
     if of.code:
         return _single(of.code)
     raise Unusual
@@ -100,21 +116,30 @@ def _item(of: Type) -> tuple[WriteItem, ReadItem]:
 
 def _message(kind: Any) -> tuple[WriteItem, ReadItem]:
     parts = _parts_of(kind)
-    build = schema(kind).build
-    writers, readers = [part.write for part in parts], [part.read for part in parts]
+    writers = [part.write for part in parts]
 
     def write(message: Any, pieces: Pieces, at: int) -> int:
         for write_part in writers:
             at = write_part(message, pieces, at)
         return at
 
+    return (writers[0] if len(writers) == 1 else write), _reader(kind, parts)
+
+
+def _reader(kind: Any, parts: tuple[Part, ...]) -> ReadItem:
+    layout = schema(kind)
+    kinds, fill, fixed = layout.kinds, layout.fill, [value for *_, value in layout.switches]
+    readers = tuple(part.read for part in parts)
+
     def read(data: bytes, at: int) -> tuple[Any, int]:
-        values: list[Any] = []
+        made = list(map(object.__new__, kinds))
+        values = made[1:] + fixed
         for read_part in readers:
             at = read_part(data, at, values)
-        return build(values), at
+        fill(made, values)
+        return made[0], at
 
-    return (writers[0] if len(writers) == 1 else write), read
+    return read
 
 
 def _single(code: str) -> tuple[WriteItem, ReadItem]:
@@ -146,17 +171,13 @@ def _encoder(kind: type, parts: tuple[Part, ...]) -> Encode:
     return encode
 
 
-def _decoder(layout: Schema, parts: tuple[Part, ...]) -> Decode:
-    readers = tuple(part.read for part in parts)
-    build = layout.build
+def _decoder(kind: Any, parts: tuple[Part, ...]) -> Decode:
+    read = _reader(kind, parts)
 
     def decode(data: bytes) -> Any:
         if data[:START] != _HEADER:
             raise Unusual
-        values: list[Any] = []
-        at = 0
-        for read in readers:
-            at = read(data, at, values)
-        return build(values)
+        message, _ = read(data, 0)
+        return message
 
     return decode

@@ -24,6 +24,7 @@ START = 4
 """Bytes of the header."""
 
 _LENGTH = struct.Struct("<I")
+_LENGTHS = tuple(struct.Struct(f"<{padding}xI") for padding in range(4))
 _PADDING = tuple(bytes(size) for size in range(8))
 
 
@@ -72,15 +73,29 @@ class Numbers(Part):
         return at + layout.size
 
 
-class Text(Part):
-    def __init__(self, leaf: Leaf) -> None:
-        super().__init__([leaf])
+class Nothing(Part):
+    """A message without fields, for which ROS puts a byte."""
+
+    def __init__(self) -> None: ...
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
-        return write_text(self.get(message), pieces, at)
+        pieces.append(b"\0")
+        return at + 1
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
-        text, end = read_text(data, at)
+        return at + 1
+
+
+class Text(Part):
+    def __init__(self, leaf: Leaf, write: WriteItem, read: ReadItem) -> None:
+        super().__init__([leaf])
+        self._write, self._read = write, read
+
+    def write(self, message: Any, pieces: Pieces, at: int) -> int:
+        return self._write(self.get(message), pieces, at)
+
+    def read(self, data: bytes, at: int, values: list[Any]) -> int:
+        text, end = self._read(data, at)
         values.append(text)
         return end
 
@@ -185,7 +200,7 @@ def _aligned(codes: list[str], at: int) -> struct.Struct:
 
 def _write_length(length: int, pieces: Pieces, at: int) -> int:
     padding = -at & 3
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length))
+    pieces.append(_LENGTHS[padding].pack(length))
     return at + padding + 4
 
 
@@ -201,15 +216,33 @@ def write_text(text: str, pieces: Pieces, at: int) -> int:
     """Append text in UTF-8 with a NUL behind it; returns the place behind."""
     encoded = text.encode()
     padding, length = -at & 3, len(encoded) + 1
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length) + encoded + b"\0")
+    pieces += (_LENGTHS[padding].pack(length), encoded, b"\0")
     return at + padding + 4 + length
 
 
 def read_text(data: bytes, at: int) -> tuple[str, int]:
     """The text at a place, and the place behind it."""
-    length, at = _read_length(data, at)
+    at += -at & 3
+    (length,) = _LENGTH.unpack_from(data, at + START)
+    at += 4
     end = at + length
     encoded = data[at + START : end + START]
     if len(encoded) != length or encoded.find(0) != length - 1:
         raise Unusual
-    return encoded[:-1].decode(errors="replace"), end
+    return str(encoded[:-1], "utf-8", "replace"), end
+
+
+def write_wide_text(text: str, pieces: Pieces, at: int) -> int:
+    """The same in UTF-16, each unit in four bytes, as Fast DDS has it."""
+    encoded = text.encode("utf-16-le")
+    count = len(encoded) // 2
+    at = _write_length(count, pieces, at)
+    pieces.append(struct.pack(f"<{count}I", *struct.unpack(f"<{count}H", encoded)))
+    return at + 4 * count
+
+
+def read_wide_text(data: bytes, at: int) -> tuple[str, int]:
+    """The text at a place, and the place behind it."""
+    count, at = _read_length(data, at)
+    units = struct.unpack_from(f"<{count}I", data, at + START)
+    return struct.pack(f"<{count}H", *units).decode("utf-16-le"), at + 4 * count

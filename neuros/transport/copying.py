@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy
 
 from neuros.transport.messages import message_class
-from neuros.transport.schema import Field, Shape, Sort, getter, schema
+from neuros.transport.schema import Field, Shape, Sort, schema
 
 Copy: TypeAlias = Callable[[Any], Any]
 
@@ -67,13 +67,12 @@ def _copier(kind: Any) -> Copy:
     layout = schema(kind)
     changeable = tuple((f.slot, _copier_of(f)) for f in layout.fields if _can_change(f))
     names = tuple(f.slot for f in layout.fields if not _can_change(f))
-    shared = getter([(name,) for name in names])
     switches = tuple((slot, value) for owner, slot, value in layout.switches if not owner)
 
     def copy(message: Any) -> Any:
         twin: Any = object.__new__(kind)
-        for slot, value in zip(names, shared(message)):  # noqa: B905, the check costs time
-            setattr(twin, slot, value)
+        for slot in names:
+            setattr(twin, slot, getattr(message, slot))
         for slot, value in switches:
             setattr(twin, slot, value)
         for slot, copy_value in changeable:

@@ -68,8 +68,6 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
         self._loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
@@ -80,6 +78,8 @@ class RosProcess:
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
 
     @property
     def loop(self) -> RosLoop:

@@ -122,6 +122,10 @@ BASIC_TYPES = {
 """By their names in IDL."""
 
 
+_MANY = 15
+"""Slots; fewer are set one by one, which takes less than to prepare for all of them."""
+
+
 class Schema:
     """The fields of a message class, those of single messages within it laid out beside its own.
 
@@ -131,8 +135,8 @@ class Schema:
         places: the slots that lead to each of these.
         switches: slots that hold no field (whether setters check): whose of these, name and value.
         leaves: all fields that hold no single message, in the order of the definition.
-        values: gets the values of all leaves of a message.
-        build: makes a message of the values of all leaves.
+        fill: puts into new messages of ``kinds`` what belongs there: those behind the first one,
+            the values of ``switches``, and those of all leaves.
     """
 
     def __init__(self, kind: Any) -> None:
@@ -148,13 +152,7 @@ class Schema:
                 self._add(field.slot, schema(field.type.message))
             else:
                 self.leaves.append(Leaf((field.slot,), 0, field))
-        self.values = getter([leaf.path for leaf in self.leaves])
-        self.build = self._builder()
-        self._default = default
-
-    def defaults(self) -> tuple[Any, ...]:
-        """The values of all leaves of a message without arguments; they are shared."""
-        return self.values(self._default)
+        self.fill = self._filler()
 
     def _add(self, slot: str, inner: Schema) -> None:
         place = len(self.kinds)
@@ -165,22 +163,22 @@ class Schema:
             Leaf((slot, *leaf.path), place + leaf.owner, leaf.field) for leaf in inner.leaves
         ]
 
-    def _builder(self) -> Callable[[Sequence[Any]], Any]:
-        """All slots are set in one go, without a turn of the interpreter for each."""
+    def _filler(self) -> Callable[[list[Any], list[Any]], Any]:
+        """Many slots are set in one go, without a turn of the interpreter for each."""
         place_of = {path: place for place, path in enumerate(self.places)}
         targets = [(place_of[path[:-1]], path[-1]) for path in self.places[1:]]
         targets += [(owner, slot) for owner, slot, _ in self.switches]
         targets += [(leaf.owner, leaf.field.slot) for leaf in self.leaves]
         owners = _items([owner for owner, _ in targets])
-        names, fixed = [slot for _, slot in targets], [value for *_, value in self.switches]
-        kinds = self.kinds
+        names = [slot for _, slot in targets]
+        if len(names) > _MANY:
+            return lambda made, values: deque(map(setattr, owners(made), names, values), maxlen=0)
 
-        def build(values: Sequence[Any]) -> Any:
-            made = list(map(object.__new__, kinds))
-            deque(map(setattr, owners(made), names, [*made[1:], *fixed, *values]), maxlen=0)
-            return made[0]
+        def fill(made: list[Any], values: list[Any]) -> None:
+            for message, name, value in zip(owners(made), names, values):  # noqa: B905, it costs
+                setattr(message, name, value)
 
-        return build
+        return fill
 
 
 @cache
@@ -199,8 +197,8 @@ def getter(paths: Sequence[Path]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 def _items(places: list[int]) -> Callable[[list[Any]], Sequence[Any]]:
-    if len(set(places)) < 2:  # of one place, itemgetter returns no tuple
-        return lambda made: (made[0],) * len(places)
+    if len(places) == 1:
+        return tuple  # there is one message only
     get: Callable[[list[Any]], tuple[Any, ...]] = itemgetter(*places)
     return get
 

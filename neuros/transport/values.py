@@ -19,18 +19,20 @@ from array import array
 from collections.abc import Callable, KeysView, Sequence, ValuesView
 from functools import cache
 from itertools import chain
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy
 
 from neuros.errors import WrongValue
-from neuros.transport.schema import Field, Leaf, Shape, Sort, Type, getter, schema
+from neuros.transport.schema import Field, Leaf, Path, Shape, Sort, Type, getter, schema
 
 Check: TypeAlias = Callable[[Any], Any]
 Convert: TypeAlias = Callable[[Any], Any]
 IsExact: TypeAlias = Callable[[Any], bool]
 
 _NOTHING = object()
+_PLAIN = "?bBhHiIlLqQefd"  # numbers of NumPy that Python has, too
 _FLOAT = struct.Struct("<f")
 _TEXTS = (Sort.TEXT, Sort.WIDE_TEXT)
 _KINDS: dict[Sort, type] = {
@@ -79,7 +81,10 @@ class _Mismatch(Exception):
 
 
 class _Exactness(NamedTuple):
-    """What tells whether the fields of a message, or of several, hold what a receiver would see."""
+    """What tells whether the fields of a message, or of several, hold what a receiver would see.
+
+    A ``float32`` between two that there are is rounded on the way: most are, in simulators.
+    """
 
     of_one: IsExact
     of_all: Callable[[list[Any]], bool]
@@ -92,7 +97,7 @@ def _exactness(kind: Any) -> _Exactness:
     leaves = sorted(layout.leaves, key=lambda leaf: _group(leaf.field))
     get = getter([*layout.places[1:], *(leaf.path for leaf in leaves)])
     kinds = (*layout.kinds[1:], *(_kind_of(leaf.field) for leaf in leaves))
-    have_right_range = _have_right_range(leaves, len(kinds))
+    is_in_range = _is_in_range(leaves, len(kinds))
 
     def is_exact(message: Any) -> bool:
         try:
@@ -101,7 +106,7 @@ def _exactness(kind: Any) -> _Exactness:
             return False
         if tuple(map(type, found)) != kinds:
             return False
-        return have_right_range is None or have_right_range(found)
+        return is_in_range is None or is_in_range(message, found)
 
     def are_exact(messages: list[Any]) -> bool:
         try:
@@ -110,15 +115,18 @@ def _exactness(kind: Any) -> _Exactness:
             return False
         if list(map(type, chain.from_iterable(found))) != [*kinds] * len(messages):
             return False
-        return have_right_range is None or all(map(have_right_range, found))
+        return is_in_range is None or all(map(is_in_range, messages, found))
 
     return _Exactness(is_exact, are_exact)
 
 
-def _have_right_range(
+def _is_in_range(
     leaves: Sequence[Leaf], count: int
-) -> Callable[[tuple[Any, ...]], bool] | None:
-    """For values of the right classes, those of ``leaves`` last; ``None`` if any will do."""
+) -> Callable[[Any, tuple[Any, ...]], bool] | None:
+    """For a message with values of the right classes, those of ``leaves`` last.
+
+    ``None`` if any will do.
+    """
     groups = [_group(leaf.field) for leaf in leaves]
     begin = count - len(leaves)
     between = begin + groups.count(0)
@@ -129,6 +137,7 @@ def _have_right_range(
     floats = struct.Struct(f"<{groups.count(1)}f")
     pack_integers, pack, unpack = integers.pack, floats.pack, floats.unpack
     has_integers, has_floats = between > begin, end > between
+    setters = [_setter(leaf.path) for leaf in leaves[between - begin : end - begin]]
     checks = tuple(
         (begin + place, check)
         for place, leaf in enumerate(leaves)
@@ -137,12 +146,13 @@ def _have_right_range(
     if not (has_integers or has_floats or checks):
         return None
 
-    def have_right_range(found: tuple[Any, ...]) -> bool:
+    def is_in_range(message: Any, found: tuple[Any, ...]) -> bool:
         try:
             if has_integers:
                 pack_integers(*found[begin:between])
-            if has_floats and unpack(pack(*found[between:end])) != found[between:end]:
-                return False
+            if has_floats and (rounded := unpack(pack(*found[between:end]))) != found[between:end]:
+                for put, value in zip(setters, rounded):  # noqa: B905, the check costs time
+                    put(message, value)
         except (struct.error, OverflowError):
             return False
         for place, check in checks:  # noqa: SIM110, a generator takes thrice as long
@@ -150,7 +160,15 @@ def _have_right_range(
                 return False
         return True
 
-    return have_right_range
+    return is_in_range
+
+
+def _setter(path: Path) -> Callable[[Any, Any], None]:
+    *holder, slot = path
+    if not holder:
+        return lambda message, value: setattr(message, slot, value)
+    get = attrgetter(".".join(holder))
+    return lambda message, value: setattr(get(message), slot, value)
 
 
 def _group(field: Field) -> int:
@@ -176,7 +194,7 @@ def _is_exact_field(field: Field) -> IsExact | None:
         return lambda value: value.typecode == code and len(value) <= bound
     if field.shape is Shape.ARRAY:
         dtype, shape = numpy.dtype(of.code), (field.size,)
-        return lambda value: value.dtype == dtype and value.shape == shape
+        return lambda value: (value.dtype is dtype or value.dtype == dtype) and value.shape == shape
     if field.shape is Shape.LIST:
         return _is_exact_list(field)
     if of.sort in _TEXTS:
@@ -324,15 +342,19 @@ def _convert_float(of: Type) -> Convert:
             rounded: float = _FLOAT.unpack(_FLOAT.pack(float(number)))[0]
         except OverflowError:
             raise _Mismatch(_describe(value), limits) from None
-        # Of what is no number no two are equal: one that is held already stays.
-        return number if type(number) is float and rounded != rounded else rounded
+        return rounded
 
     return convert
 
 
 def _number(value: Any, allowed: str) -> int | float:
     """A number of any library, or an array with one, as one of Python."""
-    if isinstance(value, numpy.ndarray) or hasattr(type(value), "__array__"):
+    if isinstance(value, float):  # numpy.float64 is one
+        return float(value)
+    if isinstance(value, numpy.generic) and value.dtype.char in _PLAIN:
+        plain: int | float = value.item()
+        return plain
+    if hasattr(type(value), "__array__"):
         found = _as_array(value, allowed)
         if found.size == 1 and found.dtype.kind in "biuf":
             number = found.reshape(-1)[0]

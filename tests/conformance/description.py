@@ -323,7 +323,9 @@ def _tidied_node(project: Project, node: Node) -> Node:
         *(port for each in hooks for port in (sent.port for sent in each.outputs)),
         *(c.source_output for c in project.connections if c.source_node == node.name),
     }
-    return Node(node.name, tuple(hooks), _only(node.inputs, fed), _only(node.outputs, feeding))
+    topics = {"", *(port.external for n in project.nodes for port in n.outputs.values())}
+    heard = {name: port for name, port in node.inputs.items() if port.external in topics}
+    return Node(node.name, tuple(hooks), _only(heard, fed), _only(node.outputs, feeding))
 
 
 def _only(ports: Mapping[str, Port], names: Sequence[str] | set[str]) -> dict[str, Port]:

@@ -175,6 +175,16 @@ class Judge:
         return self.seen.exit_code in (0, 1, 130) and not self._has_failed
 
     @property
+    def _unbegun(self) -> set[str]:
+        """Nodes that were still being loaded when the project ended: they never said a word."""
+        nodes = self.seen.record.get("nodes", {})
+        return {
+            name
+            for name, log in self.log.items()
+            if not log and not nodes.get(name, {}).get("report")
+        }
+
+    @property
     def _has_failed(self) -> bool:
         return self.seen.exit_code == 1 and "deadlock" not in self.seen.reason.lower()
 
@@ -309,7 +319,8 @@ class Judge:
                 count = len(self.runs[node.name, hook.name])
                 if hook.kind == "initialise" and (count > 1 or (main and not count)):
                     yield Violation("initialise", f"{node.name}.{hook.name} ran {count} times")
-                if hook.kind == "finalise" and count != 1 and node.name in self.seen.loaded_ns:
+                has_begun = node.name in self.seen.loaded_ns and node.name not in self._unbegun
+                if hook.kind == "finalise" and count != 1 and has_begun:
                     yield Violation("finalise", f"{node.name}.{hook.name} ran {count} times")
             if main and any(kind == "initialise" for kind in kinds[main[0] :]):
                 yield Violation("initialise", f"{node.name}: another hook ran before")
@@ -670,7 +681,7 @@ class Judge:
         sent, received, lost = books["sent"], books["received"], books["lost"]
         consumed, discarded, unread = books["consumed"], books["discarded"], books["unread"]
         if None in (sent, received, lost, consumed, discarded, unread):
-            if self.seen.loaded_ns.keys() >= {c.source_node, c.destination_node}:
+            if not self._unbegun & {c.source_node, c.destination_node}:
                 yield f"unknown counts {dict(books)}"
             return
         # What a hook returns when the project is ended at once is not sent any more.

@@ -29,7 +29,7 @@ def take(node, back):
     node.taken.append(back)
 """
 KINDS = message_classes()
-OFTEN = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+OFTEN = settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @pytest.fixture(scope="module")
