@@ -11,6 +11,7 @@ import ast
 import math
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -110,11 +111,16 @@ def read_plugin(path: Path) -> PluginFile | None:
         return None
 
 
+# Filters of warnings belong to the whole process, and up to Python 3.12 two threads that build
+# syntax trees at once make each other fail (https://github.com/python/cpython/issues/106905).
+_PARSING = threading.Lock()
+
+
 @lru_cache(maxsize=256)
 def _read(path: Path, *_: int) -> PluginFile:
     plugin, source = PluginFile(path), path.read_bytes()
     try:
-        with warnings.catch_warnings():
+        with _PARSING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of syntax: whoever runs it will hear them
             tree = ast.parse(source, str(path))
             compile(tree, str(path), "exec", dont_inherit=True)
