@@ -213,6 +213,9 @@ class Middleware(Protocol):
         It returns the packet, with the values that its receivers see; raises ``WrongValue``.
         """
 
+    def take_in(self) -> None:
+        """Handle what had arrived when the loop was stopped, so that it counts; call no plugin."""
+
     def close(self) -> None:
         """Let what was sent last leave, then give up everything."""
 

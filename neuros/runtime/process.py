@@ -194,6 +194,7 @@ class NodeProcess:
             self._middleware.loop.post(node.start)
         gc.freeze()
         self._middleware.loop.run()
+        self._middleware.take_in()
 
     def _open_middleware(self) -> None:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)

@@ -231,6 +231,9 @@ class Workbench:
         """What checks packets of a class before they are sent."""
         return checker(kind)
 
+    def take_in(self) -> None:
+        """Nothing arrives by itself."""
+
     def close(self) -> None:
         """Nothing to give up."""
 

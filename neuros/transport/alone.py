@@ -151,6 +151,9 @@ class Alone:
         """What checks packets of a class before they are sent."""
         return checker(kind)
 
+    def take_in(self) -> None:
+        """Nothing arrives by itself."""
+
     def close(self) -> None:
         """Give up ROS."""
         self._no_spinning.close()

@@ -40,6 +40,7 @@ _TURN_NS = 1_000_000
 _LONGEST_TURN_NS = 10_000_000
 _EVENTS = 8
 _LONG_S = 3600.0
+_TAKE_IN_S = 0.5
 
 
 class _Waker:
@@ -183,6 +184,13 @@ class RosLoop:
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0:
             self._executor.spin_until_future_complete(self._waker, left_s)
+
+    def take_in(self) -> None:
+        """After :meth:`run`: handle what had arrived by then, so that it is counted."""
+        for _ in range(len(self._events)):
+            self.guard(self._events.popleft()[0])
+        self._executor.create_task(self._wake)
+        self._executor.spin_until_future_complete(self._waker, _TAKE_IN_S)
 
     def stop(self) -> None:
         """End :meth:`run` after the current event. Any thread."""

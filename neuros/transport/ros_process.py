@@ -149,6 +149,12 @@ class RosProcess:
         """What checks packets of a class before they are sent."""
         return checker(kind)
 
+    def take_in(self) -> None:
+        """Handle what had arrived when the loop ended, but for callbacks of plugins."""
+        for callbacks in self._callbacks:
+            callbacks.close()
+        self._loop.take_in()
+
     def close(self) -> None:
         """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
 
@@ -156,8 +162,6 @@ class RosProcess:
         killed; the shared memory of DDS is left to the guardian.
         """
         self._no_spinning.close()
-        for callbacks in self._callbacks:
-            callbacks.close()
         for transport in self._transports:
             transport.close()
         self._loop.run_for(_LINGER_S)
