@@ -572,5 +572,6 @@ def _describe(value: Any) -> str:
     name = kind.__qualname__
     if kind.__module__ != "builtins":
         name = f"{kind.__module__}.{name}"
-    shown = value.item() if isinstance(value, numpy.generic) else value
-    return f"{' '.join(_REPR.repr(shown).split())} ({name})"
+    shown = _REPR.repr(value.item() if isinstance(value, numpy.generic) else value)
+    in_one_line = " ".join(shown.split()).encode(errors="backslashreplace").decode()
+    return f"{in_one_line} ({name})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from engine_bench import Bench, function, initialise, wire
 
-from neuros.errors import HookError
+from neuros.errors import HookError, WrongValue
 
 IN, OUT, OTHER = "a.o -> node.x", "node.o -> b.x", "node.p -> b.y"
 
@@ -148,6 +148,19 @@ def test_a_packet_of_a_wrong_type_is_an_error_and_is_not_accepted():
     with pytest.raises(HookError, match=r"hook 'submit\(o\)': returned str for output 'o'"):
         offer(bench, accepted, o="text")
     assert accepted == [False]
+
+
+def test_a_packet_with_a_wrong_value_is_an_error_and_nothing_is_sent():
+    def check(packet):
+        raise WrongValue("data", "300 (int)", "uint8: 0 to 255")
+
+    bench, accepted = Bench(connections=[wire(OUT)], packet_types={"o": int}, check=check), []
+    what = r"hook 'submit\(o\)': packet for output 'o': field 'data' must be uint8: 0 to 255"
+    with pytest.raises(HookError, match=what) as caught:
+        offer(bench, accepted, o=300)
+    assert caught.value.where.endswith(".py")
+    assert accepted == [False]
+    assert bench.sent == []
 
 
 def test_a_source_cannot_wake_the_node_since_threads_are_the_runtimes_business():

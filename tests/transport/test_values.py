@@ -161,6 +161,13 @@ class TestNumbers:
     def test_any_other_is_refused_in_words(self, message: Any, text: str) -> None:
         assert str(refusal(message)) == f"field 'data' must be {text}"
 
+    def test_an_error_can_be_printed_whatever_the_value_says_of_itself(self) -> None:
+        class Odd:
+            def __repr__(self) -> str:
+                return "half \ud83d\nof a pair"
+
+        assert refusal(Float64(data=Odd())).found.startswith("half \\ud83d of a pair (")
+
     def test_a_masked_number_is_none(self) -> None:
         assert "masked" in str(refusal(Float64(data=numpy.ma.masked)))
 
