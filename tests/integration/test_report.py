@@ -98,7 +98,9 @@ def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
     table = {cells[0]: cells[1:5] for cells in rows if cells and cells[0] in ("sender", "receiver")}
     executing = {name: cells[0] for name, cells in table.items()}
     for cells in table.values():
-        assert sum(int(cell.rstrip("%")) for cell in cells) in range(98, 103)
+        assert sum(int(cell.rstrip("%")) for cell in cells) <= 102  # they are rounded
+    if back_end == "in-process":  # one thread
+        assert sum(int(share.rstrip("%")) for share in executing.values()) <= 102
 
     run = open_for_review(tmp_path / "run")
     assert main(["report", str(tmp_path / "run")]) == 0
