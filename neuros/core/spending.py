@@ -1,8 +1,9 @@
 """How nodes spent the time in which all of them ran: the same for table, report and figures.
 
 That time counts from when the last node had initialised until the end was asked for (``running_s``
-of ``run.json``). A node executes (its hooks, and the scheduling between them), waits for input, is
-blocked by an output, or idles between ticks; the four shares add up to 1.
+of ``run.json``). A node executes its hooks, waits for input, is blocked by an output, or idles
+between ticks. What is missing to all of the time is scheduling: a hook may start, and its turn has
+not come. In process that is where the hooks of other nodes run.
 """
 
 from __future__ import annotations
@@ -28,9 +29,14 @@ class Spending:
     scheduling_s: float
 
     @property
+    def executing_s(self) -> float:
+        """In hooks."""
+        return sum(self.executing.values())
+
+    @property
     def own_s(self) -> float:
         """What nobody else could spare it."""
-        return sum(self.executing.values()) + self.scheduling_s
+        return self.executing_s + self.scheduling_s
 
     @property
     def busiest_hook(self) -> tuple[str, float]:
@@ -49,9 +55,9 @@ class Spending:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Executing (with scheduling), waiting, blocked and idle; together 1."""
+        """Executing, waiting, blocked and idle; what is missing to 1 is scheduling."""
         return {
-            "executing": self.share(self.own_s),
+            "executing": self.share(self.executing_s),
             "waiting": self.share(sum(self.waiting.values())),
             "blocked": self.share(sum(self.blocked.values())),
             "idle": self.share(self.idle_s),
@@ -69,15 +75,14 @@ def spending_of(node: Mapping[str, Any], running_s: float | None) -> Spending | 
     if not accounting:
         return None
     executing = _without_initialising(accounting.get("executing", {}), node.get("hooks") or {})
-    scheduling_s = accounting.get("scheduling", 0.0)
     rests = {
         (state, name): s
         for state in ("waiting", "blocked")
         for name, s in accounting.get(state, {}).items()
     }
-    rests["idle", ""] = accounting.get("idle", 0.0)
+    rests |= {(state, ""): accounting.get(state, 0.0) for state in ("idle", "scheduling")}
     if running_s:
-        surplus_s = sum(executing.values()) + scheduling_s + sum(rests.values()) - running_s
+        surplus_s = sum(executing.values()) + sum(rests.values()) - running_s
         for cause in sorted(rests, key=lambda cause: rests[cause], reverse=True):
             taken_s = min(max(surplus_s, 0.0), rests[cause])
             rests[cause] -= taken_s
@@ -86,7 +91,8 @@ def spending_of(node: Mapping[str, Any], running_s: float | None) -> Spending | 
     def of(state: str) -> dict[str, float]:
         return {name: s for (kind, name), s in rests.items() if kind == state and s > 0}
 
-    return Spending(executing, of("waiting"), of("blocked"), rests["idle", ""], scheduling_s)
+    idle_s, scheduling_s = rests["idle", ""], rests["scheduling", ""]
+    return Spending(executing, of("waiting"), of("blocked"), idle_s, scheduling_s)
 
 
 def _without_initialising(

@@ -13,12 +13,7 @@ from neuros.core.spending import spending_of
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""
 
-_STATES = {
-    "executing": ("executing", "scheduling"),
-    **{state: (state,) for state in ("waiting", "blocked", "idle", "registering", "paused")},
-}
-"""By share that is shown, the causes that count to it; as at the end of a run."""
-
+_STATES = ("executing", "waiting", "blocked", "idle", "registering", "scheduling", "paused")
 _COUNTS = ("sent", "outstanding", "received", "discarded", "unread")
 _MOST_SENT = 4096
 _MOST_TAKEN = 8
@@ -224,10 +219,8 @@ class Figures:
 
     def _take_node(self, name: str, books: Mapping[str, Any], now_s: float) -> None:
         shares = {
-            state: self._speed(
-                f"share {state}", name, now_s, sum(_seconds(books, cause) for cause in causes)
-            )
-            for state, causes in _STATES.items()
+            state: self._speed(f"share {state}", name, now_s, _seconds(books, state))
+            for state in _STATES
         }
         executing = books["executing"]
         self.nodes[name] = {

@@ -98,7 +98,9 @@ def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
     table = {cells[0]: cells[1:5] for cells in rows if cells and cells[0] in ("sender", "receiver")}
     executing = {name: cells[0] for name, cells in table.items()}
     for cells in table.values():
-        assert sum(int(cell.rstrip("%")) for cell in cells) in range(98, 103)
+        assert sum(int(cell.rstrip("%")) for cell in cells) <= 102  # they are rounded
+    if back_end == "in-process":  # one thread
+        assert sum(int(share.rstrip("%")) for share in executing.values()) <= 102
 
     run = open_for_review(tmp_path / "run")
     assert main(["report", str(tmp_path / "run")]) == 0
@@ -114,4 +116,6 @@ def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
     assert drawn == table
     assert main(["compare", str(tmp_path / "run")]) == 0
     compared = re.findall(r"(\w+): executing / % +([\d.]+)", capsys.readouterr().out)
-    assert {name: f"{float(share):.0f}%" for name, share in compared} == executing
+    assert [name for name, _ in compared] == [*executing]
+    for name, share in compared:  # with a digit more
+        assert abs(float(share) - int(executing[name].rstrip("%"))) <= 0.5 + 1e-9

@@ -158,7 +158,8 @@ def _largest(node: str, spent: Spending, running_s: float) -> Step:
     elif state == "waiting":
         causes = spent.waiting
     cause = max(causes, key=lambda cause: causes[cause], default="")
-    return Step(node, state, cause, spent.share(sums[state]))
+    share_s = spent.executing_s if state == "executing" else sums[state]
+    return Step(node, state, cause, spent.share(share_s))
 
 
 def _held_up_by(

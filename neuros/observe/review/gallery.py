@@ -20,7 +20,8 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[Run], Any]], ...] = (
     (
         "time_shares",
         "Where the time went",
-        "Shares of each node's time, without the start and the end of the run.",
+        "Shares of each node's time, without the start and the end of the run; what is missing to"
+        " 100 % is scheduling: a hook whose turn has not come.",
         bars.spending_figure,
     ),
     (

@@ -160,9 +160,9 @@ def _in_process(run: Run, spending: Mapping[str, Spending], running_s: float) ->
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in spending.items()), key=lambda x: x[1][1]
     )
-    all_s = sum(spent.own_s for spent in spending.values())
-    slowest = max(spending, key=lambda name: spending[name].own_s)
-    at_most = all_s / max(spending[slowest].own_s, 1e-9)
+    all_s = sum(spent.executing_s for spent in spending.values())
+    slowest = max(spending, key=lambda name: spending[name].executing_s)
+    at_most = all_s / max(spending[slowest].executing_s, 1e-9)
     idle = max(0.0, 1 - all_s / running_s)
     headline = (
         f"One thread runs all hooks in turn (in-process); {node}.{hook} takes the largest share:"

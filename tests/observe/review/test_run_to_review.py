@@ -86,6 +86,14 @@ def test_start_and_end_of_a_run_are_taken_off_what_a_node_waited_for(tmp_path: P
     assert run.spending["a"].blocked == {WIRE: 7.0}
 
 
+def test_in_process_the_turns_of_others_are_no_execution(tmp_path: Path) -> None:
+    """Nor do they count that came before all nodes ran, or after the end."""
+    spent = accounting(executing={"f": 4.0}, waiting={"in": 1.0}, scheduling=8.0)
+    run = open_for_review(run_folder(tmp_path, {}, {"a": spent}, backend="in-process"))
+    shares = {"executing": 0.4, "waiting": 0.1, "blocked": 0.0, "idle": 0.0}
+    assert run.spending["a"].shares == pytest.approx(shares)
+
+
 def test_initialise_hooks_do_not_count(tmp_path: Path) -> None:
     spent = accounting(executing={"init": 4.0}, waiting={"in": 10.0})
     run = open_for_review(run_folder(tmp_path, {}, {"b": spent}))
