@@ -27,6 +27,9 @@ if __name__ == "__main__":
         )
         sys.exit(4)
     sys.path.insert(0, ROOT)
-    from neuros.installation import main
+    try:
+        from neuros.installation import main
 
-    sys.exit(main(sys.argv[1:], ROOT))
+        sys.exit(main(sys.argv[1:], ROOT))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -10,11 +10,12 @@ It needs what the examples need, and Matplotlib. Look at what it has made.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+from neuros.installation.machine import offscreen_opengl
 from neuros.project.graph_svg import graph_svg
 from neuros.project.load import load_project
-from neuros.simulators.mujoco.opengl import choose_opengl
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
@@ -36,7 +37,7 @@ def draw_graphs() -> None:
 
 def render_scenes() -> None:
     """One PNG per model."""
-    choose_opengl()
+    os.environ.setdefault("MUJOCO_GL", offscreen_opengl())
     import mujoco
     from matplotlib.image import imsave
 

@@ -8,7 +8,9 @@ kind        sent by a process of nodes                                fields
 =========== ========================================================= =====================
 hello       when it is there                                          nodes, pid
 report      once per second, on demand, at the end                    node, ... (see runtime)
+hooks       what a node's plugin declares, once it is loaded           node, hooks, finalise
 first_hook  when a node has started its first hook                    node
+finalising  when a node starts a finalise hook                        node, hook
 shutdown    when a plugin calls ``node.shutdown``                     node, reason, drain_s
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines
@@ -21,7 +23,8 @@ kind    sent by the supervisor                           fields
 ======= ================================================ =================
 probe   report between two events, all at one moment     number
 explain say why nothing moves
-drain   stop the hooks that send unasked
+drain   stop the hooks that send unasked; some start     last_round
+        once more (their places, by node)
 stop    start no further hook, finalise and end
 say     let nodes elsewhere hear this (see launch.sides) text
 leave   all is said and heard: a node at its end may go
@@ -51,7 +54,7 @@ kind    sent to onlookers                                fields
 glimpse what a node does, for the one that asked         node, ...
 phase   where the run is in its life                     phase, is_paused
 log     what the launcher itself tells the user          severity, text
-ended   all nodes have ended                             exit_code, reason
+ended   all nodes have ended; their last reports         exit_code, reason, ...
 ======= ================================================ =================
 """
 
@@ -60,12 +63,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import socket
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 SOCKET_NAME = "control.sock"
+_NO_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 class Lines:
@@ -117,7 +122,9 @@ class Lines:
 
 def encode_line(kind: str, fields: Mapping[str, Any]) -> bytes:
     """One object as it goes through the socket."""
-    return json.dumps({"kind": kind, **fields}).encode() + b"\n"
+    text = json.dumps({"kind": kind, **fields}, ensure_ascii=False)
+    # What is no character cannot be written anywhere: both ends see its escape in its place.
+    return _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text).encode() + b"\n"
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@
     ├── UsageError          the command line is wrong          exit code 2
     ├── EnvironmentFault    something is missing on this machine   exit code 4
     ├── RunError            a run did not end well, and was to
+    ├── WrongValue          a message holds what its definition does not allow
     └── NodeError           a node failed                      exit code 1
         ├── HookError       ... in a hook of its plugin
         ├── CallbackError   ... in a callback that its plugin has registered with ROS
@@ -24,6 +25,11 @@ from dataclasses import dataclass
 
 class NeurosError(Exception):
     """Base of all errors that NeuROS raises on purpose; its text is written for the user."""
+
+
+def printable(text: str) -> str:
+    r"""A text that can be written as UTF-8: half a character, as ``'\udc80'``, is spelt out."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 @dataclass(frozen=True, order=True)
@@ -84,6 +90,21 @@ class RunError(NeurosError):
     def __init__(self, text: str, exit_code: int) -> None:
         self.exit_code = exit_code
         super().__init__(text)
+
+
+class WrongValue(NeurosError, ValueError):
+    """A message holds a value that its definition does not allow.
+
+    Attributes:
+        path: of the field, ``poses[3].position.y``; empty if the message itself is of another type.
+        found: the value, and its type.
+        allowed: the type of the field, and what it can hold.
+    """
+
+    def __init__(self, path: str, found: str, allowed: str) -> None:
+        self.path, self.found, self.allowed = path, found, allowed
+        what = f"field '{path}'" if path else "the message"
+        super().__init__(f"{what} must be {allowed}, but is {found}")
 
 
 class NodeError(NeurosError):

@@ -124,6 +124,10 @@ class EventLoop(Protocol):
     def has_waiting_events(self) -> bool:
         """Whether events of engines wait."""
 
+    @property
+    def has_taken_in(self) -> bool:
+        """Whether all that had come from outside has been handled; at a loop-back it has."""
+
     def note_execution(self) -> None:
         """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
 
@@ -202,6 +206,12 @@ class Middleware(Protocol):
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
+
+    def checker(self, kind: type) -> Callable[[Packet], Packet]:
+        """What checks packets of a class before they are sent.
+
+        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
+        """
 
     def close(self) -> None:
         """Let what was sent last leave, then give up everything."""

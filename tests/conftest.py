@@ -1,4 +1,4 @@
-"""For all tests: where they run, and that none leaves anything in the environment for the next.
+"""For all tests: where they run, what they need, and that none leaves anything for the next.
 
 A run is on the back end that a test names, else on that of processes. What ``auto`` would choose
 depends on the machine: it has tests of its own, which name it.
@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 
 import pytest
+from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
 
@@ -20,3 +21,20 @@ def environment_as_found() -> Iterator[None]:
     if dict(os.environ) != found:
         os.environ.clear()
         os.environ.update(found)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What a test's marker ``needs`` names has to be there."""
+    for mark in item.iter_markers("needs"):
+        require(*mark.args)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Count apart the tests that were left out for want of something."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = [each.longrepr[2] for each in skipped if isinstance(each.longrepr, tuple)]
+    if lines := list(summary(reason.removeprefix("Skipped: ") for reason in reasons)):
+        terminalreporter.section("left out, for want of")
+        for line in lines:
+            terminalreporter.line(line)

@@ -1,20 +1,18 @@
 """Tests in containers: what they need, and that they leave nothing.
 
-Without an engine, or without NeuROS's images in it, they are skipped and say why. On a machine for
-continuous integration (``CI`` is set) that is a failure: there they have to run.
+Without an engine, or without NeuROS's images in it, they are left out, as :mod:`needs` says.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-import pytest
 from docker import DockerClient
+from needs import cannot_run
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.engine import connect
@@ -24,12 +22,9 @@ IMAGES = ("neuros_python", "neuros_mujoco", "neuros_nest")
 
 
 def require_containers(*names: str) -> None:
-    """Skip the test, or let it fail, where containers of these names cannot be started."""
-    reason = _why_not(names or IMAGES[:1])
-    if reason and os.environ.get("CI"):
-        pytest.fail(reason)
-    if reason:
-        pytest.skip(reason)
+    """End the test where containers of these names cannot be started."""
+    if reason := _why_not(names or IMAGES[:1]):
+        cannot_run("containers", reason)
 
 
 @cache

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from docker import DockerClient
-from machines import Machine, cannot_run, require_machines
+from machines import Machine, require_machines
+from needs import cannot_run
 
 from containers import connected, require_containers, wait_until
 from neuros.errors import EnvironmentFault
@@ -113,9 +114,11 @@ def own_engine(
 def require_engines(*images: str) -> None:
     """Skip the test where it cannot have engines of its own with these images; in CI it has to."""
     require_containers(*images)
-    require_machines("dockerd", "setpriv")
+    require_machines()
+    if shutil.which("dockerd") is None:
+        cannot_run("dockerd")
     if not (_lender() / "overlay2").is_dir():
-        cannot_run("the engine does not keep its images as the storage driver overlay2 does")
+        cannot_run("an engine that keeps its images as the storage driver overlay2 does")
 
 
 def _lender() -> Path:

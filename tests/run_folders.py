@@ -60,6 +60,8 @@ def _node(spent: Any) -> dict[str, Any]:
     if spent is None:
         return {"report": None}
     hooks = {name: {"executions": PACKETS} for name in spent["executing"]}
+    if "init" in hooks:
+        hooks["init"]["initialise_s"] = spent["executing"]["init"]
     return {"accounting": spent, "hooks": hooks, "sim_time": None, "report": "final"}
 
 

@@ -39,8 +39,10 @@ def is_within(module: str, package: str) -> bool:
 
 
 SUPERVISOR = (
+    "backlog",
     "supervisor",
     "channels",
+    "declarations",
     "ending",
     "onlookers",
     "outcome",
@@ -58,7 +60,7 @@ ROOMS = (
     Room(1, ("hooks",)),
     Room(1, ("project",)),
     Room(2, ("core",)),
-    Room(3, ("ports", "control")),
+    Room(3, ("ports", "control", "stacks")),
     Room(3, ("convert",)),
     Room(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
     Room(4, ("launch",)),
@@ -68,6 +70,7 @@ ROOMS = (
     Room(4, ("visualise",)),
     Room(4, ("dashboard", "views")),
     Room(4, ("snn",)),
+    Room(4, ("tf",)),
     Room(5, ("runtime",)),
     Room(4, ("messages",)),
     Room(6, ("api",)),
@@ -91,10 +94,11 @@ GENERATORS |= {"rosidl_adapter"}
 # What is not named here has none; a part of a room may have less than the room.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
-    "transport": {"rclpy", "rpyutils", "xxhash"} | MESSAGES,
+    "transport": {"numpy", "rclpy", "rosidl_parser", "rpyutils", "xxhash"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
+    "tf": {"geometry_msgs"},
     "snn.kernel": {"numpy", "nest"},
     "convert": {"mujoco", "numpy"},
     "convert.meshes": {"mujoco", "numpy", "trimesh"},

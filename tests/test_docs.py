@@ -15,8 +15,9 @@ from typing import Any
 
 import pytest
 
+from neuros.api.loading import load_with_messages
 from neuros.cli.main import parser
-from neuros.project.load import load_project
+from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -190,7 +191,7 @@ def test_every_project_shown_is_valid(page: Path, tmp_path: Path) -> None:
         for name in files_named_in(project):
             (tmp_path / name).write_text("")
         (tmp_path / "project.json").write_text(json.dumps(project))
-        load_project(tmp_path, workspace=tmp_path / "workspace")
+        load_with_messages(tmp_path, reads_plugins=False)
 
 
 @pages
@@ -249,3 +250,19 @@ def test_the_keys_of_the_schema_are_described() -> None:
     for part in ("input", "output", "connection", "mujoco_actuator", "mujoco_sensor"):
         keys |= set(node["$defs"][part]["properties"])
     assert not {key for key in keys if f"`{key}`" not in text}
+
+
+def test_the_supported_pythons_are_the_same_everywhere() -> None:
+    oldest, newest = dotted(OLDEST), dotted(NEWEST)
+    files = (*PAGES, ROOT / "install.py", *(ROOT / "neuros").rglob("*.py"))
+    said = {
+        (str(file.relative_to(ROOT)), versions)
+        for file in files
+        for versions in re.findall(r"Python (3\.\d+) to (3\.\d+)", file.read_text("utf-8"))
+    }
+    assert {name for name, _ in said} >= {"README.md", "install.py", "docs/tutorial.md"}
+    assert {versions for _, versions in said} == {(oldest, newest)}
+    pyproject = (ROOT / "pyproject.toml").read_text("utf-8")
+    assert f'requires-python = ">={oldest}"' in pyproject
+    newest_for_nest = dotted((NEWEST_FOR_NEST[0], NEWEST_FOR_NEST[1] + 1))
+    assert f"nest-simulator>=3.9,<4; python_version < '{newest_for_nest}'" in pyproject

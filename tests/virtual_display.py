@@ -16,12 +16,11 @@ import ctypes
 import ctypes.util
 import os
 import selectors
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator
 
-import pytest
+from needs import require
 
 DEADLINE_S = 30.0
 """For a window to appear: software OpenGL on a busy machine takes its time."""
@@ -32,15 +31,11 @@ _KEY_PRESS, _KEY_RELEASE, _CLIENT_MESSAGE = 2, 3, 33
 
 @contextlib.contextmanager
 def virtual_display() -> Iterator[User]:
-    """Start Xvfb on a free display, and end it; skips the test where there is no Xvfb."""
-    program = shutil.which("Xvfb")
-    if program is None:
-        if "CI" in os.environ:
-            pytest.fail("Xvfb is not installed, but CI has to test the windows: apt install xvfb")
-        pytest.skip("Xvfb is not installed: apt install xvfb")
+    """Start Xvfb on a free display, and end it; programs draw on it with OpenGL."""
+    require("Xvfb", "OpenGL")
     reader, writer = os.pipe()
     server = subprocess.Popen(
-        [program, "-displayfd", str(writer), "-screen", "0", _SIZE, "-nolisten", "tcp"],
+        ["Xvfb", "-displayfd", str(writer), "-screen", "0", _SIZE, "-nolisten", "tcp"],
         pass_fds=[writer],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -12,8 +12,8 @@ from benchmarks.reproduce.experiment import Entry
 from benchmarks.reproduce.kinds import Kind, Reading, Readings
 from benchmarks.reproduce.packets import (
     after_the_start,
-    delivered,
     load_meanwhile,
+    packet_figures,
     speed_percent,
 )
 from benchmarks.reproduce.page import Section
@@ -44,8 +44,8 @@ LAYOUT = Layout(
         Remark("back end", "backend"),
         Ours("speed, % of real time", "speed_percent"),
         Published("published, %", published.ELEVATOR_SPEED_PERCENT),
-        Ours("readings delivered, %", "delivery_percent.cabin"),
-        Ours("commands delivered, %", "delivery_percent.target"),
+        Ours("readings consumed, %", "consumed_percent.cabin"),
+        Ours("commands consumed, %", "consumed_percent.target"),
         Ours("nodes, % of the machine", "cpu_nodes_percent", "{:.0f}"),
         Ours("whole machine, %", "cpu_machine_percent", "{:.0f}"),
         Published("published, %", published.ELEVATOR_CPU_PERCENT),
@@ -80,7 +80,7 @@ def read(folder: Path, entry: Entry) -> Reading:
     figures: dict[str, float | None] = {
         "speed_percent": speed_percent(sent_ns, CABIN_PERIOD_S),
         "wall_s": past.record["wall_s"],
-        **delivered(past, CONNECTIONS),
+        **packet_figures(past, CONNECTIONS),
         **load_meanwhile(folder, sent_ns, entry.unix_minus_monotonic_s),
     }
     return Reading(entry.title, entry.name, figures, {"backend": past.record["backend"]}, None)

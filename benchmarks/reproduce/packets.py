@@ -10,23 +10,23 @@ from benchmarks.reproduce.load import load_between
 from neuros.observe.past_run import PastRun
 
 
-def delivered(past: PastRun, connections: Mapping[str, str]) -> dict[str, float | None]:
-    """Packets sent and delivered (a hook started on them), by connection and in all.
+def packet_figures(past: PastRun, connections: Mapping[str, str]) -> dict[str, float | None]:
+    """Packets sent and consumed (a hook started on them), by connection and in all.
 
     Args:
         connections: what they are called in the figures, by their names.
     """
     figures: dict[str, float | None] = {}
-    whole = dict.fromkeys(("sent", "delivered"), 0)
+    whole = dict.fromkeys(("sent", "consumed"), 0)
     for name, short in connections.items():
         counts = past.connections[name]
         sent, consumed = counts["sent"] or 0, counts["consumed"] or 0
-        figures |= {f"sent.{short}": sent, f"delivered.{short}": consumed}
-        figures[f"delivery_percent.{short}"] = _percent(consumed, sent)
+        figures |= {f"sent.{short}": sent, f"consumed.{short}": consumed}
+        figures[f"consumed_percent.{short}"] = _percent(consumed, sent)
         whole["sent"] += sent
-        whole["delivered"] += consumed
+        whole["consumed"] += consumed
     figures |= whole
-    return {**figures, "delivery_percent": _percent(whole["delivered"], whole["sent"])}
+    return {**figures, "consumed_percent": _percent(whole["consumed"], whole["sent"])}
 
 
 def _percent(part: float, whole: float) -> float | None:

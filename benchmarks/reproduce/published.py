@@ -37,7 +37,7 @@ DELIVERY_PERCENT = {
     connection: {name: shares[place] for name, shares in _DELIVERED_PERCENT.items()}
     for place, connection in enumerate(("imu", "pose", "estimate"))
 }
-"""Packets that were delivered, of those sent, by connection."""
+"""Packets that were consumed (a hook started on them), of those sent, by connection."""
 
 CPU_PERCENT = {
     NRP: 92.5,

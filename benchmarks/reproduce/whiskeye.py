@@ -80,32 +80,32 @@ TOPICS = (
     ),
     _Topic(
         "Delivery rate",
-        "Packets that a hook has started on, of those that were sent. Where nothing holds the"
-        " physics back it is faster than the network here, and does not wait for its start either."
-        " In the published runs, in which no IMU packet was lost, it must have been slower.",
+        "Packets that were consumed (a hook has started on them), of those sent. Where nothing"
+        " holds the physics back it is faster than the network here, and does not wait for its"
+        " start either. In the published runs, in which no IMU packet was lost, it must have been"
+        " slower.",
         Layout(
             "delivery",
             [
-                Ours("all, %", "delivery_percent"),
-                Ours("IMU, %", "delivery_percent.imu"),
+                Ours("all, %", "consumed_percent"),
+                Ours("IMU, %", "consumed_percent.imu"),
                 Published("published, %", published.DELIVERY_PERCENT["imu"]),
-                Ours("pose, %", "delivery_percent.pose"),
+                Ours("pose, %", "consumed_percent.pose"),
                 Published("published, %", published.DELIVERY_PERCENT["pose"]),
-                Ours("estimate, %", "delivery_percent.estimate"),
+                Ours("estimate, %", "consumed_percent.estimate"),
                 Published("published, %", published.DELIVERY_PERCENT["estimate"]),
             ],
         ),
     ),
     _Topic(
         "Packet counts",
-        "Sent and delivered on "
-        + ", ".join(f"{name} ({key})" for name, key in CONNECTIONS.items()),
+        "Sent and consumed on " + ", ".join(f"{name} ({key})" for name, key in CONNECTIONS.items()),
         Layout(
             "packets",
             [
                 Ours(f"{key} {what}", f"{what}.{key}", "{:.0f}")
                 for key in CONNECTIONS.values()
-                for what in ("sent", "delivered")
+                for what in ("sent", "consumed")
             ],
         ),
     ),

@@ -66,8 +66,8 @@ def _speed(titles: Titles, readings: Readings, file: Path) -> Path:
 
 
 def _delivery(titles: Titles, readings: Readings, file: Path) -> Path:
-    keys = [("all", "delivery_percent")]
-    keys += [(short, f"delivery_percent.{short}") for short in CONNECTIONS.values()]
+    keys = [("all", "consumed_percent")]
+    keys += [(short, f"consumed_percent.{short}") for short in CONNECTIONS.values()]
     names = list(titles)
     with figure(file, 10.0, 3.6) as drawn:
         every = drawn.subplots(1, len(keys), sharex=True, sharey=True)
@@ -78,7 +78,7 @@ def _delivery(titles: Titles, readings: Readings, file: Path) -> Path:
             axes.set_xlim(0, 105)
             axes.set_title(label, loc="left", fontsize=9)
         drawn.legend(*every[-1].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-        drawn.supxlabel("packets delivered, of those sent (%)", fontsize=9)
+        drawn.supxlabel("packets consumed, of those sent (%)", fontsize=9)
     return file
 
 
@@ -89,7 +89,7 @@ def _packets(titles: Titles, readings: Readings, file: Path) -> Path:
         for (connection, short), axes in zip(CONNECTIONS.items(), every, strict=True):
             counts = [
                 (what, [_middle(readings, name, f"{what}.{short}") for name in names])
-                for what in ("sent", "delivered")
+                for what in ("sent", "consumed")
             ]
             bars(axes, list(titles.values()), counts)
             axes.set_title(connection.replace(" -> ", "\n-> "), loc="left", fontsize=9)

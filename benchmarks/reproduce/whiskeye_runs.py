@@ -19,8 +19,8 @@ from benchmarks.reproduce.intervals import interval_figures
 from benchmarks.reproduce.kinds import Reading
 from benchmarks.reproduce.packets import (
     after_the_start,
-    delivered,
     load_meanwhile,
+    packet_figures,
     speed_percent,
 )
 from benchmarks.subjects.whiskeye import IMU, WHISKEYE
@@ -100,7 +100,7 @@ def read(folder: Path, entry: Entry) -> Reading:
         "speed_percent": speed_percent(sent_ns, IMU_PERIOD_S),
         "wall_s": record["wall_s"],
         "simulated_s": record["sim_s"],
-        **delivered(past, CONNECTIONS),
+        **packet_figures(past, CONNECTIONS),
         **_errors(heading.heading_error(comparison), error_deg),
         **interval_figures(ticks),
         **load_meanwhile(folder, sent_ns, entry.unix_minus_monotonic_s),

@@ -28,7 +28,7 @@ from neuros.launch.progress import Progress
 from neuros.launch.sessions import Session, guardian_environment, this_process
 from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
-from neuros.observe.budgets import broken_budgets
+from neuros.observe.budgets import broken_budgets, losses
 from neuros.observe.recording.plan import RecordingPlan
 from neuros.observe.report import run_record, run_table
 from neuros.runtime.side import ELSEWHERE_VARIABLE
@@ -168,6 +168,8 @@ class Execution:
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
+            outcome.failures = [self._as_here(text) for text in outcome.failures]
+            outcome.stacks = {name: self._as_here(s) for name, s in outcome.stacks.items()}
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
             record |= {
@@ -205,7 +207,15 @@ class Execution:
         return with_messages({**path, **self._environment()}, messages.paths if messages else ())
 
     def _judge(self, record: dict[str, Any], outcome: Outcome) -> None:
-        """Hold the run to its budgets."""
+        """Hold the run to what lossless connections promise, and to its budgets."""
+        if outcome.exit_code in (0, EXIT_ENVIRONMENT):  # else it was not drained
+            lost = losses(record)
+            for text in lost:
+                outcome.fail(text)
+            if outcome.late_drain and not lost:
+                self._console.log(
+                    "INFO", "not drained in time, but no packet of a lossless connection was lost"
+                )
         broken = broken_budgets(
             record, self._plan.project.budgets, is_partial=self._plan.is_partial
         )

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from neuros.api.workspace import WORKSPACE
-from neuros.errors import ProjectError
+from neuros.errors import Problem, ProjectError
+from neuros.launch.containers import find_container, misspelt
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
+from neuros.project.message_types import unknown_type
+from neuros.project.scanner import display_name, place_of
+
+_LONG_BYTES = 1 << 20
+"""A file of a container's folder from this size on is data, not a recipe."""
 
 
 def load_with_messages(
@@ -18,8 +25,10 @@ def load_with_messages(
     overrides: Sequence[str] = (),
     namespace: str | None = None,
     remap: Sequence[str] = (),
+    *,
+    reads_plugins: bool = True,
 ) -> tuple[Loaded, Messages]:
-    """Load the project and find its message packages.
+    """Load the project and find its message packages; ``reads_plugins``: look into plugins, too.
 
     Raises:
         ProjectError: with all its problems, and those of its message files.
@@ -33,6 +42,7 @@ def load_with_messages(
             packages=workspaces,
             namespace=namespace,
             remap=remap,
+            reads_plugins=reads_plugins,
         )
     except ProjectError as error:
         problems = Messages(workspaces, workspaces.own).problems()
@@ -40,7 +50,39 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    return loaded, messages
+    doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces))
+    return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
+
+
+def _misspelt(loaded: Loaded) -> Iterator[Problem]:
+    """The containers that are probably meant to be others."""
+    for node in loaded.project.nodes:
+        if meant := misspelt(node.container, loaded.project.folder):
+            text = f"there is no container '{node.container}'"
+            yield Problem(f"node '{node.name}'", 0, 0, "", text, f"did you mean '{meant}'?")
+
+
+def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
+    """Message types that are not here, nor named in the folder of the node's container."""
+    for node in loaded.project.nodes:
+        container = find_container(node.container, loaded.project.folder)
+        if container is None or container.is_own:  # an image of the user's; or it was a mistake
+            continue
+        for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
+            for index, port in enumerate(ports):
+                unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
+                package = port.type.partition("/")[0]
+                if unknown and not _names_package(container.folder, package):
+                    pointer = f"{node.pointer}/{side}/{index}/type"
+                    place = place_of(node.file, pointer)
+                    yield Problem(display_name(node.file), *place, pointer, *unknown)
+
+
+def _names_package(folder: Path, package: str) -> bool:
+    """Whether a file of a container's folder names a package, as ROS or as Debian and pip do."""
+    files = [file for file in folder.iterdir() if file.is_file()]
+    short = (file for file in files if file.stat().st_size < _LONG_BYTES)
+    return any(package in file.read_text("utf-8", "replace").replace("-", "_") for file in short)
 
 
 def workspaces_of(project: Path) -> Workspaces:

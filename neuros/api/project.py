@@ -18,7 +18,8 @@ from neuros.api.plan import make_plan
 from neuros.api.request import Request, parse_duration
 from neuros.api.run import Run
 from neuros.api.settings import override_texts, seed_texts
-from neuros.errors import Problem
+from neuros.api.validation import model_problems
+from neuros.errors import Problem, ProjectError
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.project.graph import graph_mermaid, graph_text
@@ -45,6 +46,7 @@ class Project:
         self.settings = dict(settings)
         self._path = file
         self._loaded = self._load()
+        self._said = {*self._loaded.warnings}
         self.file = self._loaded.project.file
 
     @classmethod
@@ -114,6 +116,8 @@ class Project:
             ProjectError: with every problem there is.
         """
         self._loaded = self._load()
+        if problems := model_problems(self._loaded.project):
+            raise ProjectError(problems)
         return self._loaded.warnings
 
     def graph(self, form: str = "text") -> str:
@@ -243,6 +247,10 @@ class Project:
         if seed is not None:
             seeds = seed_texts(loaded.project, seed)
             loaded, messages = load_with_messages(self._path, [*texts, *seeds])
+        for warning in loaded.warnings:
+            if warning not in self._said:
+                self._said.add(warning)
+                warnings.warn(str(warning), stacklevel=3)
         return loaded.project, messages
 
 

@@ -48,8 +48,9 @@ class Run:
 
     @property
     def exit_code(self) -> int:
-        """0 ended normally, 1 a node failed or a deadlock, 4 a record was not written, 5 a budget
-        was broken, 130 Ctrl+C, 143 SIGTERM."""
+        """0 ended normally, 1 a node failed or was killed, a deadlock or a lossless connection
+        that was none, 4 a record was not written, 5 a budget was broken, 130 Ctrl+C, 143 SIGTERM.
+        """
         return int(self.record["exit_code"])
 
     @property

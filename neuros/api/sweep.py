@@ -28,7 +28,7 @@ class Sweep:
     Attributes:
         folder: with a folder for each run, and the table, ``sweep.csv``.
         rows: one for each run: its values, ``seed``, ``exit_code``, ``reason``, times, of each
-            connection how many packets were sent and the share that was delivered, what nodes
+            connection how many packets were sent and consumed, also as a share, what nodes
             found out (``node.set_result``), and its ``folder``.
     """
 

@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.run import Run
+from neuros.observe.report import consumed_percent
 
 CSV_NAME = "sweep.csv"
 _REASON_CHARACTERS = 50
+_COUNTS = (": sent", ": consumed")
+_SHARE = ": consumed / %"
 
 
 def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
@@ -28,7 +31,8 @@ def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
     for name, connection in run.connections.items():
         sent, consumed = connection["sent"], connection["consumed"]
         row[f"{name}: sent"] = sent
-        row[f"{name}: delivered"] = consumed / sent if sent and consumed is not None else None
+        row[f"{name}: consumed"] = consumed
+        row[f"{name}{_SHARE}"] = consumed_percent(connection)
     for node, results in run.node_results.items():
         row |= {f"{node}.{name}": value for name, value in results.items()}
     return {**row, "folder": str(run.folder)}
@@ -62,7 +66,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     from tabulate import tabulate
 
     hidden = ("folder", "wall_s", "sim_s")
-    names = [name for name in columns_of(rows) if name not in hidden and ": sent" not in name]
+    names = [n for n in columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
     names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
     table: str = tabulate(
         [[_cell(name, row.get(name)) for name in names] for row in rows],
@@ -79,8 +83,8 @@ def _is_shown(value: Any) -> bool:
 def _cell(name: str, value: Any) -> str:
     if value is None or isinstance(value, (list, dict)):
         return ""
-    if name.endswith(": delivered"):
-        return f"{value:.1%}"
+    if name.endswith(_SHARE):
+        return f"{value:.1f}"
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
     if name == "reason" and len(text) > _REASON_CHARACTERS:
         return text[: _REASON_CHARACTERS - 3] + "..."

@@ -1,6 +1,18 @@
-"""``python -m neuros.cli``: the same as the console script ``neuros``."""
+"""The console script ``neuros``, and ``python -m neuros.cli``, which is the same.
 
-from neuros.cli.main import console_script
+Ctrl+C waits while the commands are imported: then they can end as they should.
+"""
+
+import signal
+
+
+def console_script() -> None:
+    """Entry point of the installed ``neuros`` command."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    from neuros.cli.main import console_script as run
+
+    run()
+
 
 if __name__ == "__main__":
     console_script()

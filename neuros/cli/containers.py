@@ -136,8 +136,12 @@ def _remove(options: argparse.Namespace) -> int:
     from neuros.launch.docker.inventory import remove_images
 
     with closing(connect()) as engine:
+        has_removed = False
         for tag in remove_images(engine, options.names):
             print(f"removed {tag}")
+            has_removed = True
+    if not has_removed:
+        print("NeuROS has built no images: there is nothing to remove")
     return 0
 
 

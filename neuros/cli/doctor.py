@@ -43,9 +43,10 @@ def _findings(*, proves: bool) -> Iterator[Finding]:
     from neuros.cli.containers import STANDARD
     from neuros.doctor.containers import look_at_containers
     from neuros.doctor.delivery import prove_delivery
-    from neuros.doctor.machine import look_at_machine
+    from neuros.doctor.machine import look_at_machine, prove_rendering
 
     yield from look_at_machine(os.environ)
+    yield prove_rendering(os.environ)
     has_base = False
     for finding in look_at_containers(STANDARD, os.environ):
         has_base |= finding.state is State.GOOD and finding.text.startswith("neuros_python:")

@@ -21,7 +21,7 @@ def write_graph(options: argparse.Namespace) -> int:
         UsageError: if the file cannot be written.
     """
     kind = options.format or _SUFFIXES.get(Path(options.output or "").suffix, "text")
-    text = _MAKERS[kind](load(options))
+    text = _MAKERS[kind](load(options, reads_plugins=False))
     if options.output is None:
         print(text)
         return 0

@@ -2,7 +2,7 @@
 
 === ===========================================================
 0   ended normally
-1   a node failed, or a deadlock
+1   a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
 2   wrong usage of the command line
 3   invalid project
 4   something is missing on this machine (package, engine, image), or what was to be recorded
@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -50,7 +51,7 @@ EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 
 _EXIT_CODES = """\
 exit codes:
   0    ended normally
-  1    a node failed, or a deadlock
+  1    a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
   2    wrong usage
   3    invalid project: every problem is listed with its file and line
   4    something is missing on this machine, or a record could not be written
@@ -77,7 +78,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def console_script() -> None:
-    """Entry point of the installed ``neuros`` command."""
+    """Run the command that the process was started with, and end the process."""
     sys.exit(main(sys.argv[1:]))
 
 
@@ -87,8 +88,10 @@ def main(arguments: Sequence[str]) -> int:
     if not arguments:
         parser().print_help(sys.stderr)
         return EXIT_USAGE
-    options = parser().parse_args(arguments)
     try:
+        options = parser().parse_args(arguments)
+        if options.command is not _launch:  # that has Ctrl+C wait until it can heed it
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
         if sys.stdout is not None:
             sys.stdout.flush()  # so that a reader that has gone is noticed here
@@ -141,6 +144,7 @@ def parser() -> argparse.ArgumentParser:
     add_benchmark(commands)
     add_reproduce(commands)
     _add_node(commands)
+    _add_import_plugin(commands)
     add_recorder(commands)
     add_dashboard(commands)
     add_view(commands)
@@ -216,9 +220,17 @@ def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     validate = commands.add_parser(
         "validate",
         help="check a project without running it",
-        description="Check a project and list every problem with its file, line and column.",
+        description="Check a project and list every problem with its file, line and column."
+        " Plugins are read, and not run.",
     )
     _add_project(validate)
+    validate.add_argument(
+        "--import",
+        dest="imports",
+        action="store_true",
+        help="import the plugin of each node, too, as its process would: their code is run, but no"
+        " hook",
+    )
     validate.set_defaults(command=_validate)
 
 
@@ -249,6 +261,16 @@ def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     node.add_argument("--debug", action="store_true")
     node.add_argument("--record", action="store_true")
     node.set_defaults(command=_node)
+
+
+def _add_import_plugin(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """What ``validate --import`` runs for each node."""
+    command = commands.add_parser("import-plugin", add_help=False)
+    command.add_argument("name")
+    command.add_argument("project")
+    command.add_argument("--set", action="append", default=[])
+    command.add_argument("--answer", type=int, required=True)
+    command.set_defaults(command=_import_plugin)
 
 
 def _add_project(command: argparse.ArgumentParser) -> None:
@@ -290,14 +312,15 @@ def _launch(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import load
+    from neuros.cli.projects import validate
 
-    project = load(options)
-    print(
-        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
-        f" {_count(len(project.connections), 'connection')}"
-    )
-    return 0
+    return validate(options)
+
+
+def _import_plugin(options: argparse.Namespace) -> int:
+    from neuros.cli.projects import import_plugin
+
+    return import_plugin(options)
 
 
 def _graph(options: argparse.Namespace) -> int:
@@ -310,10 +333,6 @@ def _node(options: argparse.Namespace) -> int:
     from neuros.cli.node import run_node
 
     return run_node(options)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _complain(text: str) -> None:

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
 import ctypes
 import faulthandler
+import gc
+import io
 import json
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from neuros.observe.provenance import note_versions
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.runtime.process import NodeProcess
+
+_FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
+_STANDARD = (0, 1, 2)
 
 
 def run_node(options: argparse.Namespace) -> int:
@@ -66,17 +72,30 @@ def _taps(run: Path) -> Callable[[NodeFile], Tap]:
 
 
 class _Leave:
-    """Python's last act: it ends the process at once where ROS has not been given up."""
+    """Python's last act: open files are closed, and it ends here where ROS has not been given up.
+
+    Python would close files by itself, but not on :func:`os._exit`, and not those that it finds
+    only through objects which the garbage collector leaves alone (:mod:`neuros.runtime.process`).
+    """
 
     def __init__(self) -> None:
         self.exit_code: int | None = None
         self.has_leftovers: Callable[[], bool] = lambda: False
 
     def __call__(self) -> None:
+        gc.unfreeze()
+        files = [each for each in gc.get_objects() if issubclass(type(each), _FILE)]
+        for file in sorted(files, key=_is_inner):  # what is compressed ends only when it is closed
+            with contextlib.suppress(Exception):  # it is closed already, or its reader has gone
+                file.flush()
+                if file.fileno() not in _STANDARD:
+                    file.close()
         if self.exit_code is None or not self.has_leftovers():
             return
-        for stream in (sys.stdout, sys.stderr):
-            if stream is not None:
-                stream.flush()
         ctypes.CDLL(None).fflush(None)  # what libraries in C have printed
         os._exit(self.exit_code)
+
+
+def _is_inner(file: Any) -> bool:
+    """Whether another file may write to it when that is closed."""
+    return type(file).__module__ == "_io" and not isinstance(file, io.TextIOBase)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 from neuros.api import loading
-from neuros.errors import UsageError
-from neuros.launch.containers import misspelt
+from neuros.api.validation import import_problems, model_problems
+from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.project.model import Project
+
+EXIT_NODE = 1
 
 
 def project_path(options: argparse.Namespace) -> Path:
@@ -27,24 +30,58 @@ def project_path(options: argparse.Namespace) -> Path:
     return Path(named.pop())
 
 
-def load(options: argparse.Namespace) -> Project:
+def load(options: argparse.Namespace, *, reads_plugins: bool = True) -> Project:
     """Load the project as :func:`load_with_messages` does."""
-    return load_with_messages(options)[0]
+    return load_with_messages(options, reads_plugins=reads_plugins)[0]
 
 
-def load_with_messages(options: argparse.Namespace) -> tuple[Project, Messages]:
+def load_with_messages(
+    options: argparse.Namespace, *, reads_plugins: bool = True
+) -> tuple[Project, Messages]:
     """Load the project and find its message packages; warnings go to standard error.
 
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
     loaded, messages = loading.load_with_messages(
-        project_path(options), options.set, options.namespace, options.remap
+        project_path(options),
+        options.set,
+        options.namespace,
+        options.remap,
+        reads_plugins=reads_plugins,
     )
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    for node in loaded.project.nodes:
-        if meant := misspelt(node.container, loaded.project.folder):
-            text = f"there is no container '{node.container}' (did you mean '{meant}'?)"
-            print(f"warning: node '{node.name}': {text}", file=sys.stderr)
     return loaded.project, messages
+
+
+def validate(options: argparse.Namespace) -> int:
+    """Check a project, and say that it is valid."""
+    project, messages = load_with_messages(options)
+    problems = model_problems(project)
+    if not problems and options.imports:
+        problems = import_problems(project, messages, project_path(options), options.set)
+    if problems:
+        raise ProjectError(problems)
+    print(
+        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
+        f" {_count(len(project.connections), 'connection')}"
+    )
+    return 0
+
+
+def import_plugin(options: argparse.Namespace) -> int:
+    """Import the plugin of one node as a run would; what is wrong with it is the answer."""
+    from neuros.testing import PluginHarness
+
+    with os.fdopen(options.answer, "w", encoding="utf-8", errors="backslashreplace") as answer:
+        try:
+            PluginHarness.from_project(options.project, options.name, overrides=options.set)
+        except NeurosError as error:
+            answer.write(str(error))
+            return EXIT_NODE
+    return 0
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -20,7 +20,8 @@ def add_recording_options(launch: argparse.ArgumentParser) -> None:
         "-r",
         "--record",
         action="store_true",
-        help="record every connection, the external topics, and /clock: RUN/bag",
+        help="record everything into RUN/bag: every connection, the external topics, and /clock;"
+        " with -t, those besides",
     )
     group.add_argument(
         "-t",
@@ -29,7 +30,8 @@ def add_recording_options(launch: argparse.ArgumentParser) -> None:
         default=[],
         dest="record_topics",
         metavar="NAME",
-        help="record this (repeatable), be it a ROS topic that no node has; without -r, this only",
+        help="record this, be it a ROS topic that no node has (repeatable); alone: only this;"
+        " with -r: everything, and this",
     )
     group.add_argument(
         "--exclude",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -76,20 +78,28 @@ def _sweep(options: argparse.Namespace) -> int:
         if path in values:
             raise UsageError(f"--set {path}: is given twice; put the values behind one another")
         values[path] = given
-    made = sweep(
-        options.project,
-        set=values,
-        seeds=options.seeds,
-        repeat=options.repeat,
-        jobs=options.jobs,
-        backend=options.backend,
-        duration=options.duration,
-        record=options.record,
-        output=options.output,
-        on_row=_say,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = _warn
+        made = sweep(
+            options.project,
+            set=values,
+            seeds=options.seeds,
+            repeat=options.repeat,
+            jobs=options.jobs,
+            backend=options.backend,
+            duration=options.duration,
+            record=options.record,
+            output=options.output,
+            on_row=_say,
+        )
     print(f"\n{made}\n\n{made.folder / CSV_NAME}")
     return 0 if all(row["exit_code"] == 0 for row in made.rows) else EXIT_FAILED
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """What may be a mistake in the project, without the line of Python that found it."""
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _say(number: int, count: int, row: Mapping[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 EXIT_DIFFERENT, EXIT_UNKNOWN = 1, 2
 
@@ -26,10 +25,12 @@ def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _verify(options: argparse.Namespace) -> int:
     from neuros.observe.difference import compare
     from neuros.observe.past_run import open_run
+    from neuros.observe.recorded import Recorded
 
     a, b = open_run(options.run_a), open_run(options.run_b)
-    verdict = compare(a, b, _Recorded())
-    for remark in verdict.remarks:
+    recorded = Recorded()
+    verdict = compare(a, b, recorded)
+    for remark in (*recorded.remarks, *verdict.remarks):
         print(f"note: {remark}")
     if verdict.difference is not None:
         print(f"different: {verdict.difference}")
@@ -39,35 +40,3 @@ def _verify(options: argparse.Namespace) -> int:
         return EXIT_UNKNOWN
     print(f"identical: {verdict.compared} packet{'' if verdict.compared == 1 else 's'}")
     return 0
-
-
-class _Recorded:
-    """Packets from what runs have recorded; ``None`` where one is not there."""
-
-    def __init__(self) -> None:
-        self._bags: dict[Path, Any] = {}
-
-    def __call__(self, run_folder: Path, connection: str, number: int) -> Any:
-        if run_folder not in self._bags:
-            self._bags[run_folder] = _bag(run_folder)
-        bag = self._bags[run_folder]
-        if bag is None:
-            return None
-        try:
-            return bag[connection].message(number - 1)
-        except (KeyError, IndexError):
-            return None
-
-
-def _bag(run_folder: Path) -> Any:
-    from neuros.errors import NeurosError
-    from neuros.observe.bag.opened import open_bag
-    from neuros.observe.recording.plan import PLAN_NAME
-
-    if not (run_folder / PLAN_NAME).exists():
-        return None
-    try:
-        return open_bag(run_folder)
-    except NeurosError as error:
-        print(f"note: {error}")
-        return None

@@ -22,6 +22,7 @@ class Building:
         spec: the ``MjSpec``.
         bodies: its bodies by the id of their links.
         geoms: the geoms made from collisions, by the id of their elements.
+        colliding_meshes: the <mesh> of collisions, by the names of their geoms.
         masks: what collisions say that they collide with, by the id of their elements.
         joints: the names of the joints made from a joint, by its name.
     """
@@ -32,6 +33,7 @@ class Building:
     bodies: dict[int, Any] = field(default_factory=dict)
     geoms: dict[int, Any] = field(default_factory=dict)
     masks: dict[int, int] = field(default_factory=dict)
+    colliding_meshes: dict[str, Element] = field(default_factory=dict)
     joints: dict[str, list[str]] = field(default_factory=dict)
     _names: set[tuple[str, str]] = field(default_factory=lambda: {("body", "world")})
 

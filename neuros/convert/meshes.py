@@ -18,6 +18,7 @@ from neuros.convert.report import Report
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
+SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
@@ -65,14 +66,8 @@ class Meshes:
     def blame(self) -> None:
         """Report the meshes that MuJoCo cannot use, once a model with them does not compile."""
         for mesh in self.spec.meshes:
-            trial = mujoco.MjSpec()
-            alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
-            alone.inertia = mesh.inertia
-            if mesh.name in self.made:
-                fill(alone, self.made[mesh.name])
-            trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
             try:
-                trial.compile()
+                compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
                 text = " ".join(str(error).removeprefix("Error: ").split())
                 self.report.problem(self._places[mesh.name], f"MuJoCo cannot use the mesh: {text}")
@@ -93,13 +88,29 @@ class Meshes:
         self._places[name] = uri
         mesh = self.spec.add_mesh(name=name, scale=scale)
         if not is_solid:  # a thin shell may be open, or flat
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            mesh.inertia = SHELL
         if triangles is None:
             mesh.file = str(file)
         else:
             fill(mesh, triangles)
             self.made[name] = triangles
         return name
+
+
+def compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
+    """The ``MjModel`` of one mesh, which collides unless it ``is_shown_only``.
+
+    ``triangles`` are its own, if it has no file. Raises ``ValueError``.
+    """
+    trial = mujoco.MjSpec()
+    alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
+    alone.inertia = SHELL if is_shown_only else mesh.inertia
+    if triangles is not None:
+        fill(alone, triangles)
+    geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+    if is_shown_only:
+        geom.contype = geom.conaffinity = 0
+    return trial.compile()
 
 
 def why_unread(file: Path) -> str:

@@ -14,6 +14,7 @@ from neuros.convert.converted import Converted
 from neuros.convert.couplings import add_mimics
 from neuros.convert.elements import Element
 from neuros.convert.find import Finder
+from neuros.convert.flat import box_flat_meshes, has_flat_meshes
 from neuros.convert.includes import Includer
 from neuros.convert.inertia import is_computed, read_inertia, set_inertia
 from neuros.convert.joints import add_joints, is_known
@@ -160,7 +161,16 @@ def _compiled(building: Building, root: Element) -> Any:
     try:
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
-            model = building.spec.compile()
+            boxed = []
+            try:
+                model = building.spec.copy().compile()  # MuJoCo 3 forgets no mesh of a geom
+                may_be_flat = has_flat_meshes(model)
+            except ValueError:
+                may_be_flat = True
+            if may_be_flat:
+                heard.clear()
+                boxed = box_flat_meshes(building.spec, building.meshes.made)
+                model = building.spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         building.meshes.blame()
         building.report.raise_any()
@@ -168,6 +178,9 @@ def _compiled(building: Building, root: Element) -> Any:
         building.report.problem(root, f"MuJoCo cannot compile what became of it: {text}")
         building.report.raise_any()
         raise
+    why = {geom.name: str(slab) for geom, slab in boxed}
+    for name, mesh in building.colliding_meshes.items():
+        building.report.remark(mesh, why.get(name, "MuJoCo collides the convex hull of a mesh"))
     for warning in heard:
         building.report.remark(root, f"MuJoCo: {' '.join(str(warning.message).split())}")
     return model

@@ -18,7 +18,6 @@ from neuros.convert.scopes import Link
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _TYPES = mujoco.mjtGeom
 _ALL_MASKS = 0xFFFF  # what Gazebo gives a collision that names none
-_CONVEX = "MuJoCo collides the convex hull of a mesh"
 
 
 @dataclass
@@ -70,6 +69,9 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
     put(geom, pose @ shape.pose, link.pose)
     noting = element if element.tag == "collision" else None  # nobody asks for a visual by name
     geom.name = building.name("geom", f"{link.name}/{element.name}", noting)
+    mesh = element.child("geometry", "mesh")
+    if shape.mesh and mesh is not None and element.tag == "collision":
+        building.colliding_meshes[geom.name] = mesh
     return geom
 
 
@@ -137,13 +139,9 @@ def _mesh(building: Building, owner: Element, element: Element, *, is_solid: boo
         building.report.problem(element, "<uri> is missing: which file is the mesh in?")
         return None
     scale = vector(element, "scale", building.report, (1.0, 1.0, 1.0))
-    is_collision = owner.tag == "collision"
-    name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_collision)
-    if name is None:
-        return None
-    if is_collision:
-        building.report.remark(element, _CONVEX)
-    return Shape(_TYPES.mjGEOM_MESH, mesh=name)
+    is_needed = owner.tag == "collision"
+    name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_needed)
+    return None if name is None else Shape(_TYPES.mjGEOM_MESH, mesh=name)
 
 
 def _read_surface(building: Building, collision: Element, geom: Any) -> None:

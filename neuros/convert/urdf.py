@@ -17,6 +17,7 @@ from neuros.convert.converted import Converted
 from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
+from neuros.convert.flat import box_flat_meshes, has_flat_meshes
 from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of, why_unread
 from neuros.convert.report import Report
 from neuros.errors import Problem
@@ -117,13 +118,26 @@ def _spec(
                 mesh.file = ""
                 fill(mesh, triangles)
                 made[mesh.name] = triangles
-        spec.copy().compile()
+        _compile(spec, made, root, report)
     except (ValueError, mujoco.FatalError) as error:
         text = " ".join(str(error).removeprefix("Error: ").split())
         report.problem(root, f"MuJoCo cannot compile it: {text}")
         report.raise_any()
         raise
     return spec, made
+
+
+def _compile(spec: Any, made: dict[str, Triangles], root: Element, report: Report) -> None:
+    """Compile a copy, with boxes for flat meshes; raises what MuJoCo does."""
+    try:
+        if not has_flat_meshes(spec.copy().compile()):
+            return
+    except ValueError:
+        pass  # perhaps for a flat mesh; if not, it is raised again below
+    links = {element.name: element for element in _all(root) if element.tag == "link"}
+    for geom, slab in box_flat_meshes(spec, made):
+        report.remark(links.get(geom.parent.name, root), str(slab))
+    spec.copy().compile()
 
 
 def _mimic(spec: Any, mimic: Element, report: Report) -> None:

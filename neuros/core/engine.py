@@ -27,7 +27,7 @@ from neuros.core.accounting import (
 from neuros.core.effects import Effects
 from neuros.core.exchange import Exchange
 from neuros.core.gate import Gate, drives
-from neuros.core.hook import Hook, Source
+from neuros.core.hook import Hook, PacketType, Source
 from neuros.core.inputs import Inlet
 from neuros.core.life import Life
 from neuros.core.node_ports import NodePorts, undeclared
@@ -45,7 +45,7 @@ class Engine:
         node: the node, with its ports.
         connections: all connections that begin or end at it, in the project's order.
         specs: its hooks, in the order of declaration.
-        packet_types: message class per output name, for checking what hooks return.
+        packet_types: per output name, what hooks must return; any value will do for others.
         clock: monotonic wall clock in nanoseconds.
 
     Attributes:
@@ -65,7 +65,7 @@ class Engine:
         specs: Sequence[HookSpec],
         effects: Effects,
         clock: Callable[[], int],
-        packet_types: Mapping[str, type] | None = None,
+        packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
         self.node = node
         self._effects = effects
@@ -122,10 +122,7 @@ class Engine:
 
     def on_timer(self) -> None:
         """The time of :attr:`next_due_ns` has come."""
-        now_ns = self._wake()
-        for hook in self._ticks:
-            if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
-                hook.is_due = True
+        self._wake()
         self._pass()
 
     def on_loop_back(self) -> None:
@@ -150,10 +147,15 @@ class Engine:
         self._pass()
         return withdraw
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; the others go on."""
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; the others go on.
+
+        Args:
+            last_round: places in :attr:`all_hooks` of hooks that would go on for ever (each of a
+                loop waits for the one before): they start at most once more.
+        """
         self._wake()
-        self._life.drain()
+        self._life.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
         self.resume()
 
@@ -277,8 +279,12 @@ class Engine:
     # ------------------------------------------------------------------ inside
 
     def _wake(self) -> int:
-        """Book the time since the last event; returns the time now."""
+        """Book the time since the last event, and note the ticks due by now; returns the time."""
         now_ns = self._clock()
+        if self._ticks and not self._gate.is_closed:
+            for hook in self._ticks:
+                if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
+                    hook.is_due = True
         if self.executing is None:  # else it is the hook's, and booked when that ends
             self._spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns
@@ -287,7 +293,7 @@ class Engine:
     def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life, gate = self._life, self._gate
+        life, gate, exchange = self._life, self._gate, self._exchange
         if not life.has_begun:
             return
         if self._schedule.candidates:
@@ -299,7 +305,7 @@ class Engine:
                     if gate.is_closed and not gate.lets(hook):
                         continue
                     if not hook.blocked or hook.can_send():
-                        if not (may_start or self._has_taken_in()):
+                        if not may_start and (exchange.to_itself or not self._has_taken_in()):
                             break
                         may_start = False
                         self._run(hook)
@@ -324,6 +330,8 @@ class Engine:
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._life.tick_start_ns, start_ns)
+        if self._life.last_round and hook in self._life.last_round:
+            self._life.finish_round(hook)
         self._spent_ns[SCHEDULING] += start_ns - self.since_ns
         self.since_ns = start_ns
         self.executing = hook
@@ -353,7 +361,7 @@ class Engine:
             if name not in self.outputs:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
-        source = self._sources[names] = Source(names, self.outputs)
+        source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
         self._life.add_source(source)
         self.all_hooks.append(source)
         return source

@@ -17,6 +17,9 @@ class Exchange:
 
     Args:
         deliver: called, as an event, with a packet of the node for itself.
+
+    Attributes:
+        to_itself: how many packets of the node for itself are on their way.
     """
 
     def __init__(
@@ -33,6 +36,7 @@ class Exchange:
         self._clock = clock
         self._deliver = deliver
         self._arrivals = 0
+        self.to_itself = 0
 
     def receive(self, key: Connection | str, packet: Any) -> None:
         """A packet has arrived on a connection, or on the external topic of the input ``key``."""
@@ -72,7 +76,13 @@ class Exchange:
 
     def _send_to_itself(self, connection: Connection, packet: Any) -> None:
         own = self._effects.copy_to_itself(connection, packet)
-        self._effects.post(lambda: self._deliver(connection, own))
+        self.to_itself += 1
+
+        def arrive() -> None:
+            self.to_itself -= 1
+            self._deliver(connection, own)
+
+        self._effects.post(arrive)
 
     def _acknowledge(self, inlet: Inlet) -> None:
         if not inlet.is_acknowledged:

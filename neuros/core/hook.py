@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from neuros.core.flow import Outlet
 from neuros.core.inputs import InputSlot, Mailbox
 from neuros.core.ticks import TickBook
-from neuros.errors import HookError
+from neuros.errors import HookError, WrongValue
 from neuros.hooks import HookKind, HookSpec, OutputSpec
 from neuros.project.model import Port
 
 _SEVERAL = (tuple, list)  # as a union it would be made anew at each use
 
 
+class PacketType(NamedTuple):
+    """What a hook must return for an output.
+
+    Attributes:
+        kind: the message class.
+        check: returns a packet with the values that are sent, or raises ``WrongValue``.
+    """
+
+    kind: type
+    check: Callable[[Any], Any]
+
+
 class Output:
     """One output of the node and the connections that it feeds.
 
-    ``packet_type`` is the message class that a hook must return for it, ``None`` if any will do.
+    ``packet_type`` says what a hook must return for it, ``None`` if anything will do.
     """
 
     __slots__ = ("elsewhere", "outlets", "packet_type", "port", "to_itself")
 
-    def __init__(self, port: Port, outlets: Sequence[Outlet], packet_type: type | None) -> None:
+    def __init__(
+        self, port: Port, outlets: Sequence[Outlet], packet_type: PacketType | None
+    ) -> None:
         self.port = port
         self.outlets = tuple(outlets)
         connections = [outlet.connection for outlet in outlets]
@@ -184,10 +198,10 @@ class Hook:
             self.ticks.skip(duration_ns)
 
     def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
-        """What the hook returned: the packets, each with its output.
+        """What the hook returned: the packets as they are sent, each with its output.
 
         Raises:
-            HookError: if the count, a type, or a missing packet is not what was declared.
+            HookError: if the count, a type, a missing packet, or a value in one is not as declared.
         """
         results = self._results
         if not results:
@@ -214,18 +228,28 @@ class Hook:
                         f"returned no packet for output '{output.port.name}': return one, or"
                         f' declare it as Optional("{output.port.name}")'
                     )
-            elif output.packet_type is not None and not isinstance(packet, output.packet_type):
-                raise self.error(
-                    f"returned {_kind(packet)} for output '{output.port.name}', which carries"
-                    f' {output.port.type}: use node.make_packet("{output.port.name}")'
-                )
             else:
-                found.append((output, packet))
+                found.append((output, self._checked(output, packet)))
         return found
 
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the address of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
+
+    def _checked(self, output: Output, packet: Any) -> Any:
+        wanted = output.packet_type
+        if wanted is None:
+            return packet
+        name = output.port.name
+        if not isinstance(packet, wanted.kind):
+            raise self.error(
+                f"returned {_kind(packet)} for output '{name}', which carries"
+                f' {output.port.type}: use node.make_packet("{name}")'
+            )
+        try:
+            return wanted.check(packet)
+        except WrongValue as error:
+            raise self.error(f"packet for output '{name}': {error}") from None
 
     def _note(self) -> None:
         if self._is_enabled and self._is_due and not self._lacking:
@@ -257,15 +281,16 @@ class Hook:
 class Source(Hook):
     """Packets from outside the hooks (a simulator's own thread), sent as if a hook returned them.
 
-    It is due while it holds an offer; several wait in line.
+    It is due while it holds an offer; several wait in line. ``where`` is the plugin's file.
     """
 
-    __slots__ = ("_accepted", "_offers")
+    __slots__ = ("_accepted", "_offers", "_where")
 
-    def __init__(self, names: Sequence[str], outputs: Mapping[str, Output]) -> None:
+    def __init__(self, names: Sequence[str], outputs: Mapping[str, Output], where: str) -> None:
         spec = HookSpec(HookKind.FUNCTION, _offer, (), tuple(OutputSpec(name) for name in names))
         super().__init__(spec, (), outputs)
         self.name = f"submit({', '.join(names)})"
+        self._where = where
         self._offers: dict[object, tuple[Sequence[Any], Callable[[], None]]] = {}
         self._accepted: Callable[[], None] = _nobody
         self.is_due = False
@@ -294,8 +319,8 @@ class Source(Hook):
         accepted()
 
     def error(self, text: str) -> HookError:
-        """A ``HookError``; an offer comes from no line of the plugin."""
-        return HookError(text, hook=self.name)
+        """A ``HookError``; an offer comes from no line of the plugin, but from its file."""
+        return HookError(text, hook=self.name, where=self._where)
 
 
 def _offer() -> None:

@@ -2,14 +2,14 @@
 
 An engine decides by its events, and, where hooks have a period, by what its clock says. So both
 are noted, in their order, and each start of a hook besides, to check against. A number below zero
-is an event (its complement has the kind in 4 bits, a place in 20 and a position in 39), any other
+is an event (its complement has the kind in 5 bits, a place in 20 and a position in 38), any other
 one a reading of the clock. An entry costs some 0.1 us.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from neuros.core.hook import Hook
 from neuros.hooks import HookKind
 from neuros.project.model import Connection
 
-_KIND_BITS, _PLACE_BITS = 4, 20
+_KIND_BITS, _PLACE_BITS = 5, 20
 _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
 
 
@@ -41,6 +41,7 @@ class What(IntEnum):
     RESUME = 13
     STEP = 14  # place: 1 if some node of the project drives it; position: how many
     DEFERRED = 15  # the pass ended, for what had arrived; position: how many hooks it had started
+    LAST_ROUND = 16  # place: of a hook that starts at most once more when the node drains: next
 
 
 class Event(NamedTuple):
@@ -109,9 +110,11 @@ class JournalledEngine(Engine):
         self._note(_OFFER)
         return super().offer(packets, accepted)
 
-    def drain(self) -> None:
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        for place in last_round:
+            self._note(_entry(What.LAST_ROUND, place))
         self._note(_entry(What.DRAIN))
-        super().drain()
+        super().drain(last_round)
 
     def pause(self) -> None:
         self._note(_entry(What.PAUSE))

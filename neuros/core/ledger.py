@@ -14,6 +14,7 @@ from neuros.core.engine import Engine
 from neuros.core.flow import Outlet
 from neuros.core.hook import Hook
 from neuros.core.inputs import Inlet
+from neuros.hooks import HookKind
 
 _T = TypeVar("_T")
 
@@ -30,8 +31,10 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``state``: what it does now, ``{"state", "cause"}``.
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
-        ``incoming``: the same; an external topic is ``/topic -> b.in``.
-        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals.
+        ``incoming``: the same; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
+        is ready to start on the oldest unread packet.
+        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
+        those that initialise, how many of the seconds that took.
         ``accounting``: seconds by cause; ``total`` is the sum of all others.
     """
     hooks = tuple(engine.all_hooks)
@@ -95,7 +98,14 @@ def _incoming(inlet: Inlet) -> dict[str, Any]:
         "longest_discard": inlet.longest_discard,
         "unread": received - consumed - discarded,
         "acknowledged": inlet.acknowledged,
+        "taker": steadily(lambda: _taker(inlet), None),
     }
+
+
+def _taker(inlet: Inlet) -> str | None:
+    """A hook that could start now, and would take a packet of this inlet."""
+    hooks = (each.slot.hook for each in inlet.mailboxes if each.slot.would_take(each))
+    return next((hook.name for hook in hooks if hook.is_ready()), None)
 
 
 def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
@@ -105,6 +115,8 @@ def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
         entry["executions"] += hook.executions
         entry["busy_s"] += hook.busy_ns / 1e9
         entry["missed_ticks"] += hook.missed_ticks
+        if hook.spec.kind is HookKind.INITIALISE:
+            entry["initialise_s"] = entry.get("initialise_s", 0.0) + hook.busy_ns / 1e9
         if hook.ticks is not None:
             entry["ticks"] = steadily(hook.ticks.figures, None)
     return books

@@ -1,12 +1,13 @@
 """The phases of a node's life: each lets some hooks run and others not.
 
 Registering (until every receiver is there), initialising (until each initialise hook has run),
-running, draining (without the hooks that send unasked), stopped.
+running, draining (without the hooks that send unasked; those that would go on for ever start once
+more at most), stopped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from neuros.core.flow import Outlet
 from neuros.core.hook import Hook, Source
@@ -21,6 +22,7 @@ class Life:
     Attributes:
         has_begun: whether the node was started and every receiver has been found.
         is_running: whether every initialise hook has run.
+        last_round: while draining, the hooks that may start once more and no more.
         tick_start_ns: when that was, on the clock; ticks are counted from then.
     """
 
@@ -37,6 +39,7 @@ class Life:
         self.is_running = False
         self.is_draining = False
         self.is_stopped = False
+        self.last_round: set[Hook] = set()
         self.tick_start_ns = 0
 
     def start(self) -> None:
@@ -60,12 +63,18 @@ class Life:
         if not self._initialisers:
             self._begin_running()
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; the others go on."""
+    def drain(self, last_round: Iterable[Hook]) -> None:
+        """Stop the hooks that send unasked; the others go on, ``last_round`` for one start each."""
         self.is_draining = True
+        self.last_round.update(last_round)
         for hook in self._schedule.order:
             if hook.spec.sends_unasked:
                 hook.is_enabled = False
+
+    def finish_round(self, hook: Hook) -> None:
+        """A hook of the last round has started: what else arrives for it stays unread."""
+        self.last_round.discard(hook)
+        hook.is_enabled = False
 
     def add_source(self, source: Source) -> None:
         """A thread of the plugin sends for the first time."""

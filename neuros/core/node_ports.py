@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from neuros.core.flow import Outlet
-from neuros.core.hook import Hook, Output
+from neuros.core.hook import Hook, Output, PacketType
 from neuros.core.inputs import Inlet, InputSlot
 from neuros.errors import HookError
 from neuros.hooks import HookSpec, InputSpec
@@ -18,7 +18,7 @@ class NodePorts:
 
     Args:
         connections: all that begin or end at the node, in the project's order.
-        packet_types: message class per output name; hooks may return anything where there is none.
+        packet_types: per output name; hooks may return anything where there is none.
 
     Attributes:
         inlets: by connection, and by the name of the input for external topics, which come last.
@@ -27,7 +27,10 @@ class NodePorts:
     """
 
     def __init__(
-        self, node: Node, connections: Sequence[Connection], packet_types: Mapping[str, type]
+        self,
+        node: Node,
+        connections: Sequence[Connection],
+        packet_types: Mapping[str, PacketType],
     ) -> None:
         self._node = node
         self.inlets: dict[Connection | str, Inlet] = {

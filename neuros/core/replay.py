@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from neuros.core.engine import Engine
@@ -46,7 +46,7 @@ class Inbox(Protocol):
     def on_acknowledgement(self, connection: Connection, position: int) -> None: ...
     def on_registered(self, connection: Connection) -> None: ...
     def on_timer(self) -> None: ...
-    def drain(self) -> None: ...
+    def drain(self, last_round: Sequence[int] = ()) -> None: ...
     def pause(self) -> None: ...
     def resume(self) -> None: ...
     def step(self, count: int, *, is_driven: bool) -> None: ...
@@ -147,6 +147,7 @@ class Player:
     def __init__(self, script: Script, engine: Engine, inbox: Inbox, source: Source) -> None:
         self._script, self._engine, self._inbox, self._source = script, engine, inbox, source
         self._arrived: dict[Connection | str, int] = {}
+        self._last_round: list[int] = []
         ends = [*engine.inlets, *engine.outlets]
         self._connections = {key.index: key for key in ends if isinstance(key, Connection)}
 
@@ -177,11 +178,15 @@ class Player:
             self._source.offer()
         elif what is What.STEP:
             self._inbox.step(event.position, is_driven=bool(event.place))
+        elif what is What.LAST_ROUND:
+            if event.place < len(self._engine.all_hooks):  # a plugin that was changed may have less
+                self._last_round.append(event.place)
+        elif what is What.DRAIN:
+            self._inbox.drain(self._last_round)
         else:
             {
                 What.START: self._inbox.start,
                 What.TIMER: self._inbox.on_timer,
-                What.DRAIN: self._inbox.drain,
                 What.PAUSE: self._inbox.pause,
                 What.RESUME: self._inbox.resume,
                 What.STOP: self._inbox.stop,

@@ -1,18 +1,30 @@
-"""From what nodes show of themselves to what the page shows: rates, shares, latencies."""
+"""From what nodes show of themselves to what the page shows: rates, shares, latencies, losses."""
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
+from neuros.core.spending import spending_of
+
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""
 
-_STATES = ("executing", "waiting", "blocked", "idle", "registering", "scheduling", "paused")
+_STATES = {
+    "executing": ("executing", "scheduling"),
+    **{state: (state,) for state in ("waiting", "blocked", "idle", "registering", "paused")},
+}
+"""By share that is shown, the causes that count to it; as at the end of a run."""
+
+_COUNTS = ("sent", "outstanding", "received", "discarded", "unread")
 _MOST_SENT = 4096
 _MOST_TAKEN = 8
+_MOST_SHOWN = 256
+_UNDER_WAY_S = 0.02
+_LATE_S = 2.0
 
 
 class Latency:
@@ -73,6 +85,42 @@ class Speed:
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
 
 
+class Loss:
+    """How many packets of a best-effort connection were lost on their way, so far.
+
+    Both ends show their counts at different moments, and what arrives while a hook executes is
+    taken in after it. So the receiver's count is compared with what had been sent shortly before it
+    last took in, and the least difference of a while counts: late packets are not lost.
+    """
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, int]] = deque(maxlen=_MOST_SHOWN)
+        self._missing: deque[tuple[float, float]] = deque()
+        self.count = 0
+
+    def sent(self, now_s: float, count: int) -> None:
+        """So many have been sent by now."""
+        self._sent.append((now_s, count))
+
+    def received(self, now_s: float, taken_in_s: float, count: int) -> None:
+        """So many have arrived of those that were there when the receiver last took in."""
+        sent = self._sent_by(taken_in_s - _UNDER_WAY_S)
+        if sent is None:
+            return
+        self._missing.append((now_s, sent - count))
+        if now_s - self._missing[0][0] >= _LATE_S:
+            self.count = max(self.count, int(min(missing for _, missing in self._missing)))
+            self._missing.popleft()
+
+    def _sent_by(self, then_s: float) -> float | None:
+        """How many had been sent then, as far as that is known."""
+        for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
+            if a_s <= then_s <= b_s:
+                return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
+        is_since = self._sent and self._sent[-1][0] <= then_s
+        return self._sent[-1][1] if is_since else None
+
+
 class Figures:
     """Keeps what is needed of the past, and gives what is to be shown.
 
@@ -87,10 +135,14 @@ class Figures:
         self.sim_time: float | None = None
         self._speeds: dict[tuple[str, str], Speed] = {}
         self._latencies: dict[str, Latency] = {}
+        self._losses: dict[str, Loss] = {}
+        self._ended_factor: float | None = None
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second now."""
+        """Simulated seconds per second: now, and of the whole run once that is over."""
+        if self._ended_factor is not None:
+            return self._ended_factor
         speed = self._speeds.get(("sim", ""))
         return None if speed is None else speed.per_s
 
@@ -109,6 +161,10 @@ class Figures:
             shown = self.connections.setdefault(name, {})
             shown |= {key: counters[key] for key in ("sent", "outstanding", "is_blocked")}
             shown["rate_hz"] = self._speed("sent", name, now_s, counters["sent"])
+            if counters["is_reliable"]:
+                shown["lost"] = 0
+            else:
+                self._losses.setdefault(name, Loss()).sent(now_s, counters["sent"])
         for name, counters in books["incoming"].items():
             shown = self.connections.setdefault(name, {})
             shown |= {key: counters[key] for key in ("received", "discarded", "unread")}
@@ -116,15 +172,63 @@ class Figures:
             shown.setdefault("rate_hz", rate_hz)
             if "sent" not in shown:  # an external topic, or a sender of another launcher
                 shown["rate_hz"] = rate_hz
+            if name in self._losses:
+                executing = books["executing"]
+                taken_in_s = now_s - (executing["for_s"] if executing else 0.0)
+                self._losses[name].received(now_s, taken_in_s, counters["received"])
+                shown["lost"] = self._losses[name].count
         self._take_times(books)
 
+    def end(self, reports: Mapping[str, Mapping[str, Any]], running_s: float | None) -> None:
+        """The run is over: counts are final, and rates and shares are those of the whole run.
+
+        Args:
+            reports: the last one of each node that has made one.
+            running_s: how long all nodes ran.
+        """
+        self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
+        ends: dict[str, dict[str, int]] = {}
+        for name, report in reports.items():
+            books = report["ledger"]
+            if books is None:
+                continue
+            self._end_node(name, books, running_s)
+            for connection, counters in (*books["outgoing"].items(), *books["incoming"].items()):
+                shown = self.connections.setdefault(connection, {})
+                shown |= {key: counters[key] for key in _COUNTS if key in counters}
+                if report.get("is_final"):
+                    ends.setdefault(connection, {}).update(counters)
+        for connection, shown in self.connections.items():
+            count, final = shown.get("sent", shown.get("received")), ends.get(connection, {})
+            is_known = {"sent", "received"} <= {*final}
+            shown |= {
+                "is_blocked": False,
+                "latency_ms": None,
+                "rate_hz": count / running_s if count is not None and running_s else None,
+                "lost": final["sent"] - final["received"] if is_known else None,
+            }
+        if self.sim_time is not None and running_s:
+            self._ended_factor = self.sim_time / running_s
+
+    def _end_node(self, name: str, books: Mapping[str, Any], running_s: float | None) -> None:
+        spent = spending_of(books, running_s)
+        self.nodes[name] = {
+            "state": "ended",
+            "cause": "",
+            "shares": {} if spent is None else spent.shares,
+            "hooks": {
+                hook: _hook(each["executions"], each["busy_s"], None)
+                for hook, each in books["hooks"].items()
+            },
+        }
+
     def _take_node(self, name: str, books: Mapping[str, Any], now_s: float) -> None:
-        spent = books["accounting"]
-        shares = {}
-        for state in _STATES:
-            value = spent[state]
-            seconds = sum(value.values()) if isinstance(value, Mapping) else value
-            shares[state] = self._speed(f"share {state}", name, now_s, seconds)
+        shares = {
+            state: self._speed(
+                f"share {state}", name, now_s, sum(_seconds(books, cause) for cause in causes)
+            )
+            for state, causes in _STATES.items()
+        }
         executing = books["executing"]
         self.nodes[name] = {
             **books["state"],
@@ -132,11 +236,7 @@ class Figures:
             "executing_s": executing["for_s"] if executing else 0.0,
             "shares": shares,
             "hooks": {
-                hook: {
-                    "executions": count,
-                    "rate_hz": self._speed(f"hook {hook}", name, now_s, count),
-                    "mean_ms": busy_s / count * 1e3 if count else None,
-                }
+                hook: _hook(count, busy_s, self._speed(f"hook {hook}", name, now_s, count))
                 for hook, (count, busy_s) in books["hooks"].items()
             },
         }
@@ -156,3 +256,16 @@ class Figures:
         speed = self._speeds.setdefault((kind, name), Speed())
         speed.note(now_s, value)
         return speed.per_s
+
+
+def _seconds(books: Mapping[str, Any], cause: str) -> float:
+    spent = books["accounting"][cause]
+    return sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
+
+
+def _hook(executions: int, busy_s: float, rate_hz: float | None) -> dict[str, Any]:
+    return {
+        "executions": executions,
+        "rate_hz": rate_hz,
+        "mean_ms": busy_s / executions * 1e3 if executions else None,
+    }

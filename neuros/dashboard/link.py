@@ -93,6 +93,8 @@ class Link:
         elif kind == "log":
             self._pages.send("log", [f"[{message['severity']}] [neuros] {message['text']}"])
         elif kind == "ended":
+            self._figures.end(message["reports"], message["running_s"])
+            self._show()
             self.phase = {
                 "phase": "ended",
                 "is_paused": False,

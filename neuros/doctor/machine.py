@@ -1,8 +1,7 @@
-"""What runs need of the machine itself: Python, packages, memory, a domain, screens, GPUs."""
+"""What runs need of the machine itself: Python, packages, memory, a domain, screens, OpenGL."""
 
 from __future__ import annotations
 
-import ctypes.util
 import os
 import platform
 import shutil
@@ -10,11 +9,12 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.doctor.findings import Finding, absent, bad, good
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.installation.machine import Machine, system_install
+from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
 from neuros.launch.domain import choose_domain
 from neuros.launch.placement import usable_cores
 
@@ -27,6 +27,7 @@ _EXTRAS = (
     ("Matplotlib", "matplotlib", "./install.py --extras plot"),
 )
 _GPU_TIMEOUT_S = 10.0
+_RENDERING_TIMEOUT_S = 60.0
 
 
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
@@ -39,7 +40,6 @@ def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     yield _shared_memory(SHARED_MEMORY)
     yield _domain(environ)
     yield _display(environ)
-    yield _cameras()
     yield _gpu()
 
 
@@ -90,12 +90,28 @@ def _display(environ: Mapping[str, str]) -> Finding:
     return absent("display", "none; figures go to files, and viewers do not open")
 
 
-def _cameras() -> Finding:
-    found = [name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)]
-    if found:
-        return good("cameras", f"simulated cameras can draw with {' and '.join(found)}")
-    remedy = system_install(apt="libegl1 libgl1-mesa-dri libosmesa6", dnf="mesa-libEGL")
-    return absent("cameras", "simulated cameras cannot draw without a graphics library", remedy)
+def prove_rendering(environ: Mapping[str, str]) -> Finding:
+    """Render one picture with the OpenGL that simulated cameras would use."""
+    subject = "cameras"
+    if find_spec("mujoco") is None:
+        return absent(subject, "not tried without MuJoCo")
+    command = [sys.executable, "-m", "neuros.simulators.mujoco.frame"]
+    try:
+        done = subprocess.run(
+            command,
+            env=dict(environ),
+            capture_output=True,
+            text=True,
+            timeout=_RENDERING_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return bad(subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl())
+    if done.returncode == 0:
+        return good(subject, f"a picture was rendered with {done.stdout.strip()}")
+    rows = done.stderr.strip().splitlines() or [f"rendering ends with {done.returncode}"]
+    is_expected = bool(environ.get("MUJOCO_GL") or offscreen_opengl())
+    return (bad if is_expected else absent)(subject, rows[-1])
 
 
 def _gpu() -> Finding:

@@ -8,7 +8,6 @@ command that mends it.
 from __future__ import annotations
 
 import argparse
-import ctypes.util
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.containers import build_containers, build_messages
 from neuros.installation.documentation import build_documentation
 from neuros.installation.environment import Environment, extras_of
-from neuros.installation.machine import Machine, system_install
+from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
 from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
 
@@ -39,6 +38,8 @@ def main(arguments: Sequence[str], root: str) -> int:
         environment = Environment(folder, options.extras, progress, pip_settings(options))
         if not (options.yes or environment.is_installed or _agrees(environment.folder)):
             return 130
+        if options.test:
+            prepare_tests(folder)
         environment.install()
         if code := build_messages(environment.python, folder):
             progress.fail("install.py: NeuROS is installed, but not all message packages are built")
@@ -88,7 +89,11 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
     parser.add_argument(
         "--docs", action="store_true", help="install what builds the documentation, and build it"
     )
-    parser.add_argument("--test", action="store_true", help="then run all checks and tests")
+    parser.add_argument(
+        "--test",
+        action="store_true",
+        help="then run all checks and tests, for which root installs packages of Debian",
+    )
     _add_container_options(parser)
     options = parser.parse_args(arguments)
     extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
@@ -138,6 +143,11 @@ def _add_container_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def prepare_tests(root: Path) -> None:
+    """Install what the tests need of the operating system; who is not root, reads what it is."""
+    subprocess.call([sys.executable, str(root / "tests" / "needs.py"), "--install"])
+
+
 def _agrees(folder: Path) -> bool:
     """Ask once, where there is somebody to answer."""
     if sys.stdin is None or not sys.stdin.isatty():
@@ -148,9 +158,8 @@ def _agrees(folder: Path) -> bool:
 
 def _next_steps(root: Path, extras: Sequence[str]) -> list[str]:
     rows = []
-    if not any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa")):
-        remedy = system_install(apt="libegl1 libgl1-mesa-dri libosmesa6", dnf="mesa-libEGL")
-        rows.append(f"simulated cameras need a graphics library: {remedy}")
+    if not offscreen_opengl():
+        rows.append(f"simulated cameras need a graphics library: {install_opengl()}")
     example = "4_neurorobotics/whiskeye" if "nest" in extras else "3_physics_simulation/elevator"
     is_here = Path.cwd() == root
     launch = "./launch.py examples" if is_here else f"{root / 'launch.py'} {root / 'examples'}"

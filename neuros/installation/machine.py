@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import re
@@ -13,6 +14,15 @@ from dataclasses import dataclass
 from neuros.errors import EnvironmentFault
 
 OLDEST, NEWEST, NEWEST_FOR_NEST = (3, 10), (3, 14), (3, 13)
+
+OPENGL_PACKAGES = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libgles2 libosmesa6"
+"""What Debian and Ubuntu render simulated cameras with, without a display."""
+_FEDORA_OPENGL = "mesa-libEGL mesa-libGL mesa-dri-drivers libglvnd-gles"
+_OPENGL = {
+    # libEGL makes contexts; what draws in them is another library, one of three.
+    "egl": (("libEGL.so.1",), ("libOpenGL.so.0", "libGL.so.1", "libGLESv2.so.2")),
+    "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),),
+}
 
 _DOCKER = 'docker run --rm -it --platform linux/amd64 -v "$PWD":/neuros -w /neuros python:3.12 bash'
 
@@ -76,7 +86,7 @@ def explain_missing_library(text: str) -> str:
     if not missing:
         return text
     remedy = system_install(
-        apt="libgl1 libegl1 libgomp1 libstdc++6", dnf="libglvnd-glx libglvnd-egl libgomp libstdc++"
+        apt=f"{OPENGL_PACKAGES} libgomp1 libstdc++6", dnf=f"{_FEDORA_OPENGL} libgomp libstdc++"
     )
     return f"{text}; {missing.group(1)} belongs to the operating system: {remedy}"
 
@@ -89,6 +99,27 @@ def system_install(*, apt: str, dnf: str) -> str:
     if shutil.which("dnf"):
         return f"{sudo}dnf install -y {dnf}"
     return f"install what Debian calls {apt}"
+
+
+def offscreen_opengl() -> str:
+    """The OpenGL for cameras without a display: ``"egl"``, else ``"osmesa"``, else ``""``."""
+    for backend, needed in _OPENGL.items():
+        if all(any(map(_has_library, names)) for names in needed):
+            return backend
+    return ""
+
+
+def install_opengl() -> str:
+    """The command that installs what :func:`offscreen_opengl` looks for."""
+    return system_install(apt=OPENGL_PACKAGES, dnf=_FEDORA_OPENGL)
+
+
+def _has_library(name: str) -> bool:
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
 
 
 def other_python() -> str:

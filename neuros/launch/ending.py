@@ -9,10 +9,13 @@ import signal
 import time
 
 from neuros.launch.channels import Channels
+from neuros.launch.declarations import Declarations
 from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Output, Phase
 from neuros.launch.probing import Probing, Verdict
 from neuros.launch.processes import Processes, names_of
 from neuros.launch.sides import Sides
+from neuros.launch.watch import Watch, with_stack
+from neuros.ports import RunningNode
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
@@ -32,6 +35,8 @@ class Ending:
         self,
         channels: Channels,
         processes: Processes,
+        watch: Watch,
+        declarations: Declarations,
         probing: Probing,
         sides: Sides,
         outcome: Outcome,
@@ -42,6 +47,8 @@ class Ending:
         self._deadline_s = 0.0
         self._channels = channels
         self._processes = processes
+        self._watch = watch
+        self._declarations = declarations
         self._probing = probing
         self._sides = sides
         self._outcome = outcome
@@ -53,8 +60,11 @@ class Ending:
         """Whether something outlasts even SIGKILL; the guardian will try on for a while."""
         return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
 
-    def drain(self, reason: str, drain_s: float) -> None:
-        """Let packets under way arrive, and then end; only a run that is not ending already."""
+    def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
+        """Let packets under way arrive, and then end; only a run that is not ending already.
+
+        ``stopped`` is the node that asks for it, and starts no further hook.
+        """
         if self.phase is not Phase.RUNNING:
             return
         self.phase = Phase.DRAINING
@@ -68,7 +78,7 @@ class Ending:
         for process in self._processes.not_loaded():
             self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
             self._processes.kill(process)
-        self._channels.send("drain")
+        self._channels.send("drain", last_round=self._declarations.last_round(stopped))
         self._probing.drain(self._processes.killed, now_s)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
@@ -88,6 +98,7 @@ class Ending:
                 self._outcome.is_signalled = True
             elif self.phase is Phase.STOPPING and self._outcome.is_signalled:
                 self._output.log("WARN", f"{name} again: killing what is left")
+                self._outcome.end_by_force(EXIT_CODES[number], name)
                 self._kill_all()
             elif self.phase is Phase.STOPPING:
                 self._outcome.is_signalled = True
@@ -117,20 +128,35 @@ class Ending:
                 self._stop()
             elif now_s >= self._deadline_s:
                 why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
-                self._output.log("WARN", f"not drained in time, so packets may be lost: {why}")
+                self._output.log("WARN", f"not drained in time: {why}")
+                self._outcome.late_drain = why
                 self._stop()
 
     def _look_at_stopping(self, now_s: float) -> None:
         if now_s >= self._deadline_s:
             for process in self._processes:
-                self._output.log(
-                    "WARN", f"{names_of(process)}: not ended after {STOP_S:g} s, killed"
-                )
+                self._fail_to_end(process)
             self._kill_all()
         elif self._sides.exist and self._processes.have_reported():
             may_go = self._sides.finish(self._outcome.reports, now_s)
             if may_go or self._deadline_s - now_s < _CLOSING_S:
                 self._channels.send("leave")
+
+    def _fail_to_end(self, process: RunningNode) -> None:
+        """Its nodes have had their time."""
+        nodes = "node" if len(process.names) == 1 else "nodes"
+        unfinished = []
+        for name in process.names:
+            if self._outcome.has_final_report(name):
+                continue
+            hook = self._watch.executing(name)
+            if hook and not self._declarations.is_finalising(name):
+                unfinished.append(f"'{name}' was still executing '{hook}'")
+            unfinished += self._declarations.unfinished(name)
+        why = "; ".join(unfinished) or "its process did not end"
+        self._outcome.fail(
+            f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
+        )
 
     def _stop_with(self, exit_code: int, reason: str) -> None:
         self._outcome.exit_code, self._outcome.reason = exit_code, reason
@@ -150,4 +176,9 @@ class Ending:
         self.phase = Phase.KILLED
         self._deadline_s = time.monotonic() + STOP_S
         for process in self._processes:
+            for name in process.names:
+                if stack := self._watch.stack_of(name):
+                    self._outcome.stacks[name] = stack.text
+                    text = f"{name} was at this point when it was killed"
+                    self._output.log("ERROR", with_stack(text, stack))
             self._processes.kill(process)

@@ -11,7 +11,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from neuros.launch.run_processes import RunProcesses
 
@@ -93,7 +93,7 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
         processes = RunProcesses(run_id)
         for pid in orders.sessions:
             processes.add_session(pid)
-    _end_all(processes, orders.grace_s)
+    _end_all(processes, orders.grace_s, lambda: _resume_containers(run_id, orders))
     _remove_containers(run_id, orders)
 
     from pathlib import Path
@@ -110,16 +110,33 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
     remove_dead_runs()
 
 
-def _end_all(processes: RunProcesses, grace_s: float) -> None:
+def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]) -> None:
+    """Wait for all processes, and kill those that are left after the grace period.
+
+    What is paused is resumed: at once, so that it can end by itself, and when it was killed.
+    """
     now = time.monotonic()
     kill_at, give_up_at = now + grace_s, now + grace_s + KILL_DEADLINE_S
     pause_s = _POLL_S / 5
+    if processes.alive():
+        resume()
+    has_killed = False
     while (alive := processes.alive()) and time.monotonic() < give_up_at:
         if time.monotonic() >= kill_at:
             _kill(alive)
             pause_s = _POLL_S / 5
+            if not has_killed:
+                has_killed = True
+                resume()
         time.sleep(max(0.001, min(pause_s, abs(kill_at - time.monotonic()))))
         pause_s = min(_POLL_S, pause_s * 2)
+
+
+def _resume_containers(run_id: str, orders: Orders) -> None:
+    for engine in orders.engines:
+        from neuros.launch.leftover_containers import resume_containers
+
+        resume_containers(engine, run_id)
 
 
 def _remove_containers(run_id: str, orders: Orders) -> None:

@@ -1,4 +1,4 @@
-"""Removes the containers of a run whose launcher could not: it was killed, or is about to end.
+"""Resumes and removes containers of a run whose launcher could not: it was killed, or is ending.
 
 Speaks the engine's HTTP itself, since the guardian runs this: standard library only.
 """
@@ -19,6 +19,7 @@ RUN_LABEL = "neuros.run"
 
 _API = "/v1.41"
 _TIMEOUT_S = 5.0
+_RESUME_TIMEOUT_S = 1.0
 _POLL_S = 0.05
 
 
@@ -52,14 +53,29 @@ def remove_containers(engine_socket: str, run_id: str, *, settle_s: float, give_
     return len(left)
 
 
-def _containers(engine_socket: str, run_id: str) -> Sequence[str]:
-    filters = urllib.parse.quote(json.dumps({"label": [f"{RUN_LABEL}={run_id}"]}))
-    found = json.loads(_request(engine_socket, "GET", f"/containers/json?all=1&filters={filters}"))
+def resume_containers(engine_socket: str, run_id: str) -> None:
+    """Resume the paused containers of a run.
+
+    A paused process (``docker pause``) cannot end, and with control groups of version 1 no signal
+    reaches it, not even SIGKILL. An engine that does not answer soon is left alone.
+    """
+    with contextlib.suppress(OSError, http.client.HTTPException, ValueError):
+        for container in _containers(engine_socket, run_id, _RESUME_TIMEOUT_S, status=["paused"]):
+            path = f"/containers/{container}/unpause"
+            _request(engine_socket, "POST", path, _RESUME_TIMEOUT_S)
+
+
+def _containers(
+    engine_socket: str, run_id: str, timeout_s: float = _TIMEOUT_S, **filters: list[str]
+) -> Sequence[str]:
+    wanted = urllib.parse.quote(json.dumps({"label": [f"{RUN_LABEL}={run_id}"], **filters}))
+    path = f"/containers/json?all=1&filters={wanted}"
+    found = json.loads(_request(engine_socket, "GET", path, timeout_s))
     return [container["Id"] for container in found]
 
 
-def _request(engine_socket: str, method: str, path: str) -> bytes:
-    with contextlib.closing(_Connection(engine_socket)) as connection:
+def _request(engine_socket: str, method: str, path: str, timeout_s: float = _TIMEOUT_S) -> bytes:
+    with contextlib.closing(_Connection(engine_socket, timeout_s)) as connection:
         connection.request(method, _API + path)
         return connection.getresponse().read()
 
@@ -67,13 +83,13 @@ def _request(engine_socket: str, method: str, path: str) -> bytes:
 class _Connection(http.client.HTTPConnection):
     """HTTP over a Unix socket."""
 
-    def __init__(self, path: str) -> None:
-        super().__init__("localhost", timeout=_TIMEOUT_S)
+    def __init__(self, path: str, timeout_s: float) -> None:
+        super().__init__("localhost", timeout=timeout_s)
         self._path = path
 
     def connect(self) -> None:
         connected: Any = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        connected.settimeout(_TIMEOUT_S)
+        connected.settimeout(self.timeout)
         try:
             connected.connect(self._path)
         except OSError:

@@ -119,7 +119,13 @@ class Onlookers:
 
     def part(self, outcome: Outcome) -> None:
         """Tell them how it has ended."""
-        self.tell("ended", exit_code=outcome.exit_code, reason=outcome.reason)
+        self.tell(
+            "ended",
+            exit_code=outcome.exit_code,
+            reason=outcome.reason,
+            reports=outcome.reports,
+            running_s=outcome.running_s,
+        )
 
     def _on_watch(self, lines: Lines, _: Mapping[str, Any]) -> None:
         self._count += 1

@@ -52,6 +52,8 @@ class Outcome:
             run that is stopped while it stands still has ended when that pause began.
         paused_s: how long it has stood still since the first hook.
         is_paused: whether it stands still now.
+        stacks: where nodes that were killed stood in their plugins, by name.
+        late_drain: why it was not drained in time, empty if it was.
         ended_s: when all processes had ended.
         is_signalled: whether the user has asked for the end by a signal, be it after another cause.
         faults: what could not be recorded, though the run went on.
@@ -66,12 +68,34 @@ class Outcome:
     elsewhere: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     started_s: float | None = None
     ending_s: float | None = None
+    stacks: dict[str, str] = field(default_factory=dict)
+    late_drain: str = ""
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     is_signalled: bool = False
     paused_s: float = 0.0
     is_paused: bool = False
+
+    @property
+    def running_s(self) -> float | None:
+        """Wall time in which all nodes ran: without initialisation, pauses, draining and the end.
+
+        It counts from when every node had initialised, or, if that was not before the end, from
+        when the node that owns simulated time had.
+        """
+        since = {
+            name: report["running_since_s"]
+            for name, report in self.reports.items()
+            if report.get("running_since_s") is not None
+        }
+        if self.ending_s is None:
+            return None
+        owners = [since[name] for name in since if self.reports[name].get("sim_time") is not None]
+        start_s = max(since.values(), default=self.ending_s)
+        if start_s >= self.ending_s or len(since) < len(self.reports):
+            start_s = max(owners, default=self.ending_s)
+        return max(0.0, float(self.ending_s - start_s))
 
     def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
@@ -90,6 +114,12 @@ class Outcome:
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
         return bool(self.reports.get(name, {}).get("is_final"))
+
+    def end_by_force(self, exit_code: int, name: str) -> None:
+        """The user has had killed what was left of a run, by a signal of this name."""
+        if self.exit_code == 0:
+            self.exit_code = exit_code
+            self.reason = f"killed by {name} before its nodes had ended: {self.reason}"
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """Note a failure; the first one decides, unless the user had ended the run before."""

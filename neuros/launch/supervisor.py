@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines
+from neuros.launch.backlog import Backlog
 from neuros.launch.channels import Channels
+from neuros.launch.declarations import Declarations
 from neuros.launch.ending import STOP_S, Ending
 from neuros.launch.onlookers import Onlookers, Overheard, Pause
 from neuros.launch.outcome import Outcome, Output, Phase
@@ -25,6 +27,7 @@ from neuros.launch.sides import Sides
 from neuros.launch.watch import Watch
 from neuros.ports import Launcher
 from neuros.project.model import NodeFile
+from neuros.stacks import remove_stack_files
 
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
@@ -71,6 +74,7 @@ class Supervisor:
         waker: socket.socket | None = None,
     ) -> None:
         self._files = files
+        self._run_folder = run_folder
         self._launcher = launcher
         self._environment = environment
         self._output = output = Overheard(output, lambda *a, **k: self.onlookers.tell(*a, **k))
@@ -83,18 +87,23 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
-        self._watch = Watch(names, time.monotonic())
+        self._watch = Watch(names, time.monotonic(), run_folder)
         self._processes = Processes(self._watch, self.outcome)
         self._sides.speak_through(lambda text: self._channels.send("say", text=text))
+        connections = connections_among(files)
+        self._backlog = Backlog(connections)
         self._probing = Probing(
             names,
-            connections_among(files),
+            connections,
             self._channels.send,
             self._sides if self._sides.exist else None,
         )
+        self._declarations = Declarations(files)
         self._ending = Ending(
             self._channels,
             self._processes,
+            self._watch,
+            self._declarations,
             self._probing,
             self._sides,
             self.outcome,
@@ -111,6 +120,10 @@ class Supervisor:
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
             "report": self._on_report,
+            "hooks": lambda _, message: self._declarations.take(message),
+            "finalising": lambda _, message: self._declarations.note_finalising(
+                message["node"], message["hook"]
+            ),
             "first_hook": self._on_first_hook,
             "shutdown": self._on_shutdown,
             "failed": self._on_failed,
@@ -141,6 +154,7 @@ class Supervisor:
             self._hear()
             self.onlookers.part(self.outcome)
             self._channels.close()
+            remove_stack_files([self._run_folder / file.node.name for file in self._files])
             self.outcome.elsewhere = self._sides.books()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
@@ -167,6 +181,7 @@ class Supervisor:
         name, now_s = message["node"], time.monotonic()
         self.outcome.take(name, message, now_s)
         self._watch.report(name, message, now_s)
+        self._backlog.report(message, now_s)
         self._probing.take(name, message)
 
     def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
@@ -177,7 +192,9 @@ class Supervisor:
     def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
         reason = f": {message['reason']}" if message["reason"] else ""
         self._ending.drain(
-            f"{message['node']} ended the project{reason}", float(message["drain_s"])
+            f"{message['node']} ended the project{reason}",
+            float(message["drain_s"]),
+            stopped=message["node"],
         )
 
     def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
@@ -230,6 +247,11 @@ class Supervisor:
         self._ending.heed_sides()
         self._ending.look(now_s)
         self._keep_pause()
+        for severity, text in self._watch.remarks_on_hooks():
+            self._output.log(severity, text)
+        if self._ending.phase in (Phase.RUNNING, Phase.DRAINING):
+            for severity, text in self._watch.remarks_on_silence(now_s, self._processes.killed):
+                self._output.log(severity, text)
         self.onlookers.look_at(self._ending.phase)
         if self._ending.phase is Phase.RUNNING:
             self._look_at_run(now_s)
@@ -249,13 +271,15 @@ class Supervisor:
             return
         if self.pause.is_on:
             self._watch.begin_anew(now_s)
+            self._backlog.begin_anew()
             return
         end_s = self._end_s
         if end_s is not None and now_s >= end_s:
             self._ending.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
-        for severity, text in (*self._watch.remarks(now_s), *self._sides.remarks(now_s)):
-            self._output.log(severity, text)
+        for source in (self._watch, self._backlog, self._sides):
+            for severity, text in source.remarks(now_s):
+                self._output.log(severity, text)
         if self._watch.has_just_stalled(now_s):
             self._channels.send("explain")
         if self._sides.exist or not self._watch.is_complete:  # then not all can be asked

@@ -5,11 +5,14 @@ Reports come once per second, so what is said here is up to a second late.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from neuros.stacks import LONG_S, Stack, held_stack
+
 STALL_S = 5.0
-"""After this long, nodes are asked why nothing moves, and a hook that still runs is named."""
+"""After this long, nodes are asked why nothing moves."""
 
 _FIRST_REMARK_S = 5.0
 _NEXT_REMARK_S = 10.0
@@ -21,10 +24,13 @@ class Watch:
     Args:
         names: the nodes.
         now_s: the time now; all times are seconds on one monotonic clock.
+        run_folder: that of the run, with a folder for each node.
     """
 
-    def __init__(self, names: Sequence[str], now_s: float) -> None:
+    def __init__(self, names: Sequence[str], now_s: float, run_folder: Path) -> None:
         self._names = tuple(names)
+        self._run_folder = run_folder
+        self._hosts: dict[str, str] = {}  # by node, the first node of its process
         self._silent = set(names)
         self._reports: dict[str, Mapping[str, Any]] = {}
         self._heard_s: dict[str, float] = {}
@@ -33,17 +39,23 @@ class Watch:
         self._has_explained = False
         self._named_hooks: set[tuple[str, str, int]] = set()
         self._named_as_mute: set[str] = set()
+        self._named_as_held: set[str] = set()
         self._next_remark_s = now_s + _FIRST_REMARK_S
 
     def greet(self, names: Sequence[str]) -> None:
         """These nodes' process is there."""
         self._silent.difference_update(names)
+        self._hosts.update(dict.fromkeys(names, names[0]))
 
     def report(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
         """Take a report."""
         self._reports[name] = report
         self._heard_s[name] = now_s
         self._named_as_mute.discard(name)
+        if name in self._named_as_held:
+            self._named_as_held.remove(name)
+            if hook := self._executing(name):
+                self._named_hooks.add((name, hook["name"], hook["executions"]))
         ledger = report["ledger"]
         moved = ledger and (
             [hook["executions"] for hook in ledger["hooks"].values()],
@@ -98,8 +110,6 @@ class Watch:
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """What to tell the user now, as ``(severity, text)``."""
-        yield from self._remarks_on_hooks()
-        yield from self._remarks_on_silence(now_s)
         if now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             if self._silent:
@@ -110,29 +120,69 @@ class Watch:
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
 
-    def last_seen(self, name: str) -> str:
-        """What a node was doing when it reported last: ``", last seen executing 'step'"``."""
-        hook = self._executing(name) if name in self._reports else None
-        return f", last seen executing '{hook['name']}'" if hook else ""
-
-    def _remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
+    def remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
+        """Hooks that run for long, each once, with their stacks."""
         for name in self._reports:
             hook = self._executing(name)
-            if hook and hook["for_s"] >= STALL_S:
+            if hook and hook["for_s"] >= LONG_S:
                 key = (name, hook["name"], hook["executions"])
                 if key not in self._named_hooks:
                     self._named_hooks.add(key)
-                    yield "WARN", f"{name} has been executing '{hook['name']}' for {STALL_S:g} s"
+                    text = f"{name} has been executing '{hook['name']}' for {LONG_S:g} s"
+                    yield "WARN", with_stack(text, self.stack_of(name))
 
-    def _remarks_on_silence(self, now_s: float) -> Iterator[tuple[str, str]]:
+    def remarks_on_silence(
+        self, now_s: float, without: Collection[str] = ()
+    ) -> Iterator[tuple[str, str]]:
+        """Nodes that do not report, each once, and where they stand; not those that were killed."""
         for name, heard_s in self._heard_s.items():
-            if now_s - heard_s >= STALL_S and name not in self._named_as_mute:
-                self._named_as_mute.add(name)
+            if now_s - heard_s < LONG_S or name in self._named_as_mute or name in without:
+                continue
+            self._named_as_mute.add(name)
+            held = held_stack(self._run_folder / self._hosts.get(name, name))
+            if held is None:
                 yield (
                     "WARN",
-                    f"{name} has not reported for {STALL_S:g} s{self.last_seen(name)}: its process"
+                    f"{name} has not reported for {LONG_S:g} s{self.last_seen(name)}: its process"
                     " is stopped, or a library holds Python's global lock",
                 )
+            elif held.node == name and not self._is_named(name):
+                self._named_as_held.add(name)
+                text = (
+                    f"{name} has been executing '{held.hook}' for {LONG_S:g} s, and cannot report:"
+                    " a library holds Python's global lock"
+                )
+                yield "WARN", with_stack(text, held)
+
+    def stack_of(self, name: str) -> Stack | None:
+        """Where a node stands in its plugin, as far as is known."""
+        if held := self._held(name):
+            return held
+        stack = self._reports.get(name, {}).get("stack")
+        return Stack(*stack) if stack else None
+
+    def executing(self, name: str) -> str:
+        """The hook that a node executes, as far as is known; empty if there is none."""
+        hook = self._executing(name) if name in self._reports else None
+        if hook is not None:
+            return str(hook["name"])
+        held = self._held(name)
+        return held.hook if held else ""
+
+    def last_seen(self, name: str) -> str:
+        """What a node was doing when it reported last: ``", last seen executing 'step'"``."""
+        hook = self.executing(name)
+        return f", last seen executing '{hook}'" if hook else ""
+
+    def _held(self, name: str) -> Stack | None:
+        """Where a node stands that holds Python's global lock."""
+        held = held_stack(self._run_folder / self._hosts.get(name, name))
+        return held if held is not None and held.node == name else None
+
+    def _is_named(self, name: str) -> bool:
+        """Whether the hook that a node was executing when it reported last has been named."""
+        hook = self._executing(name)
+        return hook is not None and (name, hook["name"], hook["executions"]) in self._named_hooks
 
     def _waiting(self) -> list[str]:
         """Connections whose other end has not been found yet."""
@@ -141,3 +191,8 @@ class Watch:
     def _executing(self, name: str) -> Mapping[str, Any] | None:
         ledger = self._reports[name]["ledger"]
         return ledger["executing"] if ledger else None
+
+
+def with_stack(text: str, stack: Stack | None) -> str:
+    """A sentence, and where the plugin stands, below it."""
+    return f"{text}:\n{stack.text}" if stack else text

@@ -1,4 +1,4 @@
-"""Whether a run has kept its project's budgets."""
+"""Whether a run has kept what it promises: lossless connections, and its project's budgets."""
 
 from __future__ import annotations
 
@@ -8,13 +8,38 @@ from typing import Any
 from neuros.project.model import Budgets
 
 
+def losses(record: Mapping[str, Any]) -> list[str]:
+    """A sentence for each lossless connection that lost packets, or may have, from ``run.json``."""
+    found = []
+    for connection in record["connections"]:
+        lost, sent, received = (connection[key] for key in ("lost", "sent", "received"))
+        if connection["discard_limit"] != 0 or lost == 0 or not _has_begun(connection, record):
+            continue
+        name = connection["connection"]
+        if lost is not None:
+            packets = "packet" if lost == 1 else "packets"
+            found.append(f"{name} lost {lost} {packets}, though it is lossless (discard_limit 0)")
+        else:
+            found.append(f"{name} is lossless (discard_limit 0), but {_unknown(sent, received)}")
+    return found
+
+
+def _unknown(sent: int | None, received: int | None) -> str:
+    """What is not known where the count of lost packets is not."""
+    if sent is None:
+        return "how many packets were sent is not known"
+    if received is None:
+        return f"how many of {sent} packets arrived is not known"
+    return "how many packets it lost is not known: a node had not reported its last"
+
+
 def broken_budgets(
     record: Mapping[str, Any], budgets: Budgets, *, is_partial: bool = False
 ) -> list[str]:
     """A sentence for each budget that a run has broken, from its ``run.json``.
 
-    What nobody reported breaks none: a node that was killed (the run has failed anyway), or those
-    that run elsewhere (``is_partial``).
+    A figure that is not known breaks its budget, except where another part of the project has it
+    (``is_partial``).
     """
     return [
         *_losses(record, budgets.lost_packets),
@@ -26,20 +51,29 @@ def broken_budgets(
 def _losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[str]:
     for connection in record["connections"]:
         limit = limits.get(connection["connection"])
-        lost, discarded = connection["lost"], connection["discarded"]
-        if limit is None or lost is None or discarded is None or lost + discarded <= limit:
+        if limit is None or not _has_begun(connection, record):
             continue
-        yield (
-            f"{connection['connection']} lost {lost + discarded} packets ({lost} on their way,"
-            f" {discarded} discarded), allowed are {limit}"
-        )
+        name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
+        if lost is None or discarded is None:
+            yield f"how many packets {name} lost is not known, allowed are {limit}"
+        elif lost + discarded > limit:
+            yield (
+                f"{name} lost {lost + discarded} packets ({lost} on their way,"
+                f" {discarded} discarded), allowed are {limit}"
+            )
 
 
 def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) -> Iterator[str]:
     factor = record["real_time_factor"]
     if least is None:
         return
-    if factor is not None and factor < least:
+    owners = [n for n, node in record["nodes"].items() if node.get("sim_time") is not None]
+    if not all(_is_known(record["nodes"][name]) for name in owners):
+        yield (
+            f"the real-time factor must be at least {least:g}, and is not known:"
+            f" {' and '.join(owners)} had not reported the last"
+        )
+    elif factor is not None and factor < least:
         yield f"the real-time factor was {factor:.3g}, and must be at least {least:g}"
     elif factor is None and not is_partial:
         yield (
@@ -52,6 +86,12 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
     if limit_ms is None:
         return
     for node, books in record["nodes"].items():
+        if _has_ticks(books) and not _is_known(books):
+            yield (
+                f"how far ticks of {node} were off their period is not known, allowed are"
+                f" {limit_ms:g} ms"
+            )
+            continue
         for hook, figures in (books.get("hooks") or {}).items():
             ticks = figures.get("ticks")
             if ticks and ticks["largest_error_ms"] > limit_ms:
@@ -59,3 +99,21 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
                     f"a tick of '{hook}' of {node} was off its period by"
                     f" {ticks['largest_error_ms']:.3g} ms, allowed are {limit_ms:g} ms"
                 )
+
+
+def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool:
+    """Whether a packet may have been sent: not before the nodes at both ends had been loaded."""
+    ends = (end.partition(".")[0] for end in connection["connection"].split(" -> "))
+    here = [record["nodes"][node] for node in ends if node in record["nodes"]]
+    if len(here) < 2 and not (connection["sent"] or connection["received"]):
+        return False  # the node elsewhere never came, as far as is known here
+    return all(node["report"] is not None for node in here)
+
+
+def _is_known(node: Mapping[str, Any]) -> bool:
+    """Whether the figures of a node are those of its end."""
+    return bool(node.get("report") == "final")
+
+
+def _has_ticks(node: Mapping[str, Any]) -> bool:
+    return any(figures.get("ticks") for figures in (node.get("hooks") or {}).values())

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 
 from neuros.observe.packets import Numbers, Packets, read_packets
 from neuros.observe.past_run import PastRun
+from neuros.project.model import Connection
 
-MessageOf: TypeAlias = Callable[[Path, str, int], Any]
-"""From a run folder, a connection and a place (from 1) to the packet; ``None`` if unrecorded."""
+
+class Recordings(Protocol):
+    """What runs have recorded (:class:`neuros.observe.recorded.Recorded`)."""
+
+    def message(self, run: Path, connection: str, number: int) -> Any: ...
+    def digests(self, run: Path, connection: str) -> Numbers | None: ...
+    def are_as_of_nodes(self, run: Path, connection: str) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -43,11 +49,11 @@ class _Difference:
     packet: tuple[str, int] | None = None
 
 
-def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
+def compare(a: PastRun, b: PastRun, recorded: Recordings) -> Verdict:
     """Compare what was sent on every connection, and what hooks took on those that lose nothing.
 
-    Of connections that may lose packets it depends on the moment which ones hooks get: that is
-    told as a remark.
+    Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
+    that may lose packets it depends on the moment which ones hooks get: that is told as a remark.
     """
     found: list[_Difference] = []
     remarks: list[str] = []
@@ -58,7 +64,7 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
             only = "A" if name in a.connections else "B"
             found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
             continue
-        compared += _compare_connection(name, a, b, found, remarks)
+        compared += _compare_connection(name, (a, b), recorded, found, remarks)
     first = min(found, key=lambda difference: difference.at_ns, default=None)
     others = len(found) - 1
     if others > 0:
@@ -66,23 +72,28 @@ def compare(a: PastRun, b: PastRun, message_of: MessageOf) -> Verdict:
         remarks.append(f"{others} more {differ}, later on")
     text = None if first is None else first.text
     if first is not None and first.packet is not None:  # a bag is read for the first one only
-        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, message_of)}"
+        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
     return Verdict(text, tuple(remarks), compared)
 
 
 def _compare_connection(
-    name: str, a: PastRun, b: PastRun, found: list[_Difference], remarks: list[str]
+    name: str,
+    runs: tuple[PastRun, PastRun],
+    recorded: Recordings,
+    found: list[_Difference],
+    remarks: list[str],
 ) -> int:
     """Returns how many packets were found equal."""
-    in_a, in_b = (read_packets(run.folder, run.connection(name)) for run in (a, b))
+    a, b = runs
+    in_a, in_b = _packets(name, runs, recorded)
     sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
     lacking = [_lacks_digests(*each) for each in sent]
     if any(lacking):
-        folders = [run.folder for run, lacks in zip((a, b), lacking, strict=True) if lacks]
+        folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
         remarks.append(
-            f"{name}: not compared, there are no digests of it in"
-            f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process they are"
-            " kept with --digests, and never of packets that a node sends to itself)"
+            f"{name}: not compared, there are neither digests nor a recording of it in"
+            f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process digests are kept with"
+            " --digests, and never of packets that a node sends to itself)"
         )
         return 0
     compared = _first_difference(in_a.sent, in_b.sent)
@@ -106,6 +117,40 @@ def _compare_connection(
     return compared
 
 
+def _packets(
+    name: str, runs: tuple[PastRun, PastRun], recorded: Recordings
+) -> tuple[Packets, Packets]:
+    """The lists of both runs, with digests from their bags where nodes have kept none.
+
+    If one run has digests of its nodes and the other only a bag, both are taken from bags, where
+    both have one; a bag stands beside digests of nodes only where both digest packets alike.
+    """
+    packets = [read_packets(run.folder, run.connection(name)) for run in runs]
+    lacks = [
+        _lacks_digests(run.connections[name]["sent"], listed)
+        for run, listed in zip(runs, packets, strict=True)
+    ]
+    if not any(lacks):
+        return packets[0], packets[1]
+    connection = runs[0].connection(name)
+    bags = [recorded.digests(run.folder, name) for run in runs]
+    if bags[0] is not None and bags[1] is not None:
+        return _recorded(packets[0], bags[0], connection), _recorded(
+            packets[1], bags[1], connection
+        )
+    for place, run in enumerate(runs):
+        bag = bags[place]
+        if lacks[place] and bag is not None and recorded.are_as_of_nodes(run.folder, name):
+            packets[place] = _recorded(packets[place], bag, connection)
+    return packets[0], packets[1]
+
+
+def _recorded(packets: Packets, digests: Numbers, connection: Connection) -> Packets:
+    """With the digests of what was recorded; on a reliable connection all of that arrives."""
+    received = digests if connection.is_reliable else packets.received
+    return replace(packets, sent=digests, received=received)
+
+
 def _lacks_digests(sent: int | None, packets: Packets) -> bool:
     """Whether packets have passed, or may have, of which nothing is known here."""
     if sent is None:  # by a node of another launcher, or one that never reported
@@ -125,9 +170,9 @@ def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
 
 
-def _field(folders: tuple[Path, Path], name: str, number: int, message_of: MessageOf) -> str:
+def _field(folders: tuple[Path, Path], name: str, number: int, recorded: Recordings) -> str:
     """In which field a packet differs, as far as it was recorded."""
-    messages = [message_of(folder, name, number) for folder in folders]
+    messages = [recorded.message(folder, name, number) for folder in folders]
     if None in messages:
         return "(which field, only --record can tell)"
     field = next(differing_fields(*messages), None)

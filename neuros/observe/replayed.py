@@ -185,4 +185,4 @@ class _Arrivals:
 
 
 def _journal_of(run_folder: Path, name: str) -> Path:
-    return run_folder / name / FOLDER / "journal"
+    return run_folder / name / FOLDER / "event_log"

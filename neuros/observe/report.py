@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from neuros.core.spending import spending_of
 from neuros.observe.load_table import load_table
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
@@ -30,6 +31,10 @@ class Ended(Protocol):
     ending_s: float | None
     ended_s: float
     paused_s: float
+    stacks: dict[str, str]
+
+    @property
+    def running_s(self) -> float | None: ...
 
 
 def run_record(
@@ -41,8 +46,7 @@ def run_record(
 ) -> dict[str, Any]:
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
-    sim_s = max(sim_times, default=None)
-    running_s = _running_s(ended)
+    sim_s, all_ran_s = max(sim_times, default=None), ended.running_s
     ledgers = {**ended.elsewhere, **{n: r["ledger"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -52,18 +56,24 @@ def run_record(
         "reason": ended.reason,
         "wall_s": wall_s,
         "sim_s": sim_s,
-        "running_s": running_s,
+        "running_s": all_ran_s,
         "paused_s": ended.paused_s,
-        "real_time_factor": None if sim_s is None or not running_s else sim_s / running_s,
+        "real_time_factor": None
+        if sim_s is None or not ended.running_s
+        else sim_s / ended.running_s,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, ledgers, running_s, run_folder, _cut_off(ended))
+            _connection(c, ledgers, all_ran_s, run_folder, _cut_off(ended))
             for c in _connections(files)
         ],
         "nodes": {
-            name: {**_node(name, ended), "results": _results(run_folder / name)}
+            name: {
+                **_node(name, ended),
+                "results": _results(run_folder / name),
+                **({"stack": ended.stacks[name]} if name in ended.stacks else {}),
+            }
             for name in (file.node.name for file in files)
         },
         "expanded_project": project_to_json(project),
@@ -82,8 +92,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         colalign=("left", *("right" for _ in _COUNTS)) if record["connections"] else None,
     )
     nodes = tabulate(
-        [[name, *_shares(node)] for name, node in record["nodes"].items()],
-        headers=["node", "busy", "waiting", "blocked", "idle", "remark"],
+        [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()],
+        headers=["node", "executing", "waiting", "blocked", "idle", "remark"],
         missingval="?",
         disable_numparse=True,
         colalign=("left", "right", "right", "right", "right", "left"),
@@ -93,24 +103,10 @@ def run_table(record: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, nodes, *load, _times(record)])
 
 
-def _running_s(ended: Ended) -> float | None:
-    """Wall time in which simulated time went on: not initialisation, pauses, draining and the end.
-
-    It counts from when every node had initialised, or, if that was not before the end, from when
-    the node that owns simulated time had.
-    """
-    since = {
-        name: report["running_since_s"]
-        for name, report in ended.reports.items()
-        if report["running_since_s"] is not None
-    }
-    if ended.ending_s is None:
-        return None
-    owners = [since[n] for n in since if ended.reports[n]["sim_time"] is not None]
-    start_s = max(since.values(), default=ended.ending_s)
-    if start_s >= ended.ending_s or len(since) < len(ended.reports):
-        start_s = max(owners, default=ended.ending_s)
-    return max(0.0, float(ended.ending_s - start_s))
+def consumed_percent(connection: Mapping[str, Any]) -> float | None:
+    """The share of the packets sent on a connection that were consumed, in per cent."""
+    sent, consumed = connection.get("sent"), connection.get("consumed")
+    return 100 * consumed / sent if sent and consumed is not None else None
 
 
 def _connections(files: Sequence[NodeFile]) -> list[Connection]:
@@ -189,21 +185,14 @@ def _results(node_folder: Path) -> dict[str, Any]:
     return results if isinstance(results, dict) else {}
 
 
-def _shares(node: Mapping[str, Any]) -> list[str]:
-    if node["report"] is None:
+def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
+    spent = spending_of(node, running_s)
+    if spent is None:
         return ["?", "?", "?", "?", "never reported"]
-    spent = node["accounting"]
-    running_s = spent["total"] - spent["registering"]
-
-    def share(seconds: float) -> str:
-        return f"{seconds / running_s:.0%}" if running_s > 0 else "-"
-
     remark = "" if node["report"] == "final" else node["report"]
-    return [
-        *(share(sum(spent[kind].values())) for kind in ("executing", "waiting", "blocked")),
-        share(spent["idle"]),
-        remark,
-    ]
+    if not spent.total_s:
+        return ["-", "-", "-", "-", remark]
+    return [*(f"{share:.0%}" for share in spent.shares.values()), remark]
 
 
 def _times(record: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from neuros.project.model import Project
 from neuros.project.outside import names_of
 from neuros.project.overrides import apply_override
 from neuros.project.paths import Roots
+from neuros.project.plugin_checks import plugin_problems, unread_variables
 from neuros.project.renaming import apply_namespace, apply_remaps
 from neuros.project.scanner import SourceError, display_name
 from neuros.project.suggest import did_you_mean
@@ -40,6 +41,7 @@ def load_project(
     packages: MessagePackages = NO_PACKAGES,
     namespace: str | None = None,
     remap: Sequence[str] = (),
+    reads_plugins: bool = False,
 ) -> Loaded:
     """Load and check a project.
 
@@ -52,6 +54,7 @@ def load_project(
         packages: message packages of workspaces.
         namespace: the text of ``--namespace``, in the place of the project's own.
         remap: the texts of ``--remap``; they go before the project's own rules.
+        reads_plugins: whether to look into plugins, too, which are not run.
 
     Raises:
         ProjectError: with every problem there is.
@@ -71,20 +74,31 @@ def load_project(
     names = names_of(draft)
     nodes = tuple(builder.node(element) for element in draft.nodes)
     problems = [*draft.problems, *_judgements(draft), *builder.problems]
+    connections = (
+        ()
+        if problems
+        else tuple(
+            connection(c, index, names.namespace) for index, c in enumerate(draft.connections)
+        )
+    )
+    doubts: list[Problem] = []
+    if reads_plugins:
+        mistakes, doubts = plugin_problems(draft, nodes, None if problems else connections)
+        problems += mistakes
     if problems:
         raise ProjectError(problems)
+    if reads_plugins:
+        doubts += unread_variables(draft, nodes, overrides)
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
-        connections=tuple(
-            connection(c, index, names.namespace) for index, c in enumerate(draft.connections)
-        ),
+        connections=connections,
         file=roots.project / file.name,
         description=draft.root.string("description") or "",
         budgets=budgets_of(draft),
         names=names,
     )
-    return Loaded(project, tuple(remarks(draft)))
+    return Loaded(project, (*remarks(draft), *doubts))
 
 
 def _judgements(draft: Draft) -> list[Problem]:

@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from neuros.control import Lines
@@ -21,7 +21,7 @@ class Controlled(Protocol):
 
     def post(self, event: Callable[[], None]) -> None: ...
     def ask_to_stop(self) -> None: ...
-    def drain(self) -> None: ...
+    def drain(self, last_round: Mapping[str, Sequence[int]]) -> None: ...
     def pause(self) -> None: ...
     def resume(self) -> None: ...
     def step(self, count: int, *, is_driven: bool) -> None: ...
@@ -89,7 +89,8 @@ class ControlThread(threading.Thread):
         if kind == "stop":
             process.ask_to_stop()
         elif kind == "drain":
-            process.post(process.drain)
+            last_round = message["last_round"]
+            process.post(lambda: process.drain(last_round))
         elif kind == "probe":
             number = int(message["number"])
             process.post(lambda: process.probe(number))

@@ -17,7 +17,6 @@ from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import describe, last_line
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
-from neuros.runtime.wrong_fields import wrong_field
 
 
 class NodeEffects:
@@ -101,11 +100,7 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(connections[0].source_output, packet)
-        try:
-            data = self._transport.send(connections, packet)
-        except Exception:
-            self._blame_plugin(connections[0].source_output, packet)
-            raise
+        data = self._transport.send(connections, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
 
@@ -115,11 +110,7 @@ class NodeEffects:
             self._time.hear(packet)
         if self._sampler.requests:
             self._sampler.note(port.name, packet)
-        try:
-            self._transport.send_external(port, packet)
-        except Exception:
-            self._blame_plugin(port.name, packet)
-            raise
+        self._transport.send_external(port, packet)
         if self._keeper is not None:
             self._keeper.keep(Way.SENT, port.name, packet)
 
@@ -138,9 +129,3 @@ class NodeEffects:
         if self._keeper is not None:
             self._keeper.keep(Way.TO_ITSELF, str(connection), packet)
         return self._copy(packet)
-
-    def _blame_plugin(self, output: str, packet: Any) -> None:
-        """Where a packet could not be sent since the plugin has filled it wrongly, say so."""
-        if wrong := wrong_field(packet):
-            where = str(self._handle.description.plugin)
-            raise HookError(f"packet for output '{output}': {wrong}", where=where) from None

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from neuros.errors import NeurosError, NodeError, PluginError
+from neuros.errors import NeurosError, NodeError, PluginError, printable
 from neuros.ports import Logger
 from neuros.runtime.callbacks import callback_error
 from neuros.runtime.plugin import describe, plugin_traceback
@@ -47,9 +47,10 @@ class Failures:
         cause = error.__cause__
         is_shown = isinstance(error, PluginError)  # its text has the traceback already
         if isinstance(error, NodeError) and cause is not None and not is_shown:
-            self._logger.error(f"{error}\n{plugin_traceback(cause, self._plugin)}")
+            text = f"{error}\n{plugin_traceback(cause, self._plugin)}"
         else:
-            self._logger.error(str(error))
+            text = str(error)
+        self._logger.error(printable(text))
 
 
 def as_node_error(error: BaseException, what: str = "") -> NodeError:

@@ -10,9 +10,11 @@ from typing import Any, Protocol
 from neuros.errors import ModelError, NodeError
 from neuros.ports import Logger
 from neuros.project.model import Node, NodeFile
+from neuros.project.suggest import did_you_mean
 from neuros.runtime.results import Results
 
 _POLL_S = 0.05
+_EMPTY = "std_msgs/msg/Empty"
 
 
 class Host(Protocol):
@@ -57,12 +59,18 @@ class NodeHandle:
         """The node as its file declares it."""
         return self._file.node
 
-    def make_packet(self, output: str) -> Any:
+    def make_packet(self, output: str | None = None) -> Any:
         """A new message of the type of an output, with default values.
 
+        Args:
+            output: its name; ``None`` where only one type can be meant: all outputs have it, or
+                it is ``std_msgs/msg/Empty`` and one of them has that.
+
         Raises:
-            NodeError: if the node has no such output.
+            NodeError: if the node has no such output, or several could be meant.
         """
+        if output is None:
+            return self._host.make_packet(self._only_type())
         try:
             type_name = self._types[output]
         except KeyError:
@@ -75,6 +83,30 @@ class NodeHandle:
     def get_ros_node(self) -> Any:
         """The real ``rclpy.node.Node``; what is created on it is served between hooks."""
         return self._ros_node
+
+    def get_topic_list(self) -> list[str]:
+        """The names of all topics on the ROS graph; to look around, while a plugin is written."""
+        return [name for name, _ in self._ros_node.get_topic_names_and_types()]
+
+    def get_topic_info(self, topic: str) -> str:
+        """Its type, and how many publish on it and listen to it, as ``ros2 topic info`` says it.
+
+        Raises:
+            NodeError: if there is no such topic on the ROS graph.
+        """
+        known = dict(self._ros_node.get_topic_names_and_types())
+        name = self._file.names.full(topic, self.name)
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise NodeError(
+                f"get_topic_info: there is no topic '{name}' now{hint and f' ({hint})'}"
+            )
+        types = known[name]
+        return (
+            f"Type: {types[0] if len(types) == 1 else types}\n"
+            f"Publisher count: {self._ros_node.count_publishers(name)}\n"
+            f"Subscription count: {self._ros_node.count_subscribers(name)}"
+        )
 
     def get_logger(self) -> Logger:
         """The logger of the ROS node."""
@@ -145,6 +177,15 @@ class NodeHandle:
         It is for those who watch the run; the end itself is :meth:`shutdown`.
         """
         self._host.expect_end(float(sim_s))
+
+    def _only_type(self) -> str:
+        types = {*self._types.values()}
+        if _EMPTY in types:
+            return _EMPTY  # as the published NeuROS does
+        if len(types) == 1:
+            return types.pop()
+        known = ", ".join(self._types) or "none"
+        raise NodeError(f"make_packet: say for which output of node '{self.name}': {known}")
 
     def _built(self, wanted: str) -> list[Path]:
         """Where ``install/PACKAGE/path`` may be: in the folder of a built message package."""

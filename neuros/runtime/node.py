@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
+from neuros.core.hook import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap, Way
@@ -71,6 +72,7 @@ class NodeRuntime:
         self._middleware = middleware
         self._clock = clock
         self._make_engine = make_engine
+        self._tell = tell
         self._stage = stage
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
         self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
@@ -145,7 +147,7 @@ class NodeRuntime:
         self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
         node = self.file.node
         self.specs = load_plugin(node.plugin, self.name)
-        types = {port.name: self._middleware.message_class(port.type) for port in node.outputs}
+        types = {port.name: self._packet_type(port) for port in node.outputs}
         self.engine = self._host.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
@@ -158,9 +160,12 @@ class NodeRuntime:
             self._middleware.loop.add_timer(lambda: engine.next_due_ns, self.on_timer)
         self._guard(self._loaded.start)
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked; after a pause, the others go on."""
-        self._guard(self._loaded.drain)
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; after a pause, the others go on.
+
+        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        """
+        self._guard(lambda: self._loaded.drain(last_round))
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -185,6 +190,7 @@ class NodeRuntime:
         if self.engine is not None:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
+                    self._tell("finalising", node=self.name, hook=spec.name)
                     self._guard(partial(self._effects.run, spec))
         if self._keeper is not None:
             self._keeper.close()
@@ -233,6 +239,10 @@ class NodeRuntime:
         self._guard(self._loaded.on_timer)
 
     # ------------------------------------------------------------------ inside
+
+    def _packet_type(self, port: Port) -> PacketType:
+        kind = self._middleware.message_class(port.type)
+        return PacketType(kind, self._middleware.checker(kind))
 
     @property
     def _loaded(self) -> Engine:

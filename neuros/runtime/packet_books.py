@@ -14,7 +14,7 @@ taken_ns  when that was
 ``hooks.json``, start and end), ``credits`` the acknowledgements that arrived meanwhile (index of
 the connection, position, time): three 8-byte numbers each.
 
-Where packets are recorded, ``journal`` has what happened to the engine (see
+Where packets are recorded, ``event_log`` has what happened to the engine (see
 :mod:`neuros.core.journal`), so that the node can be replayed.
 
 An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
@@ -35,7 +35,7 @@ from neuros.core.journal import JournalledEngine
 from neuros.project.model import Connection
 
 FOLDER = "packets"
-JOURNAL = "journal"
+JOURNAL = "event_log"
 
 MOST_ENTRIES = 8_000_000
 """Of a file, 64 MB; what comes later is counted and not listed."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeGuard
 
-from neuros.errors import NeurosError, PluginError
+from neuros.errors import NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
+from neuros.runtime.nest2 import nest2_hint
 
 _GONE = {
     "neuros.gazebo": "MuJoCo stands in for Gazebo, and reads its SDF files: use MuJoCo(node, path)"
@@ -57,10 +59,41 @@ def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxErr
 
 
 def describe(error: BaseException) -> str:
-    """An exception in one line: its type, and the first line of its text."""
+    """An exception in one line: its type, the first line of its text, and what helps, if known."""
+    if isinstance(error, NodeError):  # its text is written for the user
+        return str(error).partition("\n")[0]
     lines = "".join(traceback.format_exception_only(type(error), error)).splitlines()
     # A syntax error shows the place first, indented.
-    return next(line for line in lines if line and not line.startswith(" ")).strip()
+    line = next(line for line in lines if line and not line.startswith(" ")).strip()
+    hint = nest2_hint(error, line.partition(": ")[2]) or _hint(error)
+    return f"{line} ({hint})" if hint else line
+
+
+def _hint(error: BaseException) -> str:
+    if isinstance(error, ModuleNotFoundError) and error.name is not None:
+        top = error.name.partition(".")[0]
+        return (
+            f"packages such as {top} go into the requirements.txt of the node's container, modules"
+            " of your own beside the plugin: docs/environments.md"
+        )
+    if isinstance(error, FileNotFoundError) and _is_relative(error.filename):
+        if _innermost_file(error).endswith("/subprocess.py"):
+            return ""  # it is a program, and is looked for on the PATH
+        name, folder = os.fsdecode(error.filename), os.path.realpath("/proc/self/cwd")
+        return (
+            f"relative to the current folder, which is {folder}; a file beside the plugin, or of"
+            f" the project, is node.resolve_path({name!r})"
+        )
+    return ""
+
+
+def _is_relative(name: object) -> TypeGuard[str | bytes]:
+    return isinstance(name, str | bytes) and bool(name) and not os.path.isabs(name)
+
+
+def _innermost_file(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    return frames[-1].filename if frames else ""
 
 
 def last_line(error: BaseException, where: str) -> str:

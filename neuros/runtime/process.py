@@ -15,6 +15,7 @@ from neuros.control import Lines, connect
 from neuros.core.engine import Engine
 from neuros.core.journal import JournalledEngine
 from neuros.errors import NeurosError
+from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
 from neuros.runtime.callbacks import callback_error
@@ -23,6 +24,7 @@ from neuros.runtime.failures import as_node_error
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
+from neuros.stacks import StackFile
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
@@ -63,6 +65,7 @@ class NodeProcess:
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._lines: Lines | None = None
+        self._stack_file: StackFile | None = None
         self._side = SideLink(
             [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
         )
@@ -72,6 +75,9 @@ class NodeProcess:
         run_folder = self._files[0].folders.run
         os.chdir(run_folder)
         self._lines = connect(run_folder)
+        own_folder = run_folder / self._files[0].node.name
+        plugins = {file.node.name: file.node.plugin for file in self._files}
+        self._stack_file = StackFile(own_folder, plugins)
         self._tell("hello", nodes=[file.node.name for file in self._files], pid=os.getpid())
         with signals_as_socket() as signalled:
             thread = ControlThread(self._lines, signalled, self)
@@ -104,10 +110,13 @@ class NodeProcess:
                 return
         self._middleware.loop.post_from_thread(event)
 
-    def drain(self) -> None:
-        """Stop the hooks that send unasked. Loop thread only."""
+    def drain(self, last_round: Mapping[str, Sequence[int]]) -> None:
+        """Stop the hooks that send unasked; ``last_round``, by node, start at most once more.
+
+        Loop thread only.
+        """
         for node in self._nodes:
-            node.drain()
+            node.drain(last_round.get(node.name, ()))
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`. Loop thread only."""
@@ -142,6 +151,8 @@ class NodeProcess:
 
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
+        if self._stack_file is not None:
+            self._stack_file.renew()
         for node in tuple(self._nodes):
             node.reports.write_books()
             self._tell("report", **node.reports.state(), is_final=is_final)
@@ -173,6 +184,7 @@ class NodeProcess:
                 return
             try:
                 node.load()
+                self._tell("hooks", node=node.name, **declared(node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
         if self._is_ending:
@@ -260,6 +272,22 @@ class NodeProcess:
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)
+
+
+def declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
+    """What the supervisor has to know of the hooks of a node."""
+    return {
+        "hooks": [
+            {
+                "kind": spec.kind.value,
+                "inputs": [[port.name, port.is_all, port.is_optional] for port in spec.inputs],
+                "outputs": [port.name for port in spec.outputs],
+            }
+            for spec in specs
+            if spec.kind is not HookKind.FINALISE
+        ],
+        "finalise": [spec.name for spec in specs if spec.kind is HookKind.FINALISE],
+    }
 
 
 def _keep_for_good() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,9 @@ from neuros.runtime.glimpse import glimpse
 from neuros.runtime.packet_books import PacketBooks
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
+from neuros.stacks import LONG_S, Stack, stack_in
+
+_MAIN = threading.main_thread()
 
 
 class NodeReports:
@@ -65,16 +69,28 @@ class NodeReports:
     def state(self) -> dict[str, Any]:
         """State and counters. Any thread."""
         now_ns, engine = self._clock(), self._engine
+        ledger = None if engine is None else snapshot(engine, now_ns)
         return {
             "node": self._file.node.name,
             "has_run": self._effects.has_run,
             "waiting_for": [str(each) for each in self._transport.waiting_for()],
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
-            "ledger": None if engine is None else snapshot(engine, now_ns),
+            "ledger": ledger,
+            "stack": self._stack(ledger),
             "fault": None if self._books is None else self._books.failure,
             "is_driving": engine is not None and engine.is_driving,
         }
+
+    def _stack(self, ledger: Mapping[str, Any] | None) -> Stack | None:
+        """Where the plugin stands, if its hook runs for long, or the node is to end."""
+        engine = self._engine
+        if engine is None or ledger is None or threading.current_thread() is _MAIN:
+            return None
+        executing = ledger["executing"]
+        if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
+            return stack_in(self._file.node.name, self._file.node.plugin)
+        return None
 
     def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> dict[str, Any]:
         """What an onlooker is shown: the node, and what was sampled of its packets. Any thread.

@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import neuros
+from neuros.errors import WrongValue
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.testing.bench import NodeBench
 from neuros.testing.packages import provide_messages, workspaces_of
 from neuros.testing.wiring import ports, with_neighbours, with_observer
 from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.values import checker
 
 _WORKSPACE = Path(neuros.__file__).resolve().parents[1] / "workspace"
 
@@ -205,12 +207,13 @@ class PluginHarness(NodeBench):
 
         Args:
             source: which connection, ``"camera"`` or ``"camera.image"``, where there are several.
+
+        Raises:
+            TypeError, ValueError: if one is of another type, or holds a value that no node may
+                send; none of them is sent then.
         """
         port = self._port(input_name, "input", self._inputs)
-        kind = message_class(port.type)
-        for packet in packets:
-            if not isinstance(packet, kind):
-                raise TypeError(f"input '{input_name}' takes {port.type}, not {packet!r}")
+        packets = tuple(self._checked(port, packet) for packet in packets)
         if port.external_topic is not None:
             for packet in packets:
                 self._loop.post(partial(self._topics.deliver, port, decode(encode(packet))))
@@ -263,6 +266,15 @@ class PluginHarness(NodeBench):
     @property
     def _outputs(self) -> dict[str, Port]:
         return {port.name: port for port in self._file.node.outputs}
+
+    def _checked(self, port: Port, packet: Any) -> Any:
+        kind = message_class(port.type)
+        if not isinstance(packet, kind):
+            raise TypeError(f"input '{port.name}' takes {port.type}, not {packet!r}")
+        try:
+            return checker(kind)(packet)
+        except WrongValue as error:
+            raise ValueError(f"packet for input '{port.name}': {error}") from None
 
     def _port(self, name: str, side: str, known: Mapping[str, Port]) -> Port:
         if name not in known:

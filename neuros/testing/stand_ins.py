@@ -11,11 +11,11 @@ from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.testing.step_loop import StepLoop
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException
+from neuros.transport.values import checker
 
 _LEVELS = {
     "DEBUG": logging.DEBUG,
@@ -75,11 +75,20 @@ _NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class RosNodeStandIn:
-    """What ``node.get_ros_node()`` gives in a test: name, logger and parameters, and no ROS."""
+    """What ``node.get_ros_node()`` gives in a test: name, logger and parameters, and no ROS.
+
+    Args:
+        topics: of the node's own ports, by name: their type, how many publish, how many listen.
+    """
 
     def __init__(
-        self, name: str, records: list[Record], parameters: Mapping[str, Value] = _NOTHING
+        self,
+        name: str,
+        records: list[Record],
+        parameters: Mapping[str, Value] = _NOTHING,
+        topics: Mapping[str, tuple[str, int, int]] = MappingProxyType({}),
     ) -> None:
+        self._topics = topics
         self._name = name
         self._parameters: dict[str, Any] = dict(parameters)
         self._given = {*parameters}
@@ -92,6 +101,18 @@ class RosNodeStandIn:
     def get_logger(self) -> RecordingLogger:
         """The logger whose records are ``harness.log``."""
         return self._logger
+
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """The topics of the node's own ports."""
+        return [(name, [topic[0]]) for name, topic in sorted(self._topics.items())]
+
+    def count_publishers(self, name: str) -> int:
+        """How many publish there: the node, or the test."""
+        return self._topics[name][1]
+
+    def count_subscribers(self, name: str) -> int:
+        """How many listen there."""
+        return self._topics[name][2]
 
     def has_parameter(self, name: str) -> bool:
         """Whether the project, or the plugin, has declared it."""
@@ -158,14 +179,14 @@ class Workbench:
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
         self.loop = loop
         self.topics = topics
-        self.hub = MemoryHub(loop.post, copy_packet)
+        self.hub = MemoryHub(loop, copy_packet)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 
     def transport(self, file: NodeFile) -> Transport:
         """The real transport of nodes that share a process."""
         self._ros_nodes[file.node.name] = RosNodeStandIn(
-            file.node.name, self._log, file.node.parameters
+            file.node.name, self._log, file.node.parameters, _topics_of(file)
         )
         return MemoryTransport(file, self.hub, self.topics)
 
@@ -206,5 +227,25 @@ class Workbench:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
 
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
+
     def close(self) -> None:
         """Nothing to give up."""
+
+
+def _topics_of(file: NodeFile) -> dict[str, tuple[str, int, int]]:
+    """The topics of a node's ports, as they would be on the ROS graph."""
+    node = file.node
+    found = {}
+    for c in file.connections:
+        is_output = c.source_node == node.name
+        port = node.output(c.source_output) if is_output else node.input(c.destination_input)
+        found[f"{c.topic}/data"] = (port.type, 1, 1)
+    for is_output, ports in ((True, node.outputs), (False, node.inputs)):
+        for port in ports:
+            if port.external_topic is not None:
+                name = file.names.resolve(port.external_topic, node.name)
+                found[name] = (port.type, int(is_output), int(not is_output))
+    return found

@@ -25,6 +25,8 @@ class StepLoop:
     after everything that waits.
     """
 
+    has_taken_in = True
+
     def __init__(self, clock: ManualClock) -> None:
         self._clock = clock
         self._events: deque[Event] = deque()

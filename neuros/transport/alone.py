@@ -7,6 +7,7 @@ registers there are not served.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 from array import array
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +19,10 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import message_carrier
-from neuros.transport.copying import copy_packet
-from neuros.transport.making import make_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import plain_node
+from neuros.transport.plain_node import plain_node, without_spinning
+from neuros.transport.values import checker
 
 Event = Callable[[], None]
 
@@ -31,10 +32,13 @@ class HeldLoop:
 
     Attributes:
         from_threads: events that threads have posted.
+        has_taken_in: always true, since nothing comes by itself.
 
     Args:
         post, post_loop_back: where events go that the node posts itself.
     """
+
+    has_taken_in = True
 
     def __init__(
         self, post: Callable[[Event], None], post_loop_back: Callable[[Event], None]
@@ -101,6 +105,8 @@ class Alone:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._ros_node = plain_node(file, self._context)
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
 
     def transport(self, file: NodeFile) -> _Nowhere:
         """One that carries nothing."""
@@ -141,7 +147,12 @@ class Alone:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
 
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
+
     def close(self) -> None:
         """Give up ROS."""
+        self._no_spinning.close()
         self._ros_node.destroy_node()
         rclpy.shutdown(context=self._context)

@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 
 from neuros.errors import NodeError
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.plain_node import PlainNode
+from neuros.transport.plain_node import PlainNode, not_in_hooks
 from neuros.transport.ros_loop import RosLoop
 
 Fail: TypeAlias = Callable[[Any, BaseException], None]
@@ -129,6 +129,7 @@ class PluginCallbacks:
             self._loop.expect_arrivals()
             client = create(*arguments, **keywords)
             client.call_async = self._calling(client.call_async)
+            client.call = not_in_hooks(client.call, "client.call")
             return client
 
         return creating

@@ -4,33 +4,37 @@ For a small message rclpy spends most of the time on looking up Python classes f
 layout of a message class is worked out once: runs of numbers become one ``struct`` each, and only
 strings and sequences are looked at one by one. The encoding is the same (plain CDR, little-
 endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
-Whatever is out of the ordinary, in a class or in a message, is left to rclpy, and so are errors: a
-value that ROS would convert or refuse, bounded fields, wide strings, sequences of messages, senders
-of the other byte order.
+What is written has been checked (:mod:`neuros.transport.values`). Whatever is out of the ordinary,
+in a class or in bytes, is left to rclpy, and so are errors: single characters, more items than a
+bound allows, senders of the other byte order.
 """
 
 from __future__ import annotations
 
-from array import array
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from operator import itemgetter
+from struct import Struct
 from typing import Any, TypeAlias
 
 from neuros.transport.cdr_parts import (
-    CODES,
     START,
     Array,
-    Field,
+    Buffer,
+    Items,
+    Nothing,
     Numbers,
     Part,
     Pieces,
-    Sequence,
+    ReadItem,
     Text,
-    Texts,
     Unusual,
+    WriteItem,
+    read_text,
+    read_wide_text,
+    write_text,
+    write_wide_text,
 )
+from neuros.transport.schema import Leaf, Shape, Sort, Type, schema
 
 Encode: TypeAlias = Callable[[Any], bytes]
 Decode: TypeAlias = Callable[[bytes], Any]
@@ -45,51 +49,111 @@ def cdr(kind: type) -> tuple[Encode, Decode] | None:
     Both raise one of ``NOT_OURS`` where a message is to be left to rclpy.
     """
     try:
-        parts = tuple(_parts(list(_fields(kind, ()))))
+        parts = _parts_of(kind)
     except Unusual:
         return None
-    return (_encoder(kind, parts), _decoder(kind, parts)) if parts else None
+    return _encoder(kind, parts), _decoder(kind, parts)
 
 
-def _fields(kind: Any, path: tuple[str, ...]) -> Iterator[Field]:
-    default = kind()
-    types = kind.get_fields_and_field_types()
-    if not types:  # CDR has a byte of its own for it
-        raise Unusual
-    for name, type_name in types.items():
-        value = getattr(default, name)
-        if hasattr(value, "get_fields_and_field_types"):
-            yield from _fields(type(value), (*path, f"_{name}"))
-        else:
-            yield Field((*path, f"_{name}"), type_name, value)
+@cache
+def _parts_of(kind: Any) -> tuple[Part, ...]:
+    return tuple(_parts(_entries(kind, iter(schema(kind).leaves))))
 
 
-def _parts(fields: list[Field]) -> Iterator[Part]:
-    run: list[Field] = []
+def _entries(kind: Any, leaves: Iterator[Leaf]) -> Iterator[Leaf | None]:
+    """The leaves of a message, in their order; ``None`` for a message without fields."""
+    fields = schema(kind).fields
+    if not fields:
+        yield None
     for field in fields:
-        if field.type_name in CODES:
-            run.append(field)
+        if field.is_message:
+            yield from _entries(field.type.message, leaves)
+        else:
+            yield next(leaves)
+
+
+def _parts(entries: Iterable[Leaf | None]) -> Iterator[Part]:
+    run: list[Leaf] = []
+    for leaf in entries:
+        if leaf and leaf.field.shape is Shape.SINGLE and leaf.field.type.code:
+            run.append(leaf)
             continue
         if run:
             yield Numbers(run)
         run = []
-        yield _part(field)
+        yield _part(leaf) if leaf else Nothing()
     if run:
         yield Numbers(run)
 
 
-def _part(field: Field) -> Part:
-    if "," in field.type_name or "<=" in field.type_name or "wstring" in field.type_name:
-        raise Unusual
-    if isinstance(field.default, array):
-        return Sequence(field)
-    if hasattr(field.default, "dtype"):
-        return Array(field)
-    if field.type_name == "string":
-        return Text(field)
-    if field.type_name == "sequence<string>":
-        return Texts(field)
+def _part(leaf: Leaf) -> Part:
+    field = leaf.field
+    if field.shape is Shape.BUFFER:
+        return Buffer(leaf)
+    if field.shape is Shape.ARRAY:
+        return Array(leaf)
+    if field.shape is Shape.LIST:
+        return Items(leaf, *_item(field.type))
+    if field.type.sort is Sort.TEXT:
+        return Text(leaf, write_text, read_text)
+    if field.type.sort is Sort.WIDE_TEXT:
+        return Text(leaf, write_wide_text, read_wide_text)
     raise Unusual
+
+
+def _item(of: Type) -> tuple[WriteItem, ReadItem]:
+    """What writes and reads one of several values that are no numbers."""
+    if of.sort is Sort.MESSAGE:
+        return _message(of.message)
+    if of.sort is Sort.TEXT:
+        return write_text, read_text
+    if of.sort is Sort.WIDE_TEXT:
+        return write_wide_text, read_wide_text
+    if of.code:
+        return _single(of.code)
+    raise Unusual
+
+
+def _message(kind: Any) -> tuple[WriteItem, ReadItem]:
+    parts = _parts_of(kind)
+    writers = [part.write for part in parts]
+
+    def write(message: Any, pieces: Pieces, at: int) -> int:
+        for write_part in writers:
+            at = write_part(message, pieces, at)
+        return at
+
+    return (writers[0] if len(writers) == 1 else write), _reader(kind, parts)
+
+
+def _reader(kind: Any, parts: tuple[Part, ...]) -> ReadItem:
+    layout = schema(kind)
+    kinds, fill, fixed = layout.kinds, layout.fill, [value for *_, value in layout.switches]
+    readers = tuple(part.read for part in parts)
+
+    def read(data: bytes, at: int) -> tuple[Any, int]:
+        made = list(map(object.__new__, kinds))
+        values = made[1:] + fixed
+        for read_part in readers:
+            at = read_part(data, at, values)
+        fill(made, values)
+        return made[0], at
+
+    return read
+
+
+def _single(code: str) -> tuple[WriteItem, ReadItem]:
+    """For a bool or a byte."""
+    layout = Struct(f"<{code}")
+
+    def write(value: Any, pieces: Pieces, at: int) -> int:
+        pieces.append(layout.pack(value))
+        return at + 1
+
+    def read(data: bytes, at: int) -> tuple[Any, int]:
+        return layout.unpack_from(data, at + START)[0], at + 1
+
+    return write, read
 
 
 def _encoder(kind: type, parts: tuple[Part, ...]) -> Encode:
@@ -108,73 +172,12 @@ def _encoder(kind: type, parts: tuple[Part, ...]) -> Encode:
 
 
 def _decoder(kind: Any, parts: tuple[Part, ...]) -> Decode:
-    """All slots are set in one go, without a turn of the interpreter for each."""
-    tree = _Tree(kind)
-    readers = tuple(part.read for part in parts)
-    targets = tree.slots + [tree.slot(path) for part in parts for path in part.targets]
-    owners = _items([owner for owner, _ in targets])
-    names = [name for _, name in targets]
-    kinds, fixed = tree.kinds, tree.fixed
+    read = _reader(kind, parts)
 
     def decode(data: bytes) -> Any:
         if data[:START] != _HEADER:
             raise Unusual
-        made = list(map(object.__new__, kinds))
-        values = made[1:] + fixed
-        at = 0
-        for read in readers:
-            at = read(data, at, values)
-        deque(map(setattr, owners(made), names, values), maxlen=0)
-        return made[0]
+        message, _ = read(data, 0)
+        return message
 
     return decode
-
-
-def _items(places: list[int]) -> Callable[[list[Any]], tuple[Any, ...]]:
-    if len(places) == 1:
-        return tuple  # there is one message only
-    get: Callable[[list[Any]], tuple[Any, ...]] = itemgetter(*places)
-    return get
-
-
-class _Tree:
-    """A message and those within it, the outermost first.
-
-    Attributes:
-        kinds: their classes.
-        fixed: what is always the same in them: whether their setters check.
-        slots: for all but the first, and for all of ``fixed``: which message they belong into, and
-            by which name.
-    """
-
-    def __init__(self, kind: type) -> None:
-        self.kinds: list[Any] = []
-        self.fixed: list[Any] = []
-        self._places: dict[tuple[str, ...], int] = {}
-        inner: list[tuple[int, str]] = []
-        switches: list[tuple[int, str]] = []
-        self._add(kind, (), inner, switches)
-        self.slots = inner + switches
-
-    def slot(self, path: tuple[str, ...]) -> tuple[int, str]:
-        """Which of the messages a slot belongs to, and its name."""
-        return self._places[path[:-1]], path[-1]
-
-    def _add(
-        self,
-        kind: Any,
-        path: tuple[str, ...],
-        inner: list[tuple[int, str]],
-        switches: list[tuple[int, str]],
-    ) -> None:
-        place = self._places[path] = len(self.kinds)
-        self.kinds.append(kind)
-        default, types = kind(), kind.get_fields_and_field_types()
-        for slot in kind.__slots__:
-            value = getattr(default, slot)
-            if slot[1:] not in types:
-                switches.append((place, slot))
-                self.fixed.append(value)
-            elif hasattr(value, "get_fields_and_field_types"):
-                inner.append((place, slot))
-                self._add(type(value), (*path, slot), inner, switches)

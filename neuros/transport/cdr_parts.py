@@ -1,4 +1,4 @@
-"""The parts of a message in CDR: runs of numbers, strings, sequences and arrays.
+"""The parts of a message in CDR: runs of numbers, strings, lists, sequences and arrays.
 
 Each part knows the places of its fields in the message, and how they are written and read. Places
 in the bytes are counted from behind the header: CDR puts a number at a multiple of its size.
@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
+
+import numpy
+
+from neuros.transport.schema import Leaf
 
 Pieces: TypeAlias = "list[Any]"
+WriteItem: TypeAlias = Callable[[Any, Pieces, int], int]
+ReadItem: TypeAlias = Callable[[bytes, int], "tuple[Any, int]"]
 
 START = 4
 """Bytes of the header."""
 
-CODES = {
-    "boolean": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
-    "uint32": "I", "int64": "q", "uint64": "Q", "float": "f", "double": "d",
-}  # fmt: skip
-"""Types of single numbers in ROS's notation, as ``struct`` calls them."""
-
 _LENGTH = struct.Struct("<I")
+_LENGTHS = tuple(struct.Struct(f"<{padding}xI") for padding in range(4))
 _PADDING = tuple(bytes(size) for size in range(8))
 
 
@@ -35,37 +36,30 @@ NOT_OURS = (Unusual, struct.error, AttributeError, TypeError, ValueError, Overfl
 """What writing and reading raise for a message that is to be left to rclpy."""
 
 
-class Field(NamedTuple):
-    """A field of a message or of one within it: the slots that lead there, and what it holds."""
-
-    path: tuple[str, ...]
-    type_name: str
-    default: Any
-
-
 class Part:
-    """Some fields that follow each other: ``targets`` are their slots in the message."""
+    """Some fields that follow each other."""
 
-    def __init__(self, fields: list[Field]) -> None:
-        self.targets = tuple(field.path for field in fields)
-        self.get: Callable[[Any], Any] = attrgetter(*(".".join(path) for path in self.targets))
+    def __init__(self, leaves: Sequence[Leaf]) -> None:
+        self.get: Callable[[Any], Any] = attrgetter(*(".".join(leaf.path) for leaf in leaves))
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
         """Append the bytes for place ``at``; returns the place behind them."""
         raise NotImplementedError
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
-        """Append the values at a place, one for each target; returns the place behind them."""
+        """Append the values at a place, one for each field; returns the place behind them."""
         raise NotImplementedError
 
 
 class Numbers(Part):
-    def __init__(self, fields: list[Field]) -> None:
-        super().__init__(fields)
-        if len(fields) == 1:
+    """Single numbers, bools and bytes."""
+
+    def __init__(self, leaves: Sequence[Leaf]) -> None:
+        super().__init__(leaves)
+        if len(leaves) == 1:
             get = self.get
             self.get = lambda message: (get(message),)
-        codes = [CODES[field.type_name] for field in fields]
+        codes = [leaf.field.type.code for leaf in leaves]
         self._layouts = tuple(_aligned(codes, at) for at in range(8))
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
@@ -79,52 +73,73 @@ class Numbers(Part):
         return at + layout.size
 
 
-class Text(Part):
-    def __init__(self, field: Field) -> None:
-        super().__init__([field])
+class Nothing(Part):
+    """A message without fields, for which ROS puts a byte."""
+
+    def __init__(self) -> None: ...
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
-        return _write_text(self.get(message), pieces, at)
+        pieces.append(b"\0")
+        return at + 1
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
-        text, end = _read_text(data, at)
+        return at + 1
+
+
+class Text(Part):
+    def __init__(self, leaf: Leaf, write: WriteItem, read: ReadItem) -> None:
+        super().__init__([leaf])
+        self._write, self._read = write, read
+
+    def write(self, message: Any, pieces: Pieces, at: int) -> int:
+        return self._write(self.get(message), pieces, at)
+
+    def read(self, data: bytes, at: int, values: list[Any]) -> int:
+        text, end = self._read(data, at)
         values.append(text)
         return end
 
 
-class Texts(Part):
-    def __init__(self, field: Field) -> None:
-        super().__init__([field])
+class Items(Part):
+    """Several values that are no numbers: a list."""
+
+    def __init__(self, leaf: Leaf, write_item: WriteItem, read_item: ReadItem) -> None:
+        super().__init__([leaf])
+        self._size = leaf.field.size
+        self._most = leaf.field.bound
+        self._write_item, self._read_item = write_item, read_item
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
-        texts = self.get(message)
-        if type(texts) is not list:
-            raise Unusual
-        at = _write_length(len(texts), pieces, at)
-        for text in texts:
-            at = _write_text(text, pieces, at)
+        items, write_item = self.get(message), self._write_item
+        if self._size is None:
+            at = _write_length(len(items), pieces, at)
+        for item in items:
+            at = write_item(item, pieces, at)
         return at
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
-        texts, (count, at) = [], _read_length(data, at)
+        items, read_item, count = [], self._read_item, self._size
+        if count is None:
+            count, at = _read_length(data, at, self._most)
         for _ in range(count):
-            text, at = _read_text(data, at)
-            texts.append(text)
-        values.append(texts)
+            item, at = read_item(data, at)
+            items.append(item)
+        values.append(items)
         return at
 
 
-class Sequence(Part):
-    """Numbers without a bound: an ``array.array``."""
+class Buffer(Part):
+    """Any number of numbers: an ``array.array``."""
 
-    def __init__(self, field: Field) -> None:
-        super().__init__([field])
-        self._code = field.default.typecode
-        self._size: int = field.default.itemsize
+    def __init__(self, leaf: Leaf) -> None:
+        super().__init__([leaf])
+        self._code = leaf.field.type.code
+        self._size = array(self._code).itemsize
+        self._most = leaf.field.bound
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
         values = self.get(message)
-        if type(values) is not array or values.typecode != self._code:
+        if type(values) is not array:  # it lies in shared memory still
             raise Unusual
         at = _write_length(len(values), pieces, at)
         if not values:
@@ -134,7 +149,7 @@ class Sequence(Part):
         return at + padding + len(values) * self._size
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
-        count, at = _read_length(data, at)
+        count, at = _read_length(data, at, self._most)
         numbers = array(self._code)
         if count:
             at += -at % self._size
@@ -150,26 +165,15 @@ class Sequence(Part):
 class Array(Part):
     """A fixed number of numbers: an array of NumPy."""
 
-    def __init__(self, field: Field) -> None:
-        super().__init__([field])
-        default = field.default
-        if not default.dtype.isnative or not default.size:
-            raise Unusual
-        self._default = default
-        self._kind, self._dtype, self._shape = type(default), default.dtype, default.shape
-        self._item: int = default.itemsize
-        self._size: int = default.nbytes
+    def __init__(self, leaf: Leaf) -> None:
+        super().__init__([leaf])
+        self._default = numpy.zeros(leaf.field.size or 0, leaf.field.type.code)
+        self._item = self._default.itemsize
+        self._size = self._default.nbytes
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
-        values = self.get(message)
-        if (
-            type(values) is not self._kind
-            or values.dtype != self._dtype
-            or values.shape != self._shape
-        ):
-            raise Unusual
         padding = -at % self._item
-        pieces += (_PADDING[padding], values.tobytes())
+        pieces += (_PADDING[padding], self.get(message).tobytes())
         return at + padding + self._size
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:
@@ -196,29 +200,49 @@ def _aligned(codes: list[str], at: int) -> struct.Struct:
 
 def _write_length(length: int, pieces: Pieces, at: int) -> int:
     padding = -at & 3
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length))
+    pieces.append(_LENGTHS[padding].pack(length))
     return at + padding + 4
 
 
-def _read_length(data: bytes, at: int) -> tuple[int, int]:
+def _read_length(data: bytes, at: int, most: int | None = None) -> tuple[int, int]:
     at += -at & 3
-    return _LENGTH.unpack_from(data, at + START)[0], at + 4
-
-
-def _write_text(text: Any, pieces: Pieces, at: int) -> int:
-    """In UTF-8 with a NUL behind it; after a NUL within, ROS sends nothing."""
-    if type(text) is not str or "\0" in text:
+    length = _LENGTH.unpack_from(data, at + START)[0]
+    if most is not None and length > most:
         raise Unusual
+    return length, at + 4
+
+
+def write_text(text: str, pieces: Pieces, at: int) -> int:
+    """Append text in UTF-8 with a NUL behind it; returns the place behind."""
     encoded = text.encode()
     padding, length = -at & 3, len(encoded) + 1
-    pieces.append(_PADDING[padding] + _LENGTH.pack(length) + encoded + b"\0")
+    pieces += (_LENGTHS[padding].pack(length), encoded, b"\0")
     return at + padding + 4 + length
 
 
-def _read_text(data: bytes, at: int) -> tuple[str, int]:
-    length, at = _read_length(data, at)
+def read_text(data: bytes, at: int) -> tuple[str, int]:
+    """The text at a place, and the place behind it."""
+    at += -at & 3
+    (length,) = _LENGTH.unpack_from(data, at + START)
+    at += 4
     end = at + length
     encoded = data[at + START : end + START]
     if len(encoded) != length or encoded.find(0) != length - 1:
         raise Unusual
-    return encoded[:-1].decode(errors="replace"), end
+    return str(encoded[:-1], "utf-8", "replace"), end
+
+
+def write_wide_text(text: str, pieces: Pieces, at: int) -> int:
+    """The same in UTF-16, each unit in four bytes, as Fast DDS has it."""
+    encoded = text.encode("utf-16-le")
+    count = len(encoded) // 2
+    at = _write_length(count, pieces, at)
+    pieces.append(struct.pack(f"<{count}I", *struct.unpack(f"<{count}H", encoded)))
+    return at + 4 * count
+
+
+def read_wide_text(data: bytes, at: int) -> tuple[str, int]:
+    """The text at a place, and the place behind it."""
+    count, at = _read_length(data, at)
+    units = struct.unpack_from(f"<{count}I", data, at + START)
+    return struct.pack(f"<{count}H", *units).decode("utf-16-le"), at + 4 * count

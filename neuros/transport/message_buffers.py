@@ -8,13 +8,13 @@ once, from its class: its own, and those of messages within it (not of *sequence
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
-from operator import attrgetter
 from typing import Any
 
 from neuros.transport.late_message import make_late
 from neuros.transport.packet_segment import StoredBuffer
+from neuros.transport.schema import Shape, getter, schema
 
 
 class MessageBuffers:
@@ -26,13 +26,16 @@ class MessageBuffers:
     """
 
     def __init__(self, kind: type) -> None:
-        found = tuple(_find(kind(), ()))
-        self.fields = tuple(".".join(path) for path, _ in found)
-        self.typecodes = tuple(typecode for _, typecode in found)
+        found = [
+            leaf
+            for leaf in schema(kind).leaves
+            if leaf.field.shape is Shape.BUFFER and leaf.field.bound is None
+        ]
+        self._paths = [leaf.path for leaf in found]
+        self.fields = tuple(".".join(slot[1:] for slot in path) for path in self._paths)
+        self.typecodes = tuple(leaf.field.type.code for leaf in found)
         self._kind = kind
-        # Slots instead of properties: a setter copies what it is given.
-        self._paths = [tuple(f"_{name}" for name in path) for path, _ in found]
-        self._get = _getter([".".join(path) for path in self._paths])
+        self._get = getter(self._paths)
         holders: dict[tuple[str, ...], tuple[str, ...]] = {}
         for *path, slot in self._paths:
             holders[tuple(path)] = (*holders.get(tuple(path), ()), slot)
@@ -96,13 +99,6 @@ def message_buffers(kind: type) -> MessageBuffers | None:
     return buffers if buffers.fields else None
 
 
-def _getter(names: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
-    if not names:
-        return lambda packet: ()
-    get: Callable[[Any], Any] = attrgetter(*names)
-    return get if len(names) > 1 else lambda packet: (get(packet),)
-
-
 def _follow(message: Any, path: Sequence[str]) -> Any:
     for slot in path:
         message = getattr(message, slot)
@@ -114,13 +110,3 @@ def _shallow(message: Any, kind: Any) -> Any:
     for slot in kind.__slots__:
         setattr(twin, slot, getattr(message, slot))
     return twin
-
-
-def _find(message: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], str]]:
-    for name, type_name in message.get_fields_and_field_types().items():
-        value = getattr(message, name)
-        if isinstance(value, array):
-            if "," not in type_name:  # with a comma: no more than so many
-                yield (*path, name), value.typecode
-        elif hasattr(value, "get_fields_and_field_types"):
-            yield from _find(value, (*path, name))

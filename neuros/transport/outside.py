@@ -13,8 +13,8 @@ from rclpy.publisher import Publisher
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.copying import make_packet
 from neuros.transport.external import ExternalTopics
-from neuros.transport.making import make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.ros import data_qos
 from neuros.transport.ros_loop import RosLoop

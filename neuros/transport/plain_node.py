@@ -1,30 +1,51 @@
-"""The ROS node of a NeuROS node: rclpy's own, with services for parameters only where it has some.
+"""The ROS node of a NeuROS node: rclpy's own, served by NeuROS and by nothing else.
 
-rclpy gives each node six services for parameters: twelve of some twenty endpoints, which every
-process of a domain hears of from every other, and more than half of what has to be found before
-the first packet.
+Who waits in a hook for a callback (``rclpy.spin_until_future_complete``) waits for what comes after
+the hook: that is refused in a sentence.
+
+It has services for parameters only where it has some. rclpy gives each node six of them: twelve of
+some twenty endpoints, which every process of a domain hears of from every other, and more than half
+of what has to be found before the first packet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
+import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
+from neuros.errors import NodeError
 from neuros.project.model import NodeFile, Value
 from neuros.project.names import Names
 
-__all__ = ["Parameter", "ParameterNotDeclaredException", "PlainNode", "plain_node"]
+__all__ = [
+    "Parameter",
+    "ParameterNotDeclaredException",
+    "PlainNode",
+    "not_in_hooks",
+    "plain_node",
+    "without_spinning",
+]
 
 _NO_NAMES = Names()
 _NOTHING: Mapping[str, Value] = MappingProxyType({})
 _OF_ROS = "use_sim_time"  # rclpy declares it itself
+
+_SPINNING = ("spin", "spin_once", "spin_until_future_complete")
+_lock = threading.Lock()
+_threads: list[int] = []
+"""Threads in which nothing may wait for callbacks; a thread is in there as often as it asked."""
+_replaced: dict[str, Callable[..., Any]] = {}
 
 
 class PlainNode(Node):  # type: ignore[misc]
@@ -83,6 +104,9 @@ class PlainNode(Node):  # type: ignore[misc]
 
     @executor.setter
     def executor(self, executor: Any) -> None:
+        current = super().executor
+        if current is not None and executor is not None and executor is not current:
+            raise _not_for_plugins(f"{type(executor).__name__}.add_node")
         Node.executor.fset(self, executor)
 
     def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
@@ -101,9 +125,51 @@ class _Tasks:
         return self._executor.create_task(self._wrap(callback), *arguments, **keywords)
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("spin"):
+            raise _not_for_plugins(f"get_ros_node().executor.{name}")
         return getattr(self._executor, name)
 
 
 def plain_node(file: NodeFile, context: Context) -> PlainNode:
     """The ROS node of a node of a project."""
     return PlainNode(file.node.name, context, file.names, file.node.parameters)
+
+
+@contextmanager
+def without_spinning() -> Iterator[None]:
+    """Meanwhile, ``rclpy.spin`` and the like are refused in this thread, and work in all others."""
+    thread = threading.get_ident()
+    with _lock:
+        if not _threads:
+            for name in _SPINNING:
+                _replaced[name] = getattr(rclpy, name)
+                setattr(rclpy, name, not_in_hooks(_replaced[name], f"rclpy.{name}"))
+        _threads.append(thread)
+    try:
+        yield
+    finally:
+        with _lock:
+            _threads.remove(thread)
+            if not _threads:
+                for name, replaced in _replaced.items():
+                    setattr(rclpy, name, replaced)
+
+
+def not_in_hooks(wait: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """``wait``, refused in threads that run hooks."""
+
+    @functools.wraps(wait)
+    def waiting(*arguments: Any, **keywords: Any) -> Any:
+        if threading.get_ident() in _threads:
+            raise _not_for_plugins(name)
+        return wait(*arguments, **keywords)
+
+    return waiting
+
+
+def _not_for_plugins(name: str) -> NodeError:
+    return NodeError(
+        f"{name}: NeuROS serves the callbacks of a node itself, between its hooks, so a hook must"
+        " not wait for them: let it return, and take an answer with"
+        " client.call_async(request).add_done_callback(function)"
+    )

@@ -20,11 +20,11 @@ from std_msgs.msg import UInt64
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.copying import make_packet
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.external import ExternalTopics
 from neuros.transport.large_carriers import LargeCarriers
 from neuros.transport.large_packets import is_parcel
-from neuros.transport.making import make_packet
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
 from neuros.transport.ros_loop import RosLoop
@@ -60,7 +60,6 @@ class RosTransport:
         self._registrations: list[Registration] = []
         self._large = LargeCarriers(file, ros_node.get_logger().warning)
         self._is_open = False
-        self.has_taken_in = loop.has_taken_in
 
     def open(self, inbox: Inbox) -> None:
         """Create all endpoints and look for the other ends until each is found."""
@@ -112,6 +111,10 @@ class RosTransport:
             if self._large.inputs:
                 self._large.settle(connection, position)
             self._acknowledgements[connection](encode_position(position))
+
+    def has_taken_in(self) -> bool:
+        """Whether all that has reached this node has been handled."""
+        return self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""

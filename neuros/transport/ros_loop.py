@@ -61,6 +61,7 @@ class RosLoop:
     ``on_failure`` gets whatever an event raises, in the loop's thread.
 
     Attributes:
+        has_taken_in: whether all that ROS had waiting when a hook or callback ended is handled.
         turns: how many turns the events of engines have had.
     """
 
@@ -72,11 +73,12 @@ class RosLoop:
         self._turn = Turn(self._take_turn)
         self._has_posted_turn = False
         self._is_turn_stale = False
-        self._has_taken_in = True
+        self.has_taken_in = True
         self._has_arrivals = False
         self.turns = 0
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
+        self._has_older_events = False
         self._is_stopping = False
 
     @property
@@ -101,18 +103,14 @@ class RosLoop:
         """From now on, ROS brings what hooks wait for, and not the nodes of this process alone."""
         self._has_arrivals = True
 
-    def has_taken_in(self) -> bool:
-        """Whether all that ROS had waiting when a hook or callback ended has been handled."""
-        return self._has_taken_in
-
     def note_execution(self) -> None:
         """A hook or callback has ended: what has arrived until now comes before the next hook.
 
         Callbacks that are taken in then put that off no further, however many keep coming.
         """
-        if not (self._has_arrivals and self._has_taken_in):
+        if not (self._has_arrivals and self.has_taken_in):
             return
-        self._has_taken_in = False
+        self.has_taken_in = False
         if self._has_posted_turn:
             self._is_turn_stale = True
         else:
@@ -163,15 +161,21 @@ class RosLoop:
         return guarded
 
     def run(self) -> None:
-        """Run until :meth:`stop`."""
+        """Run until :meth:`stop`.
+
+        Where a timer is overdue, and one may always be, all that waits is handled before it.
+        """
         while not self._is_stopping:
             self._planned_ns = self._next_due_ns()
             if self._planned_ns is None:
                 wait_s = _LONG_S
             else:
                 wait_s = (self._planned_ns - time.monotonic_ns()) / 1e9
-            if wait_s > 0:
-                self._executor.spin_until_future_complete(self._waker, wait_s)
+            if wait_s <= 0:
+                wait_s = _LONG_S
+                self._has_older_events = True
+                self.post(self._end_older_events)
+            self._executor.spin_until_future_complete(self._waker, wait_s)
             self._run_due_timers()
 
     def run_for(self, seconds: float) -> None:
@@ -195,6 +199,11 @@ class RosLoop:
     def _wake(self) -> None:
         self._waker.wake(None)
 
+    def _end_older_events(self) -> None:
+        """All that waited when a timer was overdue has been handled: now it is the timer's turn."""
+        self._has_older_events = False
+        self._waker.wake(None)
+
     def _post_turn(self) -> None:
         self._has_posted_turn = True
         self._executor.create_task(self._turn)
@@ -205,7 +214,7 @@ class RosLoop:
             self._is_turn_stale = False
             self._post_turn()
             return
-        self._has_taken_in = True
+        self.has_taken_in = True
         self.turns += 1
         events = self._events
         begin_ns = now_ns = time.monotonic_ns()
@@ -221,7 +230,7 @@ class RosLoop:
                 event()
             except BaseException as error:
                 self._on_failure(error)
-            if not self._has_taken_in:
+            if not self.has_taken_in:
                 break
             since_ns, now_ns = now_ns, time.monotonic_ns()
             if now_ns - begin_ns > length_ns:
@@ -240,6 +249,8 @@ class RosLoop:
 
     def _check_timers(self) -> None:
         """Leave the executor if a timer is due, or due at another time than was planned for."""
+        if self._has_older_events:
+            return
         next_ns = self._next_due_ns()
         if next_ns != self._planned_ns or (next_ns and next_ns <= time.monotonic_ns()):
             self._waker.wake(None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,10 +21,11 @@ from neuros.transport.digests import digest_of
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
-from neuros.transport.plain_node import PlainNode, plain_node
+from neuros.transport.plain_node import PlainNode, plain_node, without_spinning
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
+from neuros.transport.values import checker
 
 _LINGER_S = 0.05
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
@@ -65,14 +67,16 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._loop = loop = RosLoop(self._context, on_failure)
+        self._loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
         self._is_recorded = record
-        self._hub = MemoryHub(loop.post, copy_packet, loop.has_taken_in) if in_memory else None
+        self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
         self._ros_nodes: dict[str, PlainNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
 
     @property
     def loop(self) -> RosLoop:
@@ -138,12 +142,17 @@ class RosProcess:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
 
+    def checker(self, kind: type) -> Callable[[Any], Any]:
+        """What checks packets of a class before they are sent."""
+        return checker(kind)
+
     def close(self) -> None:
         """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
 
         Others in that crowd notice after 20 s that a process has gone, as with one that was
         killed; the shared memory of DDS is left to the guardian.
         """
+        self._no_spinning.close()
         for callbacks in self._callbacks:
             callbacks.close()
         for transport in self._transports:

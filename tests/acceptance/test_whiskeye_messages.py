@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 from launching import BACKENDS, EXAMPLES, Finished, launch
+from needs import COMPILER
 
 import neuros.bag
 from containers import require_containers
 
-pytestmark = pytest.mark.acceptance
+pytestmark = [pytest.mark.acceptance, pytest.mark.needs(*COMPILER, "OpenGL")]
 
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 SECONDS, PACKETS = 20, 1000

@@ -35,8 +35,8 @@ def test_one_orchestration_comes_out_whole(tmp_path: Path) -> None:
     assert main([*command, "--backend", "in-process", "-o", str(tmp_path)]) == 0
     (row,) = rows(tmp_path).values()
     assert row["backend"] == "in-process"
-    assert row["sent.imu"] == row["delivered.imu"] == row["estimates"] == "50"
-    assert float(row["delivery_percent"]) == 100
+    assert row["sent.imu"] == row["consumed.imu"] == row["estimates"] == "50"
+    assert float(row["consumed_percent"]) == 100
     assert float(row["rms_deg"]) < 6
     assert float(row["speed_percent"]) > 0
     assert len(row["estimates_digest"]) == 8
@@ -57,7 +57,7 @@ def test_the_elevator_goes_on_for_as_long_as_it_is_measured(tmp_path: Path) -> N
     found = rows(tmp_path)
     assert [*found] == ["strict-1", "no_discard_limit-1", "asynchronous-1"]
     assert all(float(row["speed_percent"]) > 0 for row in found.values())
-    assert float(found["strict-1"]["delivery_percent"]) > 99, "one may be under way at the end"
+    assert float(found["strict-1"]["consumed_percent"]) > 99, "one may be under way at the end"
     assert "| strict" in (tmp_path / "index.md").read_text()
 
 
@@ -85,7 +85,7 @@ def test_all_seven_orchestrations_come_out_and_lossless_ones_repeat(tmp_path: Pa
     assert len(found) == len(PARTS)
     whole = {name: row["sent.imu"] for name, row in found.items() if "_1ms" not in name}
     assert set(whole.values()) <= {"199", "200"}  # the clock ends one
-    assert float(found["strict-1"]["delivery_percent"]) == 100
+    assert float(found["strict-1"]["consumed_percent"]) == 100
 
     lossless = ["--only", "strict", "hybrid", "--repeat", "2", "-o", str(tmp_path / "again")]
     assert main([*command, *lossless]) == 0

@@ -214,11 +214,11 @@ def test_the_load_is_that_of_the_same_time(tmp_path: Path) -> None:
 
 def test_packets_and_errors_are_read(read: Reading) -> None:
     expected = {
-        "delivery_percent": 70.0,
-        "delivery_percent.imu": 100.0,
-        "delivery_percent.pose": 50.0,
+        "consumed_percent": 70.0,
+        "consumed_percent.imu": 100.0,
+        "consumed_percent.pose": 50.0,
         "sent.estimate": 100,
-        "delivered.estimate": 60,
+        "consumed.estimate": 60,
         "estimates": 50,
         "rms_deg": 3.0,
         "mean_deg": 3.0,

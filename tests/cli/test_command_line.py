@@ -22,6 +22,7 @@ from neuros.project.model import Node, Project
 from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS
 
 PORT = "std_msgs/msg/Int32"
+PLUGIN = "from neuros.hooks import *\n@neuros_initialise()\ndef begin(node): pass\n"
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +34,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """Two connected nodes, ``a`` and ``b``."""
-    (tmp_path / "plugin.py").write_text("")
+    (tmp_path / "plugin.py").write_text(PLUGIN)
     nodes = [
         {
             "name": name,

@@ -125,7 +125,7 @@ def test_two_runs_are_shown_side_by_side_with_their_ratio(
         if len(cells := re.split(r"  +", line.strip())) > 2
     }
     assert rows["wall time / s"] == ["12.00", "6.00", "0.50"]
-    assert rows["a: executes / %"] == ["20.0", "100.0", "5.00"]
+    assert rows["a: executing / %"] == ["20.0", "100.0", "5.00"]
     assert rows["b.out -> a.in: sent"] == ["50", "-", "-"]
     page = (tmp_path / "out.html").read_text("utf-8")
     assert "The bottleneck of faster" in page

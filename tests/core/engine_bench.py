@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.hook import Hook
+from neuros.core.hook import Hook, PacketType
 from neuros.hooks import (
     HookSpec,
     Optional,
@@ -119,6 +119,7 @@ class Bench:
         external_inputs: Sequence[str] = (),
         external_outputs: Sequence[str] = (),
         packet_types: dict[str, type] | None = None,
+        check: Callable[[Any], Any] = lambda packet: packet,
         is_started: bool = True,
         is_registered: bool = True,
         make_engine: Callable[..., Engine] = Engine,
@@ -135,7 +136,8 @@ class Bench:
         self.posted: deque[tuple[str, Callable[[], None]]] = deque()
         node = node_for("node", specs, connections, external_inputs, external_outputs)
         self.by_name: dict[str, Any] = {str(c): c for c in connections}
-        self.engine = make_engine(node, connections, specs, self, self.clock, packet_types)
+        types = {name: PacketType(kind, check) for name, kind in (packet_types or {}).items()}
+        self.engine = make_engine(node, connections, specs, self, self.clock, types)
         if is_registered:
             for connection in self.engine.outlets:
                 self.engine.on_registered(connection)

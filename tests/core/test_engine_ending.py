@@ -118,6 +118,29 @@ def test_draining_holds_whenever_it_comes(is_before_initialisation):
     assert bench.ran[before:] == []
 
 
+def test_a_hook_of_the_last_round_starts_once_more_and_keeps_what_comes_after():
+    bench = Bench(function("f", "x", "o", returns=1), connections=[wire(IN, 0), wire(OUT)])
+    bench.packet(IN)
+    bench.engine.drain(last_round=[0])
+    assert bench.packet(IN) == ["f"]
+    assert bench.packet(IN) == []
+    (inlet,) = bench.engine.inlets.values()
+    assert (inlet.received, inlet.consumed, inlet.unread) == (3, 2, 1)
+    assert not bench.engine.has_startable_packet
+    assert not bench.engine.has_ready_hook
+
+
+def test_so_does_one_that_was_initialised_only_then():
+    bench = Bench(
+        function("f", "x"), initialise("init"), connections=[wire(IN, 0, 2)], is_started=False
+    )
+    bench.engine.drain(last_round=[0])
+    bench.engine.start()
+    bench.packet(IN)
+    assert bench.packet(IN) == []
+    assert bench.ran == ["init", "f"]
+
+
 def test_drained_means_that_no_hook_could_start_on_a_packet():
     bench = Bench(
         function("f", ["x", "y"]),

@@ -246,3 +246,22 @@ def test_acknowledgements_that_have_piled_up_start_a_main_loop_once():
         assert bench.acknowledge_to_node(str(receiver), 1) == []
     bench.is_taken_in = True
     assert bench.posted_event() == ["step"]
+
+
+def test_what_a_node_sends_itself_is_taken_in_before_the_next_hook_too():
+    """Else each event would let a hook start, and more would be sent than is handled."""
+    bench = Bench(
+        function("send", outputs="o", returns=1),
+        function("take", "x"),
+        connections=[wire("node.o -> node.x"), wire("a.o -> node.y")],
+        is_started=False,
+    )
+    after_a_hook_something_may_have_arrived(bench)
+    bench.engine.start()
+    for _ in range(50):
+        bench.is_taken_in = True
+        bench.packet("a.o -> node.y")
+        bench.is_taken_in = True
+        bench.posted_event()
+        assert len(bench.waiting) <= 3
+    assert {"send", "take"} <= set(bench.ran[-3:])

@@ -40,7 +40,9 @@ def sending(name: str, outputs: list[Any], gap: int) -> Any:
 
 
 @st.composite
-def projects(draw: st.DrawFn) -> tuple[list[Connection], dict[str, list[HookSpec]]]:
+def projects(
+    draw: st.DrawFn, gaps: tuple[int, ...] = (0, 2, 3)
+) -> tuple[list[Connection], dict[str, list[HookSpec]]]:
     names = [f"n{number}" for number in range(draw(st.integers(1, 3)))]
     ends = [(a, o, b, i) for a in names for o in ("o", "p") for b in names for i in ("x", "y")]
     chosen = draw(st.lists(st.sampled_from(ends), unique=True, min_size=1, max_size=8))
@@ -53,12 +55,14 @@ def projects(draw: st.DrawFn) -> tuple[list[Connection], dict[str, list[HookSpec
         )
         for index, end in enumerate(chosen)
     ]
-    plugins = {name: draw(hooks_of(name, connections)) for name in names}
+    plugins = {name: draw(hooks_of(name, connections, gaps)) for name in names}
     return connections, plugins
 
 
 @st.composite
-def hooks_of(draw: st.DrawFn, node: str, connections: list[Connection]) -> list[HookSpec]:
+def hooks_of(
+    draw: st.DrawFn, node: str, connections: list[Connection], gaps: tuple[int, ...]
+) -> list[HookSpec]:
     connected = sorted({c.destination_input for c in connections if c.destination_node == node})
     specs = []
     for number in range(draw(st.integers(1, 3))):
@@ -73,7 +77,7 @@ def hooks_of(draw: st.DrawFn, node: str, connections: list[Connection]) -> list[
         ]
         kind = draw(st.sampled_from(["function"] * 5 + ["initialise", "tick"]))
         name = f"{node}_{kind}{number}"
-        body = sending(name, outputs, draw(st.sampled_from([0, 2, 3])))
+        body = sending(name, outputs, draw(st.sampled_from(gaps)))
         if kind == "function":
             specs.append(function(name, inputs, outputs, body))
         elif kind == "initialise":

@@ -58,6 +58,7 @@ class Run:
         for connection in (*OUTGOING, CONNECTIONS[3]):
             engine.on_registered(connection)
         engine.start()
+        self.is_draining = False
 
     def step(self, what: int, advance_ns: int) -> None:
         bench = self.bench
@@ -84,7 +85,11 @@ class Run:
             bench.engine.resume() if bench.engine.is_paused else bench.engine.pause()
         elif what == 8:
             bench.engine.step(2, is_driven=advance_ns % 2 == 0)
-        elif what == 9:
+        elif what == 9 and not self.is_draining:
+            self.is_draining = True
+            places = range(len(bench.engine.all_hooks))
+            bench.engine.drain([place for place in places if advance_ns >> place & 1])
+        elif what == 10:
             bench.is_taken_in = not bench.is_taken_in
 
 
@@ -122,7 +127,7 @@ class Again:
             player.play(event)
 
 
-steps = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 10), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)

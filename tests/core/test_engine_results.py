@@ -7,17 +7,18 @@ import re
 import pytest
 from engine_bench import Bench, function, wire
 
-from neuros.errors import HookError
+from neuros.errors import HookError, WrongValue
 from neuros.hooks import Optional
 
 IN, OUT_O, OUT_P = "a.o -> node.x", "node.o -> b.o", "node.p -> b.p"
 
 
-def run(outputs, returns, types=None) -> Bench:
+def run(outputs, returns, types=None, check=lambda packet: packet) -> Bench:
     bench = Bench(
         function("f", "x", outputs, returns=lambda _: returns),
         connections=[wire(IN), wire(OUT_O), wire(OUT_P)],
         packet_types=types,
+        check=check,
     )
     bench.packet(IN)
     return bench
@@ -75,6 +76,33 @@ def test_a_packet_of_a_wrong_type_is_an_error_that_says_what_to_do():
 
 def test_a_packet_of_the_right_type_passes():
     assert run("o", 7, {"o": int}).sent == [(OUT_O, 7)]
+
+
+def test_what_is_sent_is_the_packet_that_its_check_returns():
+    assert run("o", 7, {"o": int}, check=lambda packet: packet + 1).sent == [(OUT_O, 8)]
+
+
+@pytest.mark.parametrize("wrong", ["o", "p"])
+def test_nothing_is_sent_if_one_of_the_packets_holds_a_wrong_value(wrong):
+    def check(packet):
+        if packet == wrong:
+            raise WrongValue("data", "300 (int)", "uint8: 0 to 255")
+        return packet
+
+    bench = Bench(
+        function("f", "x", ["o", "p"], returns=("o", "p")),
+        connections=[wire(IN), wire(OUT_O), wire(OUT_P)],
+        packet_types={"o": str, "p": str},
+        check=check,
+    )
+    with pytest.raises(HookError) as caught:
+        bench.packet(IN)
+    assert bench.sent == []
+    assert re.fullmatch(
+        rf".*engine_bench\.py:\d+: hook 'f': packet for output '{wrong}': field 'data' must be"
+        r" uint8: 0 to 255, but is 300 \(int\)",
+        str(caught.value),
+    )
 
 
 def test_nothing_is_sent_if_one_of_the_packets_is_wrong():

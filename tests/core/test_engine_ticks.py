@@ -86,6 +86,13 @@ def test_a_due_tick_hook_takes_its_turn_among_the_others():
     bench.pass_time(1.0)
     assert bench.ran == ["f", "t"]
 
+def test_a_tick_that_is_due_takes_its_turn_whatever_event_comes_first():
+    """The loop may have much to do before it gets to the timer."""
+    bench = Bench(function("main"), tick("t", 0.1))
+    assert bench.ran == ["main"]
+    bench.clock.advance(0.1)
+    assert bench.posted_event() == ["t", "main"]
+
 
 @settings(max_examples=50)
 @given(

@@ -20,7 +20,7 @@ def glimpse(node: str, now_s: float, **books: Any) -> dict[str, Any]:
         "books": {
             "now_s": now_s,
             "state": {"state": "waiting", "cause": "x"},
-            "executing": None,
+            "executing": books.get("hook"),
             "hooks": books.get("hooks", {}),
             "accounting": spent,
             "outgoing": books.get("outgoing", {}),
@@ -32,8 +32,9 @@ def glimpse(node: str, now_s: float, **books: Any) -> dict[str, Any]:
     }
 
 
-def outgoing(sent: int, outstanding: int = 0) -> dict[str, Any]:
-    return {LINK: {"sent": sent, "outstanding": outstanding, "is_blocked": outstanding > 0}}
+def outgoing(sent: int, outstanding: int = 0, *, is_reliable: bool = True) -> dict[str, Any]:
+    blocked = {"is_blocked": outstanding > 0, "is_reliable": is_reliable}
+    return {LINK: {"sent": sent, "outstanding": outstanding, **blocked}}
 
 
 def incoming(received: int, discarded: int = 0) -> dict[str, Any]:
@@ -109,3 +110,84 @@ def test_a_node_that_loads_its_plugin_has_no_figures_yet() -> None:
     figures = Figures()
     figures.take({"node": "a", "sim_time": None, "books": None})
     assert figures.nodes == {"a": {"state": "loading", "cause": ""}}
+
+
+def lost(sent: list[int], received: list[int], hooks: list[float] | None = None) -> int:
+    """What is shown as lost after a glimpse of both ends every 200 ms.
+
+    Args:
+        hooks: for how long a hook of the receiver has been executing at each glimpse, in seconds.
+    """
+    figures = Figures()
+    for place, (out, arrived) in enumerate(zip(sent, received, strict=True)):
+        now_s, for_s = 10 + 0.2 * place, hooks[place] if hooks else 0.0
+        hook = {"name": "f", "for_s": for_s, "executions": 1} if for_s else None
+        figures.take(glimpse("a", now_s, outgoing=outgoing(out, is_reliable=False)))
+        figures.take(glimpse("b", now_s, incoming=incoming(arrived), hook=hook))
+    return int(figures.connections[LINK]["lost"])
+
+
+def test_what_was_sent_and_has_not_arrived_for_a_while_is_lost() -> None:
+    assert lost([10 * n for n in range(30)], [max(0, 10 * n - 189) for n in range(30)]) in (
+        188,
+        189,
+    )
+
+
+def test_what_is_under_way_is_not_lost() -> None:
+    sent = [10 * n for n in range(60)]
+    assert lost(sent, [max(0, count - n % 10) for n, count in enumerate(sent)]) == 0
+
+
+def test_what_waits_for_a_hook_to_end_is_not_lost() -> None:
+    """The hook starts again every 5 s, with all that has arrived by then."""
+    since = [0.2 * (n % 25) + 0.001 for n in range(100)]
+    assert lost(list(range(100)), [n - n % 25 for n in range(100)], since) == 0
+
+
+def test_nothing_is_lost_on_a_reliable_connection() -> None:
+    figures = Figures()
+    figures.take(glimpse("a", 1.0, outgoing=outgoing(5)))
+    assert figures.connections[LINK]["lost"] == 0
+
+
+def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
+    figures = Figures()
+    figures.take(
+        glimpse("a", 1.0, outgoing=outgoing(5, 1), sim_time=1.0, hook={"name": "f", "for_s": 1})
+    )
+    figures.take(glimpse("b", 1.0, incoming=incoming(1)))
+    nothing = dict.fromkeys(STATES, 0.0) | {"executing": {}, "waiting": {}, "blocked": {}}
+    ends = {
+        "a": ({LINK: {"sent": 8, "outstanding": 0}}, {}, {"executing": {"f": 1.0}, "idle": 3.0}),
+        "b": ({}, {LINK: {"received": 6, "discarded": 2, "unread": 0}}, {"waiting": {"x": 4.0}}),
+    }
+    reports = {
+        name: {
+            "is_final": True,
+            "ledger": {
+                "outgoing": out,
+                "incoming": into,
+                "accounting": nothing | spent,
+                "hooks": {"f": {"executions": 4, "busy_s": 1.0}},
+            },
+        }
+        for name, (out, into, spent) in ends.items()
+    }
+    figures.end(reports, 4.0)
+    assert {node["state"] for node in figures.nodes.values()} == {"ended"}
+    assert figures.nodes["a"]["shares"] == pytest.approx(
+        {"executing": 0.25, "waiting": 0, "blocked": 0, "idle": 0.75}
+    )
+    shown = figures.connections[LINK]
+    assert (shown["sent"], shown["discarded"], shown["lost"], shown["is_blocked"]) == (
+        8,
+        2,
+        2,
+        False,
+    )
+    assert (shown["rate_hz"], figures.real_time_factor) == (2.0, 0.25)
+
+    reports["b"]["is_final"] = False
+    figures.end(reports, 4.0)
+    assert figures.connections[LINK]["lost"] is None

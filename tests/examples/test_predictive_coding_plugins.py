@@ -87,6 +87,7 @@ def test_an_arena_is_a_function_of_its_seed(load):
     assert arena(1).count("<geom") == 24 + 2
 
 
+@pytest.mark.needs("OpenGL")
 def test_the_robot_tells_its_heading_while_the_network_is_to_learn_and_never_after(view):
     pytest.importorskip("mujoco")
     with PluginHarness.from_project(

@@ -209,7 +209,8 @@ def test_a_packet_of_a_wrong_type_from_a_thread_is_named(run, tmp_path):
     ended = run()
     assert ended.exit_code == 1
     last = ended.output.splitlines()[-1]
-    assert "node 'sender' failed: hook 'submit(out)': returned int for output 'out'" in last
+    assert "node 'sender' failed: " in last
+    assert "/sender.py: hook 'submit(out)': returned int for output 'out'" in last
 
 
 def test_a_thread_that_is_blocked_for_ever_does_not_hide_a_deadlock(run, tmp_path):

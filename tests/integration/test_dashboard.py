@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,14 @@ def wait_until(page: Any, condition: str, argument: Any = None) -> None:
     page.wait_for_function(condition, arg=argument)
 
 
+COVERED_EDGES = """() => window.neuros.graph.cy.edges().filter((edge) => {
+    const {x1, x2, y1, y2} = edge.boundingBox(
+        {includeNodes: false, includeEdges: false, includeLabels: true});
+    const {x, y} = edge.midpoint();
+    return x1 <= x && x <= x2 && y1 <= y && y <= y2;
+}).map((edge) => edge.id())"""
+STATES = """() => Object.fromEntries(window.neuros.graph.cy.nodes().map(
+    (node) => [node.data('name'), node.data('state')]))"""
 MORE_THAN = """([name, count]) => Number(document.querySelector(
     `#connections tr[data-name="${name}"] td:nth-child(3)`).textContent) > count"""
 
@@ -53,6 +62,7 @@ def test_a_visitor_sees_and_steers_a_run_in_a_browser(tmp_path: Path) -> None:
             IMU,
         )
         assert label.startswith("imu: lossless\n")
+        assert page.evaluate(COVERED_EDGES) == []
         wait_until(page, MORE_THAN, [IMU, 5])
 
         # A field of a packet, over time.
@@ -96,8 +106,16 @@ def test_a_visitor_sees_and_steers_a_run_in_a_browser(tmp_path: Path) -> None:
         page.click("#stop")
         page.wait_for_selector("#phase.ended")
         assert "ended from the dashboard (exit code 0)" in page.inner_text("#phase")
+        assert page.evaluate(STATES) == {"world": "ended", "brain": "ended"}
+        rows = [row.split("\t") for row in page.inner_text("#connections tbody").splitlines()]
+        cells = {row[0]: [row[2], *row[-2:]] for row in rows}  # sent, discarded, lost
+        shares = page.inner_text('#nodes tr[data-name="world"] td:nth-child(3)')
         finished = running.finish()
     assert finished.exit_code == 0
+    for name, shown in cells.items():
+        connection = finished.connection(name)
+        assert shown == [str(connection[key]) for key in ("sent", "discarded", "lost")]
+    assert re.search(rf"^world +{shares.replace(' ', '')} ", finished.output, re.M)
     assert finished.connection(IMU)["lost"] == 0
     assert finished.record["nodes"]["world"]["accounting"]["paused"] > 0
 

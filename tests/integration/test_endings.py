@@ -63,8 +63,9 @@ def test_a_packet_that_cannot_be_sent_is_named_with_its_output_and_field(bench: 
         b=SINK,
     )
     finished = bench.launch("--digests")  # in process packets are serialised for these only
-    what = r"packet for output 'o': field 'data' must be int32, but is 'three' \(str\)"
-    assert_ended(finished, 1, f"node 'a' failed: .*a\\.py: {what}")
+    limits = f"{-(2**31)} to {2**31 - 1}"
+    what = rf"packet for output 'o': field 'data' must be int32: {limits}, but is 'three' \(str\)"
+    assert_ended(finished, 1, rf"node 'a' failed: .*a\.py:\d+: hook 'fill': {what}")
     assert "Traceback" not in finished.output
 
 
@@ -72,7 +73,6 @@ def test_a_packet_that_cannot_be_sent_is_named_with_its_output_and_field(bench: 
     ("plugin", "reason"),
     [
         ("import no_such_package", ".*/a.py: cannot be imported: ModuleNotFoundError: .*"),
-        ("def broken(:", ".*/a.py:\\d+: cannot be imported: SyntaxError: .*"),
         ("raise SystemExit(0)", ".*/a.py: cannot be imported: SystemExit: 0"),
     ],
 )
@@ -83,6 +83,17 @@ def test_a_plugin_that_cannot_be_imported_is_named_last(
     finished = bench.launch()
     assert_ended(finished, 1, f"node 'a' failed: {reason}")
     assert "Traceback" in finished.output
+
+
+def test_plugins_that_could_not_run_are_all_named_and_nothing_is_started(bench: Bench) -> None:
+    bench.project(a="def broken(:", b="@neuros_tick(seconds=0.1)\ndef tick(): pass")
+    finished = bench.launch()
+    assert finished.exit_code == 3
+    assert finished.run_folder is None
+    broken, tick, count = finished.output.splitlines()
+    assert re.fullmatch(r".*a\.py:\d+:12: syntax error: invalid syntax", broken)
+    assert re.fullmatch(r".*b\.py:\d+:1: hook 'tick' gets \(node\), but takes \(\)", tick)
+    assert count == "2 problems; nothing was started"
 
 
 def test_a_hook_that_calls_exit_has_failed(bench: Bench) -> None:
@@ -115,10 +126,11 @@ def test_a_node_whose_process_ends_is_a_failure(bench: Bench, act: str, how: str
 
 
 def test_a_finalise_hook_that_fails_makes_the_project_fail(bench: Bench) -> None:
-    fails = "@neuros_finalise()\ndef close(node):\n    raise ValueError('stuck')\n"
+    fails = "@neuros_finalise()\ndef close(node):\n    raise ValueError('stuck \\udc80')\n"
     bench.project("b.o -> a.x", a=COUNTS, b=SOURCE + fails)
     finished = bench.launch()
-    assert_ended(finished, 1, "node 'b' failed: .*: hook 'close': ValueError: stuck")
+    assert_ended(finished, 1, r"node 'b' failed: .*: hook 'close': ValueError: stuck \\udc80")
+    assert "in close" in finished.output, "half a character is no obstacle"
     assert bench.saved("a", "b"), "the other finalise hooks have run"
 
 

@@ -103,7 +103,27 @@ def test_but_no_longer_than_the_plugin_says(bench: Bench) -> None:
     )
     finished = bench.launch()
     assert_ended(finished, 0, "a ended the project: enough")
-    assert any("not drained in time" in text for text in finished.said("neuros"))
+    said = finished.said("neuros")
+    assert any(t.startswith("not drained in time: ") and "b is busy" in t for t in said)
+    assert "not drained in time, but no packet of a lossless connection was lost" in said
+
+
+def test_a_drain_that_was_cut_off_is_a_good_end_only_if_nothing_was_lost(bench: Bench) -> None:
+    bench.project(
+        "a.o -> b.x",
+        a="@neuros_tick(seconds=0.3, outputs='o')\ndef send(node):\n"
+        "    if node.get_user_data():\n        node.shutdown('enough', drain_s=0.3)\n"
+        "    node.set_user_data('sent one')\n    return node.make_packet('o')\n",
+        b="@neuros_function(inputs='x')\ndef work(node, x):\n    time.sleep(1.5)\n",
+    )
+    finished = bench.launch()
+    connection = finished.connection("a.o -> b.x")
+    assert connection["sent"] == connection["received"] + connection["lost"] == 2
+    if connection["lost"]:
+        what = r"a\.o -> b\.x lost 1 packet, though it is lossless \(discard_limit 0\)"
+        assert_ended(finished, 1, what)
+    else:
+        assert_ended(finished, 0, "a ended the project: enough")
 
 
 THREAD = """

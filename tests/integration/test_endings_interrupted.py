@@ -26,7 +26,7 @@ from ending_bench import (
     made_bench,
 )
 from endings import GONE_WITHIN_S, RUNS
-from launching import BACKENDS
+from launching import BACKENDS, REPOSITORY
 
 from containers import wait_until
 
@@ -62,6 +62,38 @@ def test_ctrl_c_during_start_up_ends_it_whenever_it_comes(bench: Bench, delay_s:
     time.sleep(delay_s)  # not to wait for something, but to hit different moments
     running.signal(signal.SIGINT)
     assert_ended(running.finish(GONE_WITHIN_S), 130, "ended by Ctrl\\+C")
+
+
+@pytest.mark.parametrize("program", [["launch.py"], ["-m", "neuros.cli", "launch"]])
+def test_ctrl_c_before_anything_is_imported_waits_and_leaves_no_traceback(
+    tmp_path: Path, program: list[str]
+) -> None:
+    with made_bench(tmp_path, "process") as bench:
+        bench.project(a=RUNS)
+        process = subprocess.Popen(
+            [sys.executable, *program, str(bench.folder), "-o", str(bench.folder / "run")],
+            cwd=REPOSITORY,
+            env={**os.environ, MARK: bench.mark},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            wait_until(lambda: _waits_with_ctrl_c(process.pid), 10.0)
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=20.0)
+        finally:
+            process.kill()
+            process.communicate()
+        assert process.returncode == 130, output.decode()
+        assert b"Traceback" not in output
+        assert output.rstrip().endswith(b"ended by Ctrl+C")
+
+
+def _waits_with_ctrl_c(pid: int) -> bool:
+    """Whether a process has blocked SIGINT."""
+    (mask,) = re.findall(r"SigBlk:\s*([0-9a-f]+)", Path(f"/proc/{pid}/status").read_text())
+    return bool(int(mask, 16) >> (signal.SIGINT - 1) & 1)
 
 
 def test_a_second_ctrl_c_kills_at_once(bench: Bench) -> None:
@@ -169,10 +201,12 @@ def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
 
 
 def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(bench: Bench) -> None:
+    holds = {"gil": HOLDS.format("ctypes.PyDLL(None).sleep(30)")}
     bench.project(
         "a.o -> b.x",
         "b.o -> c.x",
         "d.o -> c.y",
+        **(holds if bench.back_end == "process" else {}),
         a="@neuros_initialise(outputs='o')\ndef think(node):\n"
         "    time.sleep(6.5)\n    return node.make_packet('o')\n",
         b=RELAY,
@@ -186,11 +220,15 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
         running.wait_for("c waits for `x` from b", 3.0)
         running.wait_for("b waits for `x` from a", 3.0)
         running.wait_for("d waits for the next tick of 'rarely'", 3.0)
+        running.wait_for("gil has been executing 'hold' for 5 s, and cannot report", 5.0)
+        running.wait_for(f'"{bench.folder}/gil.py", line ', 1.0)
     running.signal(signal.SIGINT)
     finished = running.finish()
     assert_ended(finished, 130, "ended by Ctrl\\+C")
     said = finished.said("neuros")
-    assert len([text for text in said if "has been executing" in text]) == 1
+    named = [text for text in said if text.startswith("a has been executing")]
+    assert named == ["a has been executing 'think' for 5 s:"]
+    assert f'  File "{bench.folder}/a.py", line ' in finished.output
     if bench.back_end == "process":
         assert not any(text.startswith("a executes") for text in said), "that was said before"
 

@@ -332,20 +332,20 @@ def test_what_has_arrived_while_a_hook_ran_is_taken_in_before_the_next(
 
     def receive(message: Int32) -> None:
         hooked.seen.append(message.data)
-        taken_in.append(loop.loop.has_taken_in())
+        taken_in.append(loop.loop.has_taken_in)
 
     hooked.node.create_subscription(Int32, "data", loop.loop.guarded(receive), 10)
     hooked.publisher("data")
 
     def first() -> None:
-        assert loop.loop.has_taken_in()
+        assert loop.loop.has_taken_in
         hooked.send("data", 1, 2, 3)
         hooked.execute("hook")
-        assert not loop.loop.has_taken_in()
+        assert not loop.loop.has_taken_in
         loop.loop.post_loop_back(second)
 
     def second() -> None:
-        assert loop.loop.has_taken_in()
+        assert loop.loop.has_taken_in
         hooked.seen.append("next")
         loop.loop.stop()
 
@@ -388,3 +388,21 @@ def test_callbacks_that_keep_coming_do_not_put_off_the_next_hook(
     assert len(hooks) == 4
     assert all(after - before <= 3 for before, after in itertools.pairwise(hooks)), hooked.seen
     assert "callback" in hooked.seen
+
+
+def test_a_timer_that_is_always_overdue_keeps_no_event_waiting(loop: Loop) -> None:
+    """All that waited when its turn came is handled before it, loop-backs included."""
+    seen: list[str] = []
+
+    def on_due() -> None:
+        seen.append("timer")
+        if seen.count("timer") == 3:
+            loop.loop.stop()
+        for kind in ("event", "other"):
+            loop.loop.post(lambda kind=kind: seen.append(kind))  # type: ignore[misc]
+            loop.loop.post_loop_back(lambda: seen.append("loop-back"))
+
+    loop.loop.add_timer(lambda: 1, on_due)
+    loop.run()
+    a_round = ["timer", "event", "loop-back", "other", "loop-back"]
+    assert seen == [*a_round, *a_round, "timer"]

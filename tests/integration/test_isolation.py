@@ -25,9 +25,7 @@ from neuros.doctor.delivery import PROJECT as IMAGES
 from neuros.launch.domain import choose_domain
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 
-pytestmark = pytest.mark.skipif(
-    os.geteuid() != 0, reason="only root can become another user and make namespaces"
-)
+pytestmark = pytest.mark.needs("root")
 
 ECHO = Path(__file__).parent / "isolation"
 STORING = Path(__file__).parent / "large_packets"

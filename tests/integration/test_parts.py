@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from launching import Running, start
 
@@ -64,8 +64,8 @@ def test_the_duration_of_one_part_ends_all(parts: Parts) -> None:
 def test_a_node_that_is_killed_ends_all_and_its_own_launcher_says_how(parts: Parts) -> None:
     with parts.start("sink", *ENDLESS) as sink, parts.start("source", *ENDLESS) as source:
         sink.wait_for("the first image is here", FOUND_S)
-        (pid,) = children(source.process.pid, "source/node.json")
-        subprocess.run(["kill", "-KILL", pid], check=True)
+        (child,) = children(source.process.pid, "source/node.json")
+        child.kill()
         assert source.finish().exit_code == sink.finish().exit_code == 1
     assert "killed by SIGKILL" in source.output
     assert "node 'source' on " in sink.output
@@ -80,12 +80,7 @@ def test_a_part_that_is_alone_is_ended_by_ctrl_c_as_ever(parts: Parts) -> None:
     assert finished.connection(CONNECTION)["received"] is None
 
 
-def children(parent: int, argument: str) -> list[str]:
+def children(parent: int, argument: str) -> list[psutil.Process]:
     """The child processes of a launcher that were given this argument."""
-    listed = subprocess.run(
-        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(parent)],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    return [line.split()[0] for line in listed.splitlines() if argument in line]
+    found = psutil.Process(parent).children()
+    return [child for child in found if any(argument in each for each in child.cmdline())]

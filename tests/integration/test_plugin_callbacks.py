@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from launching import BACKENDS, launch
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -206,3 +208,30 @@ def test_parameters_of_the_project_can_be_declared_again_with_their_value() -> N
     assert node.get_parameter("list").type_ == Parameter.Type.INTEGER_ARRAY
     node.destroy_node()
     rclpy.shutdown(context=context)
+
+
+WAITING = Path(__file__).parent / "waiting"
+DO_THIS = (
+    "NeuROS serves the callbacks of a node itself, between its hooks, so a hook must not wait for"
+    " them: let it return, and take an answer with"
+    " client.call_async(request).add_done_callback(function)"
+)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_hook_that_waits_for_callbacks_is_told_what_to_do(backend: str, tmp_path: Path) -> None:
+    run = launch(WAITING, "--backend", backend, cwd=tmp_path)
+    assert run.exit_code == 0, run.output
+    assert run.record["reason"] == "waiter ended the project: spun in a thread"
+    assert run.said("waiter") == [
+        f"refused: {what}: {DO_THIS}"
+        for what in (
+            "rclpy.spin",
+            "rclpy.spin_once",
+            "rclpy.spin_until_future_complete",
+            "client.call",
+            "get_ros_node().executor.spin_once",
+            "SingleThreadedExecutor.add_node",
+            "rclpy.spin",
+        )
+    ]

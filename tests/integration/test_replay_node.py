@@ -128,7 +128,7 @@ def test_a_plugin_that_is_gone(own: Recorded) -> None:
 
 
 def test_a_journal_that_was_cut_off_is_replayed_as_far_as_it_goes(own: Recorded) -> None:
-    journal = own.run / "mixer/packets/journal"
+    journal = own.run / "mixer/packets/event_log"
     journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
     done = replay(own.run, "mixer")
     assert done.returncode == 0, done.stdout + done.stderr

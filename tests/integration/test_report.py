@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
 from launching import BACKENDS, EXAMPLES, launch
 
 from neuros.cli.main import main
+from neuros.observe.review.bars import spending_figure
+from neuros.observe.review.run import open_for_review
 
 FIGURES = {"graph", "time_shares", "swim_lanes", "real_time", "packets", "latency"}
 
@@ -29,3 +33,85 @@ def test_a_run_of_the_elevator_becomes_a_page(
     assert "without -m" in missing
     page = (tmp_path / "run/report/report.html").read_text("utf-8")
     assert page.count("data:image/png;base64,") == len(FIGURES)
+
+
+SLOW_TO_BEGIN = """
+import time
+from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+
+@neuros_initialise()
+def prepare(node):
+    time.sleep(0.5)
+
+@neuros_function(inputs="number")
+def use(node, number):
+    time.sleep(0.02)
+    if number.data == 30:
+        node.shutdown("thirty")
+
+@neuros_finalise()
+def tidy(node):
+    time.sleep(0.5)
+"""
+SENDER = """
+import time
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="number")
+def send(node, count=[0]):
+    time.sleep(0.005)
+    count[0] += 1
+    number = node.make_packet("number")
+    number.data = count[0]
+    return number
+"""
+INT = "std_msgs/msg/Int32"
+
+
+def pipeline(folder: Path) -> Path:
+    """A sender of 5 ms, and a receiver of 20 ms that is slow to begin and to end."""
+    (folder / "sender.py").write_text(SENDER)
+    (folder / "receiver.py").write_text(SLOW_TO_BEGIN)
+    ends = {"source_node": "sender", "source_output": "number",
+            "destination_node": "receiver", "destination_input": "number"}  # fmt: skip
+    nodes = [
+        {"name": "sender", "plugin": "sender.py", "outputs": [{"name": "number", "type": INT}]},
+        {"name": "receiver", "plugin": "receiver.py", "inputs": [{"name": "number", "type": INT}]},
+    ]
+    project = {
+        "nodes": [{"container": "neuros_python", **node} for node in nodes],
+        "connections": [{**ends, "discard_limit": 0}],
+    }
+    (folder / "project.json").write_text(json.dumps(project))
+    return folder
+
+
+@pytest.mark.parametrize("back_end", BACKENDS)
+def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
+    tmp_path: Path, back_end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finished = launch(
+        pipeline(tmp_path), "--backend", back_end, "-o", str(tmp_path / "run"), cwd=tmp_path
+    )
+    assert finished.exit_code == 0, finished.output
+    rows = (line.split() for line in finished.output.splitlines())
+    table = {cells[0]: cells[1:5] for cells in rows if cells and cells[0] in ("sender", "receiver")}
+    executing = {name: cells[0] for name, cells in table.items()}
+    for cells in table.values():
+        assert sum(int(cell.rstrip("%")) for cell in cells) in range(98, 103)
+
+    run = open_for_review(tmp_path / "run")
+    assert main(["report", str(tmp_path / "run")]) == 0
+    words = dict(re.findall(r"(?m)^  (\w+) .*executes (\d+%)", capsys.readouterr().out))
+    assert words == executing
+
+    (axes,) = spending_figure(run).axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    drawn = {
+        name: [f"{bars[row].get_width():.0f}%" for bars in axes.containers]
+        for row, name in enumerate(names)
+    }
+    assert drawn == table
+    assert main(["compare", str(tmp_path / "run")]) == 0
+    compared = re.findall(r"(\w+): executing / % +([\d.]+)", capsys.readouterr().out)
+    assert {name: f"{float(share):.0f}%" for name, share in compared} == executing

@@ -20,7 +20,7 @@ _INSTALLING = ("git clone", "cd neuros", "./install.py")
 
 def steps() -> list[str]:
     """The text of each step."""
-    return re.split(r"^## ", PAGE.read_text("utf-8"), flags=re.MULTILINE)[1:7]
+    return re.split(r"^## ", PAGE.read_text("utf-8"), flags=re.MULTILINE)[1:8]
 
 
 @pytest.fixture(scope="module")
@@ -77,24 +77,24 @@ def shown(step: str) -> list[str]:
     return [line.partition("RMS")[0] for text in texts for line in text.splitlines()]
 
 
-def test_the_first_five_steps_do_what_they_say(checkout: Path) -> None:
-    first, second, third, fourth, fifth, _ = steps()
-    assert "[display]: It is " in follow(first, checkout)
+def test_the_first_six_steps_do_what_they_say(checkout: Path) -> None:
+    first, second, third, fourth, fifth, sixth, _ = steps()
+    assert follow(first, checkout).count("[display]: It is ") == len(shown(first))
     assert "valid: 1 node, 0 connections" in follow(second, checkout)
-    for step in (third, fourth):
+    for step in (third, fourth, fifth):
         said = follow(step, checkout)
         assert shown(step)
         assert not [line for line in shown(step) if line not in said]
-    follow(fifth, checkout)
+    follow(sixth, checkout)
     assert (checkout / "runs" / "recorded" / "report" / "report.html").exists()
 
 
 @pytest.mark.acceptance
-def test_the_sixth_changes_the_example(checkout: Path) -> None:
-    sixth = steps()[5]
-    plain, biased = commands_of(sixth)
+def test_the_seventh_changes_the_example(checkout: Path) -> None:
+    seventh = steps()[6]
+    plain, biased = commands_of(seventh)
     assert rms_deg(run(plain, checkout)) < 3
-    change(sixth, checkout)
+    change(seventh, checkout)
     assert rms_deg(run(biased, checkout)) > 30
 
 

@@ -73,6 +73,20 @@ def test_in_process_without_digests_there_is_nothing_to_compare(
     assert text.endswith("unknown: there is nothing to compare\n")
 
 
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_in_process_what_was_recorded_is_compared(
+    tmp_path: Path, reference: Finished, back_end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = run(tmp_path / "first", "--backend", "in-process", "-r")
+    if back_end == "process":
+        other = reference
+    else:
+        other = run(tmp_path / "second", "--backend", "in-process", "-r", "--storage", "sqlite3")
+    code, text = verify(first, other, capsys)
+    assert code == 0, text
+    assert text == f"identical: {sum(c['sent'] for c in first.record['connections'])} packets\n"
+
+
 def test_latencies_are_there_with_and_without_digests(reference: Finished) -> None:
     for connection in reference.record["connections"]:
         latency_ms = connection["latency_ms"]

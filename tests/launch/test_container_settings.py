@@ -60,6 +60,12 @@ def test_by_default_it_may_nothing_and_sees_only_its_run() -> None:
     assert found["ipc_mode"] == "private"
 
 
+def test_what_others_have_in_the_run_folder_can_only_be_read() -> None:
+    seen = mounts(settings(node_file(), others=[HERE.run / "arm", HERE.run / "project.json"]))
+    assert seen["/neuros/run/arm"] == ("/home/me/runs/1/arm", True)
+    assert seen["/neuros/run/project.json"] == ("/home/me/runs/1/project.json", True)
+
+
 def test_with_a_rootless_engine_its_user_is_root_inside_and_has_no_more_rights() -> None:
     found = settings(node_file(), user_for(node_file(), {}, is_rootless=True))
     assert (found["user"], found["group_add"]) == ("0:0", [])

@@ -71,6 +71,12 @@ class TestBuildLog:
             ("E: Unable to locate package ros-jazzy-rviz2", "have no ros-jazzy-rviz2: correct"),
             ("E: Package 'rviz' has no installation candidate", "have no rviz: correct"),
             ("COPY failed: file not found in build context", "is not beside it"),
+            ('failed to compute cache key: "/x" not found: not found', "is not beside it"),
+            (
+                "docker.io/library/nest:9: pull access denied, repository does not exist or may",
+                "there is no image docker.io/library/nest:9 to begin from",
+            ),
+            ("dockerfile parse error line 2: Unknown flag: link", "uses the option --link"),
             ("E: Could not open lock file - open (13: Permission denied)", "put USER 0 above it"),
             ("/bin/sh: 1: python3: not found", "its base has no Python"),
             ("ensurepip is not available", "add the package python3-venv"),
@@ -159,7 +165,7 @@ class TestSurroundings:
 
     def test_with_a_wheelhouse_nothing_else_is_asked(self) -> None:
         around = surroundings(engine_with("bridge"), {"HTTP_PROXY": "x"}, None, "http://w/")
-        assert around.arguments == {"SYSTEM_PACKAGES": ""}
+        assert around.arguments == {"SYSTEM_PACKAGES": "", "WINDOWS": "no"}
         assert around.network == "host"
         assert around.lines == "ARG PIP_NO_INDEX=1 PIP_FIND_LINKS=http://w/"
 

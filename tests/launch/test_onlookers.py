@@ -70,7 +70,7 @@ def test_an_onlooker_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     assert told(lines, 3) == [
         {"kind": "phase", "phase": "running", "is_paused": False},
         {"kind": "phase", "phase": "draining", "is_paused": False},
-        {"kind": "ended", "exit_code": 3, "reason": "why"},
+        {"kind": "ended", "exit_code": 3, "reason": "why", "reports": {}, "running_s": None},
     ]
     lines.close()
 

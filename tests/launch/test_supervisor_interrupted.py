@@ -87,7 +87,10 @@ def test_two_do_not(run: Run) -> None:
     outcome = run(
         a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); open('stopping', 'w'); {DEAF}"
     )
-    assert outcome.exit_code == 0
+    assert outcome.exit_code == 130
+    assert outcome.reason == (
+        "killed by Ctrl+C before its nodes had ended: a ended the project: enough"
+    )
     assert run.lasted_s < 4
 
 
@@ -104,19 +107,46 @@ def test_a_failure_while_a_signal_ends_the_run_is_noted(run: Run) -> None:
 
 def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None:
     outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
-    assert "'b': not ended after 5 s, killed" in run.output.said
-    assert outcome.exit_code == 0
+    assert outcome.exit_code == 1
+    assert outcome.reason == (
+        "node 'b' had to be killed 5 s after the end began: its process did not end"
+    )
     assert 5 <= run.lasted_s < 6.5
 
 
 def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
-    stops = "host.up_last(); host.tell('shutdown', reason='', drain_s=0.2); " + (
+    stops = "host.up_last(); host.tell('hooks', hooks=[], finalise=['save', 'close']); " + (
+        "host.tell('shutdown', reason='', drain_s=0.2); "
         "import os, signal; os.kill(os.getpid(), signal.SIGSTOP)"
     )
     outcome = run(a=stops, b=WELL_BEHAVED)
     assert outcome.has_final_report("b")
-    assert "'a': not ended after 5 s, killed" in run.output.said
+    assert outcome.exit_code == 1
+    assert outcome.reason == (
+        "node 'a' had to be killed 5 s after the end began:"
+        " finalise hooks 'save' and 'close' of 'a' did not run"
+    )
     assert run.lasted_s < 7
+
+
+def test_of_a_node_that_had_to_be_killed_it_is_said_what_it_had_still_to_do(run: Run) -> None:
+    stack = ["b", "close", '  File "b.py", line 7, in close']
+    hangs = f"""
+host.up()
+host.tell('hooks', hooks=[], finalise=['save', 'close', 'last'])
+host.wait_for('stop')
+host.tell('finalising', hook='save')
+host.tell('finalising', hook='close')
+host.report(stack={stack})
+{DEAF}
+"""
+    outcome = run(a=SHUTS_DOWN, b=hangs)
+    assert outcome.reason == (
+        "node 'b' had to be killed 5 s after the end began: finalise hook 'close' of 'b' did not"
+        " finish; finalise hook 'last' of 'b' did not run"
+    )
+    assert "b was at this point when it was killed:\n" + stack[2] in run.output.said
+    assert outcome.stacks == {"b": stack[2]}
 
 
 def test_a_report_behind_the_final_one_does_not_count(run: Run) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from hypothesis import given
@@ -36,7 +37,7 @@ def executing(for_s: float, executions: int = 7) -> dict[str, Any]:
 
 def watch_of(*names: str) -> Watch:
     """A watch from second 0 on, whose nodes have all been loaded."""
-    watch = Watch(names, 0.0)
+    watch = Watch(names, 0.0, Path("nowhere"))
     watch.greet(names)
     for name in names:
         watch.report(name, report(), 0.0)
@@ -44,7 +45,15 @@ def watch_of(*names: str) -> Watch:
 
 
 def remarks(watch: Watch, now_s: float) -> list[str]:
-    return [text for _, text in watch.remarks(now_s)]
+    return [
+        text
+        for said in (
+            watch.remarks_on_hooks(),
+            watch.remarks_on_silence(now_s),
+            watch.remarks(now_s),
+        )
+        for _, text in said
+    ]
 
 
 # ------------------------------------------------------------------ standstill
@@ -89,7 +98,7 @@ def test_nothing_rests_while_a_hook_executes() -> None:
 
 
 def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> None:
-    watch = Watch(["a", "b"], 0.0)
+    watch = Watch(["a", "b"], 0.0, Path("nowhere"))
     watch.greet(["a"])
     watch.report("a", report(), 0.0)
     assert not watch.has_just_stalled(9.0), "b has not come yet"
@@ -125,7 +134,7 @@ def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
 
 
 def test_nodes_that_start_slowly_are_named() -> None:
-    watch = Watch(["a", "b", "c"], 0.0)
+    watch = Watch(["a", "b", "c"], 0.0, Path("nowhere"))
     watch.greet(["b", "c"])
     watch.report("b", LOADING, 4.0)
     watch.report("c", report(), 4.0)

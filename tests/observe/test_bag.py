@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from observe.recordings import ANSWER, NUMBER, answer, number, plan, record, spool
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import neuros.bag
 from neuros.cli.main import main
@@ -135,6 +135,9 @@ def test_a_frame_has_a_column_for_each_element(tmp_path: Path) -> None:
         frame = bag["/answer"].frame()
     assert list(frame) == ["log_time_ns", "publish_time_ns", "data"]
     assert frame["data"].tolist() == [0.0, 0.0]
+    assert frame.index.name == "time"
+    assert frame.index.astype("int64").tolist() == [10, 30]
+    assert str(frame.index.tz) == "UTC"
 
 
 def test_without_pandas_a_frame_says_what_to_do(
@@ -167,17 +170,48 @@ def test_topics_are_the_same_whichever_is_asked_for_first(tmp_path: Path, storag
 def test_a_topic_without_packets_is_an_empty_array(tmp_path: Path) -> None:
     record(tmp_path, plan())
     with neuros.bag.open(tmp_path) as bag:
-        assert len(bag["/answer"].array()) == 0
+        array = bag["/answer"].array()
+        assert len(array) == 0
+        assert array.dtype.names == ("log_time_ns", "publish_time_ns", "data")
+        assert array["data"].dtype == np.float64
+        assert list(bag["/answer"].frame()) == list(array.dtype.names)
         assert bag["/answer"].count == 0
 
 
-def test_a_name_that_means_several_topics_or_none_is_said(tmp_path: Path) -> None:
+@settings(deadline=None)
+@given(sent)
+def test_columns_of_no_message_are_those_of_any(messages: Sent) -> None:
+    name, packets = messages
+    found = columns_of([bytes(STORE.serialize_cdr(each, name)) for each in packets], name, STORE)
+    empty = columns_of([], name, STORE)
+    assert {*empty} == {*found}
+    for column_name, column in empty.items():
+        assert len(column) == 0
+        kinds = "iuO" if column.dtype.kind in "iu" else column.dtype.kind + "O"
+        assert found[column_name].dtype.kind in kinds
+
+
+def test_columns_of_no_message_of_an_intricate_type_have_its_fields() -> None:
+    store = get_typestore(Stores.EMPTY)
+    definition = f"string[2] names\nstd_msgs/Bool on\n{'=' * 80}\nMSG: std_msgs/Bool\nbool data"
+    store.register(get_types_from_msg(definition, "a/msg/B"))
+    assert [*columns_of([], "a/msg/B", store)] == ["names", "on.data"]
+
+
+def test_an_output_with_several_receivers_is_any_of_its_connections(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1)), (30, None, number(3))])
     record(tmp_path, plan())
     with neuros.bag.open(tmp_path) as bag:
-        with pytest.raises(KeyError, match=r"which of a\.number -> b\.n, a\.number -> c\.n"):
-            bag["a.number"]
-        with pytest.raises(KeyError, match="there are"):
-            bag["nothing"]
+        assert bag["a.number"].array()["data"].tolist() == [1, 3]
+
+
+def test_a_name_that_means_no_topic_is_said(tmp_path: Path) -> None:
+    record(tmp_path, plan())
+    with (
+        neuros.bag.open(tmp_path) as bag,
+        pytest.raises(KeyError, match=r"there are a\.number -> b\.n, a\.number -> c\.n"),
+    ):
+        bag["nothing"]
 
 
 def test_what_was_cut_off_is_completed_when_it_is_opened(tmp_path: Path) -> None:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from neuros.observe.budgets import broken_budgets
+import pytest
+
+from neuros.observe.budgets import broken_budgets, losses
 from neuros.project.model import Budgets
 
 CONNECTION = "robot.imu -> snn.imu"
+
+
+KILLED = "last report 5.8 s before the end"
 
 
 def record(
@@ -15,13 +20,25 @@ def record(
     discarded: int | None = 0,
     factor: float | None = 1.0,
     worst_ms: float | None = None,
+    *,
+    sent: int | None = 10,
+    received: int | None = 10,
+    discard_limit: int | None = 0,
+    robot: str | None = "final",
+    snn: str | None = "final",
 ) -> dict[str, Any]:
-    """The part of ``run.json`` that budgets are about."""
+    """The part of ``run.json`` that this is about; ``robot`` and ``snn`` are how nodes reported."""
     ticks = None if worst_ms is None else {"largest_error_ms": worst_ms}
+    hooks = {"step": {"ticks": ticks}, "move": {}}
+    connection = {"connection": CONNECTION, "discard_limit": discard_limit}
+    counts = {"sent": sent, "received": received, "lost": lost, "discarded": discarded}
     return {
-        "connections": [{"connection": CONNECTION, "lost": lost, "discarded": discarded}],
+        "connections": [connection | counts],
         "real_time_factor": factor,
-        "nodes": {"robot": {"hooks": {"step": {"ticks": ticks}, "move": {}}}, "dead": {}},
+        "nodes": {
+            "robot": {"hooks": hooks, "report": robot, "sim_time": factor},
+            "snn": {"report": snn},
+        },
     }
 
 
@@ -60,9 +77,63 @@ def test_the_worst_tick_of_any_hook_counts() -> None:
     ]
 
 
-def test_what_nobody_reported_breaks_nothing() -> None:
-    budgets = Budgets(lost_packets={CONNECTION: 0}, tick_error_ms=1)
-    assert broken_budgets(record(lost=None, discarded=None), budgets) == []
+def test_a_figure_that_is_not_known_breaks_its_budget() -> None:
+    budgets = Budgets({CONNECTION: 7}, real_time_factor=0.5, tick_error_ms=5)
+    assert broken_budgets(record(None, None, worst_ms=1.0, robot=KILLED), budgets) == [
+        f"how many packets {CONNECTION} lost is not known, allowed are 7",
+        "the real-time factor must be at least 0.5, and is not known: robot had not reported the"
+        " last",
+        "how far ticks of robot were off their period is not known, allowed are 5 ms",
+    ]
+
+
+def test_of_a_node_that_never_began_it_is_known_that_nothing_was_lost() -> None:
+    never = record(None, None, sent=0, received=None, snn=None)
+    assert broken_budgets(never, Budgets({CONNECTION: 0})) == []
+    assert losses(never) == []
+
+
+def test_nor_is_anything_lost_to_a_node_elsewhere_that_never_came() -> None:
+    never = record(None, None, sent=0, received=None)
+    del never["nodes"]["snn"]
+    assert losses(never) == []
+
+
+# ------------------------------------------------------------------ lossless connections
+
+
+def test_where_all_that_was_sent_has_arrived_nothing_is_said() -> None:
+    assert losses(record()) == []
+
+
+@pytest.mark.parametrize("limit", [None, 3])
+def test_nor_where_packets_may_be_lost(limit: int | None) -> None:
+    assert losses(record(lost=2, received=8, discard_limit=limit)) == []
+
+
+def test_a_packet_lost_on_a_lossless_connection_is_named() -> None:
+    assert losses(record(lost=1, received=9)) == [
+        f"{CONNECTION} lost 1 packet, though it is lossless (discard_limit 0)"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("sent", "received", "what"),
+    [
+        (None, 3, "how many packets were sent is not known"),
+        (10, None, "how many of 10 packets arrived is not known"),
+        (10, 9, "how many packets it lost is not known: a node had not reported its last"),
+    ],
+)
+def test_so_is_one_of_which_that_is_not_known(
+    sent: int | None, received: int | None, what: str
+) -> None:
+    assert losses(record(None, sent=sent, received=received, snn=KILLED)) == [
+        f"{CONNECTION} is lossless (discard_limit 0), but {what}"
+    ]
+
+
+# ------------------------------------------------------------------ all budgets
 
 
 def test_every_budget_that_is_broken_is_listed() -> None:

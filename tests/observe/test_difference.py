@@ -65,12 +65,27 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     return found
 
 
-def unrecorded(folder: Path, connection: str, number: int) -> None:
-    return None
+@dataclass
+class Bags:
+    """What was recorded, by run: digests by connection, and messages by connection and number."""
+
+    digests_in: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
+    messages: dict[tuple[Path, str, int], Any] = field(default_factory=dict)
+    are_small: bool = True
+
+    def message(self, run: Path, connection: str, number: int) -> Any:
+        return self.messages.get((run, connection, number))
+
+    def digests(self, run: Path, connection: str) -> Any:
+        found = self.digests_in.get(run, {}).get(connection)
+        return None if found is None else np.array(found, np.uint64)
+
+    def are_as_of_nodes(self, run: Path, connection: str) -> bool:
+        return self.are_small
 
 
-def verdict(a: PastRun, b: PastRun) -> Verdict:
-    return compare(a, b, unrecorded)
+def verdict(a: PastRun, b: PastRun, bags: Bags | None = None) -> Verdict:
+    return compare(a, b, bags or Bags())
 
 
 def test_runs_with_the_same_packets_are_identical(folders: tuple[Path, Path]) -> None:
@@ -169,8 +184,43 @@ def test_without_digests_nothing_is_said_to_be_identical(folders: tuple[Path, Pa
     found = verdict(a, b)
     assert found.compared == 0
     assert (
-        f"{FIRST}: not compared, there are no digests of it in {folders[1]} (" in found.remarks[0]
+        f"{FIRST}: not compared, there are neither digests nor a recording of it in {folders[1]} ("
+        in found.remarks[0]
     )
+
+
+@pytest.mark.parametrize(("in_b", "difference"), [([1, 2], None), ([1, 9], "packet 2 differs")])
+def test_without_digests_packets_are_taken_from_bags(
+    folders: tuple[Path, Path], in_b: list[int], difference: str | None
+) -> None:
+    a, b = (run(folder, {FIRST: [1, 2]}, has_digests=False) for folder in folders)
+    bags = Bags({a.folder: {FIRST: [1, 2]}, b.folder: {FIRST: in_b}})
+    found = verdict(a, b, bags)
+    assert found.compared == (2 if difference is None else 1)
+    assert found.remarks == ()
+    assert (found.difference or "None").startswith(
+        f"{FIRST}: {difference}" if difference else "None"
+    )
+
+
+@pytest.mark.parametrize("are_small", [True, False])
+def test_a_bag_stands_beside_digests_where_both_are_made_alike(
+    folders: tuple[Path, Path], are_small: bool
+) -> None:
+    a, b = run(folders[0], {FIRST: [1, 2]}), run(folders[1], {FIRST: [1, 2]}, has_digests=False)
+    for first, second in ((a, b), (b, a)):
+        found = verdict(first, second, Bags({b.folder: {FIRST: [1, 2]}}, are_small=are_small))
+        assert found.difference is None
+        assert found.compared == (2 if are_small else 0)
+    bags = Bags({a.folder: {FIRST: [7, 8]}, b.folder: {FIRST: [7, 8]}}, are_small=are_small)
+    assert verdict(a, b, bags) == Verdict(None, (), 2), "both are taken from their bags"
+
+
+def test_what_is_missing_in_a_bag_is_not_said_to_be_identical(folders: tuple[Path, Path]) -> None:
+    a, b = (run(folder, {FIRST: [1, 2, 3]}, has_digests=False) for folder in folders)
+    found = verdict(a, b, Bags({a.folder: {FIRST: [1, 2, 3]}, b.folder: {FIRST: [1, 2]}}))
+    assert found.compared == 2
+    assert "compared up to packet 2" in found.remarks[0]
 
 
 @dataclass
@@ -203,11 +253,9 @@ def test_fields_that_differ_are_named(a: Message, b: Message, expected: list[str
 def test_what_was_recorded_tells_the_field(folders: tuple[Path, Path]) -> None:
     a, b = run(folders[0], {FIRST: [1, 2]}), run(folders[1], {FIRST: [1, 9]})
 
-    def message_of(folder: Path, connection: str, number: int) -> Message:
-        assert (connection, number) == (FIRST, 2)
-        return Message(Stamp(3 if folder == folders[0] else 4))
-
-    difference = compare(a, b, message_of).difference
+    stamps = zip(folders, (3, 4), strict=True)
+    bags = Bags(messages={(folder, FIRST, 2): Message(Stamp(sec)) for folder, sec in stamps})
+    difference = verdict(a, b, bags).difference
     assert difference == f"{FIRST}: packet 2 differs in stamp.sec: 3 in A, 4 in B"
 
 

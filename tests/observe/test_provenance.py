@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from needs import require
 
 from containers import wait_until
 from neuros.observe.provenance import (
@@ -38,6 +39,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
+    require("git")
     git(tmp_path, "init", "-q")
     (tmp_path / "project").mkdir()
     (tmp_path / "project/project.json").write_text("{}")

@@ -57,6 +57,14 @@ def test_every_vote_is_counted_in_every_election(backend: str, tmp_path: Path) -
     assert set(counted) == {"counted ['blue', 'green', 'red']"}
 
 
+def test_a_plugin_can_look_around(backend: str, tmp_path: Path) -> None:
+    run = run_until("census", "[citizen]: counted", backend, tmp_path)
+    assert run.said("census") == [
+        "found /neuros/census/start/citizen/start/data",
+        "Type: std_msgs/msg/Empty",
+    ]
+
+
 def test_a_gazebo_type_gives_one_warning_and_no_more(backend: str, tmp_path: Path) -> None:
     run = run_until("thermostat", "[thermostat]: off", backend, tmp_path)
     assert run.output.count("Gazebo itself is not supported") == 1

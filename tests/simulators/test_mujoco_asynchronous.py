@@ -155,6 +155,7 @@ def test_reset_while_it_runs(node):
     assert 20_000_000 in stamps[:2]  # one packet of before may have been on its way
 
 
+@pytest.mark.needs("OpenGL")
 def test_cameras_render_in_the_stepping_thread_and_afterwards_in_the_plugins():
     camera = {"sensor": "camera", "element": "eye", "rate": 100, "width": 16, "height": 12}
     node = SimulatedNode({"image": ("sensor_msgs/msg/Image", camera)})
@@ -172,6 +173,7 @@ def test_cameras_render_in_the_stepping_thread_and_afterwards_in_the_plugins():
     assert all(any(image.data) for image in images)
 
 
+@pytest.mark.needs("OpenGL")
 def test_an_entity_that_spawns_while_it_runs_is_seen(tmp_path):
     (tmp_path / "wall.xml").write_text(
         """<mujoco model="wall"><worldbody><body name="wall">

@@ -195,6 +195,7 @@ def test_contacts_of_a_box_on_the_floor():
     assert vector(packets["floor"].wrench.torque) == pytest.approx([0, 2 * weight, 0], abs=1e-2)
 
 
+@pytest.mark.needs("OpenGL")
 def test_a_camera_sees_the_red_floor_below_the_horizon():
     camera = {"sensor": "camera", "element": "eye", "rate": 10, "width": 64, "height": 48}
     node = SimulatedNode({"image": ("sensor_msgs/msg/Image", camera)})
@@ -211,6 +212,7 @@ def test_a_camera_sees_the_red_floor_below_the_horizon():
     assert pixels[0].sum() == 0  # above the horizon: nothing
 
 
+@pytest.mark.needs("OpenGL")
 def test_the_simulator_keeps_no_hold_of_an_image_so_that_it_is_handed_over_without_a_copy():
     camera = {"sensor": "camera", "element": "eye", "rate": 10, "width": 64, "height": 48}
     sim = MuJoCo(SimulatedNode({"image": ("sensor_msgs/msg/Image", camera)}), WORLD)

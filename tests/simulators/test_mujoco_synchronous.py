@@ -137,6 +137,7 @@ def packets_of_a_run():
     return packets
 
 
+@pytest.mark.needs("OpenGL")
 def test_the_same_commands_give_the_same_packets_bit_for_bit():
     first = packets_of_a_run()
     assert len(first) == 3 * 50 + 10

@@ -12,6 +12,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import rclpy
 from std_msgs.msg import Float64, Int32, String
 
 from neuros.errors import HookError, NodeError, PluginError, ProjectError
@@ -523,3 +524,84 @@ def test_simulated_results_come_through_as_ros_rounds_them(plugin):
     bench.run()
     assert bench.received("y")[0].data == pytest.approx(0.1)
     assert bench.received("y")[0].data != 0.1
+
+
+def test_a_plugin_can_look_around(plugin):
+    harness = PluginHarness(
+        plugin(COUNT),
+        inputs={"x": INT},
+        outputs={"total": INT, "done": "std_msgs/msg/Empty"},
+        connections=[wire("camera.image -> node.x")],
+    )
+    topics = ["/neuros/camera/image/node/x/data"]
+    topics += [f"/neuros/node/{name}/receiver/{name}/data" for name in ("done", "total")]
+    assert harness.node.get_topic_list() == topics
+    assert harness.node.get_topic_info(topics[0]) == (
+        "Type: std_msgs/msg/Int32\nPublisher count: 1\nSubscription count: 1"
+    )
+    with pytest.raises(NodeError, match=r"get_topic_info: there is no topic '/x' now$"):
+        harness.node.get_topic_info("x")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "kind"),
+    [
+        ({"a": INT}, "Int32"),
+        ({"a": INT, "b": INT}, "Int32"),
+        ({"a": INT, "b": "std_msgs/msg/Empty"}, "Empty"),
+        ({"a": INT, "b": TEXT}, None),
+        ({}, None),
+    ],
+    ids=["one output", "one type", "Empty, as published", "two types", "no output"],
+)
+def test_a_packet_without_a_name_is_of_the_type_that_alone_can_be_meant(plugin, outputs, kind):
+    path = plugin("from neuros.hooks import *\n@neuros_initialise()\ndef f(node): pass")
+    node = PluginHarness(path, outputs=outputs).node
+    if kind:
+        assert type(node.make_packet()).__name__ == kind
+    else:
+        known = ", ".join(outputs) or "none"
+        with pytest.raises(NodeError, match=f"say for which output of node 'node': {known}$"):
+            node.make_packet()
+
+
+def failing(plugin, body, **arguments):
+    """What a hook with this body fails of."""
+    head = "import rclpy, subprocess\nfrom neuros.hooks import *\n"
+    text = f"{head}@neuros_initialise()\ndef f(node): {body}"
+    with pytest.raises(HookError) as failed:
+        PluginHarness(plugin(text), **arguments).run()
+    return failed.value.text
+
+
+def test_a_hook_that_spins_is_told_what_to_do_and_the_test_may_spin(plugin):
+    before = rclpy.spin_once
+    told = failing(plugin, "rclpy.spin_once(node.get_ros_node())")
+    assert re.match("rclpy.spin_once: NeuROS serves .* itself, .*call_async", told)
+    assert rclpy.spin_once is before
+
+
+def test_a_file_that_is_not_in_the_current_folder_is_looked_for_where_it_may_be(plugin, tmp_path):
+    assert failing(plugin, "open('data/weights.csv')", run_folder=tmp_path) == (
+        "FileNotFoundError: [Errno 2] No such file or directory: 'data/weights.csv' (relative to"
+        f" the current folder, which is {tmp_path}; a file beside the plugin, or of the project, is"
+        " node.resolve_path('data/weights.csv'))"
+    )
+
+
+@pytest.mark.parametrize("body", ["open('/no/such/file')", "subprocess.run(['nosuchprogram'])"])
+def test_what_is_not_looked_for_in_the_current_folder_has_no_such_hint(plugin, body):
+    assert "current folder" not in failing(plugin, body)
+
+
+@pytest.mark.parametrize("is_in_hook", [True, False], ids=["in a hook", "at the top"])
+def test_a_missing_module_names_where_packages_go(plugin, is_in_hook):
+    hint = (
+        "No module named 'brian9' (packages such as brian9 go into the requirements.txt of the"
+        " node's container, modules of your own beside the plugin: docs/environments.md)"
+    )
+    if is_in_hook:
+        assert failing(plugin, "import brian9.units").endswith(hint)
+    else:
+        with pytest.raises(PluginError, match=re.escape(hint)):
+            PluginHarness(plugin("import brian9"))

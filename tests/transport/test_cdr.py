@@ -7,122 +7,44 @@ from array import array
 from typing import Any
 
 import pytest
-from geometry_msgs.msg import TwistStamped, Vector3
 from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from message_values import parts, right_messages
 from rclpy.serialization import deserialize_message, serialize_message
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image, Imu, JointState, LaserScan, MagneticField, PointCloud2
-from std_msgs.msg import (
-    Bool,
-    Byte,
-    Empty,
-    Float32,
-    Float64MultiArray,
-    Header,
-    Int8,
-    Int32,
-    String,
-    UInt8MultiArray,
-    UInt64,
-)
+from sensor_msgs.msg import Image
+from std_msgs.msg import Int32, String
 
-from neuros.transport.carriers import QuickCarrier, message_carrier
+from neuros.transport.carriers import message_carrier
 from neuros.transport.cdr import cdr
 from neuros.transport.messages import message_class
 
-QUICK = (
-    Bool, Clock, Float32, Header, Image, Imu, Int8, Int32, JointState, LaserScan, MagneticField,
-    String, TwistStamped, UInt64, Vector3,
+TYPES = (
+    "builtin_interfaces/Time", "diagnostic_msgs/DiagnosticArray", "geometry_msgs/PoseArray",
+    "geometry_msgs/TwistStamped", "sensor_msgs/Image", "sensor_msgs/Imu", "sensor_msgs/JointState",
+    "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "shape_msgs/SolidPrimitive",
+    "std_msgs/Bool", "std_msgs/ByteMultiArray", "std_msgs/Empty", "std_msgs/Float32",
+    "std_msgs/Int8", "std_msgs/String", "std_msgs/UInt64",
 )  # fmt: skip
-LEFT_TO_ROS = (Byte, Empty, Float64MultiArray, PointCloud2, UInt8MultiArray)
-
-for _kind in (*QUICK, *LEFT_TO_ROS):  # ROS's first conversion of a type imports what warns
-    message_class(f"{_kind.__module__.split('.')[0]}/msg/{_kind.__name__}")
-
-_RANGES = {
-    f"{sign}int{bits}": st.integers(
-        0 if sign else -(2 ** (bits - 1)), (2**bits if sign else 2 ** (bits - 1)) - 1
-    )
-    for sign in ("", "u")
-    for bits in (8, 16, 32, 64)
-}
-_TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
+KINDS = [message_class(name.replace("/", "/msg/")) for name in (*TYPES, "std_msgs/Int32")]
 
 
-def values(type_name: str, default: Any) -> st.SearchStrategy[Any]:
-    """Values of a field."""
-    if type_name.startswith("sequence<"):
-        item = type_name[len("sequence<") : -1]
-        return st.lists(values(item, None), max_size=5)
-    if hasattr(default, "dtype"):
-        numbers = st.floats(allow_nan=False)
-        return st.lists(numbers, min_size=default.size, max_size=default.size)
-    if type_name == "boolean":
-        return st.booleans()
-    if type_name in ("float", "double"):
-        return st.floats(allow_nan=False, width=32 if type_name == "float" else 64)
-    if type_name == "string":
-        return _TEXT
-    return _RANGES[type_name]
-
-
-@st.composite
-def messages(draw: st.DrawFn, kind: Any) -> Any:
-    """Messages of a class with any values that ROS accepts."""
-    message = kind()
-    for name, type_name in kind.get_fields_and_field_types().items():
-        default = getattr(message, name)
-        if hasattr(default, "get_fields_and_field_types"):
-            setattr(message, name, draw(messages(type(default))))
-        else:
-            setattr(message, name, draw(values(type_name, default)))
-    return message
-
-
-@pytest.mark.parametrize("kind", QUICK, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_what_is_written_and_read_is_what_ros_writes_and_reads(kind: Any) -> None:
     quick = cdr(kind)
     assert quick is not None
     encode, decode = quick
 
-    @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-    @given(messages(kind))
-    def check(message: Any) -> None:
+    @settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(right_messages(kind))
+    def check(messages: tuple[Any, Any]) -> None:
+        _, message = messages
         data, by_ros = encode(message), serialize_message(message)
         # Not equal: rclpy fills neither the gaps between numbers nor all that it reserves.
         assert len(data) <= len(by_ros)
         for each in (data, by_ros):
-            read, expected = decode(each), deserialize_message(each, kind)
-            assert read == expected
-            assert repr(read) == repr(expected)
-            assert encode(read) == data
+            assert parts(decode(each)) == parts(deserialize_message(each, kind))
+            assert encode(decode(each)) == data
 
     check()
-
-
-@pytest.mark.parametrize("kind", LEFT_TO_ROS, ids=lambda kind: kind.__name__)
-def test_what_is_out_of_the_ordinary_is_left_to_ros(kind: Any) -> None:
-    assert cdr(kind) is None
-    carrier = message_carrier(kind)
-    assert carrier.decode(carrier.encode(kind())) == kind()
-
-
-@pytest.mark.parametrize(
-    "text", ["before\0after", "\udc80"], ids=["a NUL within", "half of a surrogate pair"]
-)
-def test_text_that_ros_changes_or_refuses_is_changed_or_refused_alike(text: str) -> None:
-    message, carrier = String(data=text), message_carrier(String)
-    expected = outcome(lambda m: deserialize_message(serialize_message(m), String), message)
-    assert outcome(lambda m: carrier.decode(carrier.encode(m)), message) == expected
-
-
-def test_an_array_of_another_type_is_left_to_ros() -> None:
-    message = Image()
-    message._data = array("H", [1, 2])
-    carrier = message_carrier(Image)
-    assert isinstance(carrier, QuickCarrier)
-    assert outcome(carrier.encode, message) == outcome(serialize_message, message)
 
 
 def test_senders_of_the_other_byte_order_are_understood() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from neuros.transport.making import make_packet
+from neuros.transport.copying import make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.ownership import is_unshared_inside
 

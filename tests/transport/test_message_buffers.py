@@ -20,6 +20,7 @@ from neuros.transport.copying import copy_packet
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.messages import message_class
 from neuros.transport.packet_segment import SegmentReader, SegmentWriter
+from neuros.transport.values import checker
 
 message_class("sensor_msgs/msg/Image")  # loads what ROS needs for its first message
 
@@ -145,7 +146,7 @@ class TestLateMessages:
         for made in (
             copy.copy,
             copy.deepcopy,
-            copy_packet,
+            lambda m: copy_packet(checker(type(packet))(m)),
             lambda m: pickle.loads(pickle.dumps(m)),
         ):
             twin = made(late(packet, tmp_path))

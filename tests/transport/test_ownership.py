@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Path
 from sensor_msgs.msg import Image, Imu, JointState
-from std_msgs.msg import ColorRGBA, Float64MultiArray, Header, String
+from std_msgs.msg import Float64MultiArray, Header, String
 
 from neuros.transport.copying import copy_packet
 from neuros.transport.messages import message_class
@@ -44,7 +44,7 @@ MAKERS = [image, imu, path, joints, PoseStamped, Vector3Stamped, Float64MultiArr
 @pytest.fixture(autouse=True, scope="module")
 def loaded_classes() -> None:
     """As a transport loads them, which keeps ROS's deprecation warnings to itself."""
-    for kind in {type(make()) for make in MAKERS} | {String, ColorRGBA}:
+    for kind in {type(make()) for make in MAKERS} | {String}:
         message_class(f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}")
 
 
@@ -142,25 +142,9 @@ def test_an_array_that_shows_the_memory_of_another_is_not_handed_over() -> None:
     assert not is_unshared_inside(packet)
 
 
-def unusual() -> list[Any]:
-    swapped, fixed = Imu(), Imu()
-    swapped._orientation_covariance = numpy.zeros(9, ">f8")
-    fixed.orientation_covariance.flags.writeable = False
-    return [
-        String(data="grüße"),
-        String(data="before\0after"),
-        ColorRGBA(r=0.1),
-        Float64MultiArray(data=[1.0]),
-        swapped,
-        fixed,
-    ]
-
-
-@pytest.mark.parametrize("place", range(6))
-def test_what_ros_would_convert_is_not_handed_over_as_it_is(place: int) -> None:
-    packet = unusual()[place]
-    if isinstance(packet, Float64MultiArray):
-        packet._data = (1.0,)
+def test_an_array_that_cannot_be_written_to_is_not_handed_over() -> None:
+    packet = Imu()
+    packet.orientation_covariance.flags.writeable = False
     assert not is_unshared_inside(packet)
 
 

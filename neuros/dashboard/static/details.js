@@ -43,7 +43,8 @@ export class Details {
     if (!node || !node.hooks) return;
     this.row("doing").show("now", `${node.state} ${node.executing ?? node.cause}`);
     for (const [state, share] of Object.entries(node.shares)) {
-      if (share > 0.0005) this.row(`share ${state}`).show(state, percent(share));
+      const isNew = !this.rows.has(`share ${state}`);
+      if (share > 0.0005 || !isNew) this.row(`share ${state}`).show(state, percent(share));
     }
     for (const [hook, books] of Object.entries(node.hooks)) {
       this.row(`hook ${hook}`).show(hook,

@@ -14,6 +14,7 @@ const log = new Log();
 let view = null;
 let stream = null;
 let hasEnded = false;
+let lastFigures = null;
 
 const handlers = {
   begin(plan) {
@@ -35,6 +36,7 @@ const handlers = {
     window.neuros = view; // for the console of the browser
   },
   figures(figures) {
+    lastFigures = figures;
     view.graph.show(figures);
     view.tables.show(figures);
     view.details.showFigures(figures);
@@ -61,6 +63,13 @@ const handlers = {
   load(load) { showLoad(load); },
 };
 
+// Nobody says any more what the nodes do.
+function forgetStates() {
+  if (!lastFigures) return;
+  const unknown = Object.keys(lastFigures.nodes).map((name) => [name, {state: "unknown"}]);
+  handlers.figures({...lastFigures, nodes: Object.fromEntries(unknown)});
+}
+
 function showPhase(name, text) {
   const phase = document.querySelector("#phase");
   phase.className = name;
@@ -83,6 +92,7 @@ function open() {
     if (hasEnded) close();
     else {
       showPhase("lost", "no connection");
+      forgetStates();
       enable({pause: false, resume: false, step: false, stop: false});
     }
   };

@@ -8,7 +8,7 @@ export class Tables {
     const nodes = document.querySelector("#nodes tbody");
     connections.replaceChildren();
     nodes.replaceChildren();
-    const numbers = Array(6).fill("number");
+    const numbers = Array(7).fill("number");
     const all = [...plan.connections, ...plan.topics.map((t) => ({...t, guarantee: "topic"}))];
     this.connections = new Map(all.map((c) => [c.name,
       {plan: c, row: selectable(new Row(connections, c.name, ["", "", ...numbers]),
@@ -28,7 +28,7 @@ export class Tables {
       const out = plan.discard_limit === null || c.outstanding === undefined
         ? "–" : `${c.outstanding} of ${plan.window}`;
       row.show(plan.title ?? name, plan.guarantee, number(c.sent ?? c.received), rate(c.rate_hz),
-        milliseconds(c.latency_ms), out, number(c.unread), number(c.discarded));
+        milliseconds(c.latency_ms), out, number(c.unread), number(c.discarded), number(c.lost));
     }
     for (const [name, row] of this.nodes) {
       const node = figures.nodes[name];

@@ -38,6 +38,16 @@ _CAUSES = (
         " has with --base-image",
     ),
     (
+        r"(?P<what>\S+): pull access denied, repository does not exist",
+        "there is no image {what} to begin from: correct the FROM line, or name one that the engine"
+        " has with --base-image",
+    ),
+    (
+        r"dockerfile parse error.*unknown flag: (?P<what>[\w-]+)",
+        "its Dockerfile uses the option --{what}, which this engine is too old for: install a newer"
+        " one, or write the step without",
+    ),
+    (
         r"Get \"?https?://(?P<what>[^/\"]+)|lookup (?P<also>\S+).* no such host",
         "the registry {what} cannot be reached: check the network and the engine's proxy, or name"
         " an image that the engine has with --base-image",
@@ -57,7 +67,10 @@ _CAUSES = (
         r"Permission denied|are you root\?",
         "a step may not write: images of NeuROS run as an ordinary user, so put USER 0 above it",
     ),
-    (r"COPY failed|ADD failed", "a file that its Dockerfile copies is not beside it"),
+    (
+        r"COPY failed|ADD failed|(compute cache key|calculate checksum).*: not found",
+        "a file that its Dockerfile copies is not beside it",
+    ),
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,12 +15,14 @@ from docker.errors import APIError
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
 from neuros.launch.docker.build_log import BuildLog
+from neuros.launch.docker.buildkit import buildkit_messages, named, require_buildkit
 from neuros.launch.docker.context import CERTIFICATES, Surroundings, context_of
-from neuros.launch.docker.dockerfile import after_each_from, label_line
+from neuros.launch.docker.dockerfile import after_each_from, label_line, needs_buildkit
 from neuros.launch.docker.python_in_image import PythonInImage, python_in
 from neuros.launch.docker.recipes import BASE, BASE_ARGUMENT, find_recipe
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
+_DOCKERFILE = "Dockerfile"
 
 
 class BuildSteps:
@@ -55,14 +57,22 @@ class BuildSteps:
         Raises:
             EnvironmentFault: if it fails.
         """
+        found = needs_buildkit(dockerfile)
+        if found:
+            require_buildkit(self._engine, self._name, dockerfile, *found)
         if self._around.lines:
             dockerfile = after_each_from(dockerfile, self._around.lines)
         given = {**self._around.arguments, **arguments}
-        archive = context_of(folder, dockerfile, self._around.files)
-        return self._run(archive, buildargs=given, network_mode=self._around.network)
+        settings = {"network_mode": self._around.network}
+        if not found:
+            archive = context_of(folder, dockerfile, self._around.files)
+            return self._run(archive, buildargs=given, **settings)
+        with named(self._engine, {**given, _DOCKERFILE: dockerfile}) as texts:
+            archive = context_of(folder, texts.pop(_DOCKERFILE), self._around.files)
+            with buildkit_messages(self._engine, archive, buildargs=texts, **settings) as messages:
+                return self._follow(messages)
 
     def _run(self, archive: io.BytesIO, **settings: Any) -> str:
-        log = BuildLog(self._log, lambda line: self._progress.detail(f"{self._name}: {line}"))
         # The classic builder's API: each line of its output is a JSON object.
         stream = self._engine.api.build(
             fileobj=archive,
@@ -72,7 +82,11 @@ class BuildSteps:
             forcerm=True,
             **settings,
         )
-        image = log.follow(stream)
+        return self._follow(stream)
+
+    def _follow(self, messages: Iterable[Mapping[str, Any]]) -> str:
+        log = BuildLog(self._log, lambda line: self._progress.detail(f"{self._name}: {line}"))
+        image = log.follow(messages)
         if image is None:
             for line in log.tail:
                 self._progress.step(f"  {line[:300]}")

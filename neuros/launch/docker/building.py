@@ -1,8 +1,8 @@
 """Builds the images of recipes: parents first, what is current not again, a tag for the whole only.
 
 Each image is built without a name, is run once to see that it can run nodes, gets what it lacks for
-that (the recipe ``neuros_python`` on top of it), and its tag last. The classic builder is used,
-which every engine has.
+that (the recipe ``neuros_python`` on top of it), and its tag last. The classic builder is used, and
+BuildKit where a Dockerfile takes it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 from docker import DockerClient
 from docker.errors import APIError, ImageNotFound
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.progress import Progress
 from neuros.launch.containers import bare_name
 from neuros.launch.docker.build_steps import BuildSteps, pulled
@@ -72,12 +72,15 @@ class ImageBuilder:
         """Build what is missing or out of date of these and of what they begin from.
 
         Raises:
+            UsageError: for a base image that would not be used; nothing is built then.
             EnvironmentFault: at the first that cannot be built; those before it are kept.
         """
         recipes = list(recipes)
         with engine_faults("images cannot be built"):
             bases = self._remembered_bases(recipes) | dict(self._wishes.bases)
-        for recipe in in_order(recipes, bases):
+        wanted = in_order(recipes, bases)
+        _require_use(self._wishes.bases, wanted)
+        for recipe in wanted:
             with engine_faults(f"image '{recipe.name}' cannot be built"):
                 self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
 
@@ -111,9 +114,11 @@ class ImageBuilder:
 
     def _remembered_bases(self, recipes: Iterable[Recipe]) -> dict[str, str]:
         """The base images that the user wanted when these were built last."""
-        built = {recipe.name: built_image(recipe, self._engine) for recipe in in_order(recipes)}
+        built = [(recipe, built_image(recipe, self._engine)) for recipe in in_order(recipes)]
         return {
-            name: base for name, old in built.items() if old and (base := old.labels.get(_BASE))
+            recipe.name: base
+            for recipe, old in built
+            if old and (base := old.labels.get(_BASE)) and recipe.takes(base)
         }
 
     def _bring_up_to_date(self, recipe: Recipe, base: str) -> None:
@@ -194,6 +199,25 @@ class ImageBuilder:
     def _report(self, text: str, started_s: float, image: Any | None = None) -> None:
         size = f", {_size(image)}" if image is not None else ""
         self._progress.step(f"{text} in {time.monotonic() - started_s:.1f} s{size}")
+
+
+def _require_use(bases: Mapping[str, str], recipes: Iterable[Recipe]) -> None:
+    """Raise ``UsageError`` where an image that is to be begun from would not be."""
+    by_name = {recipe.name: recipe for recipe in recipes}
+    for name, base in bases.items():
+        recipe = by_name.get(name)
+        if recipe is None:
+            names = ", ".join(sorted(by_name)) or "none"
+            raise UsageError(
+                f"--base-image {name}={base}: no container '{name}' is built here; those that are:"
+                f" {names}"
+            )
+        if not recipe.takes(base):
+            raise UsageError(
+                f"--base-image {name}={base}: {recipe.folder}/Dockerfile does not begin from"
+                f" {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
+                f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
+            )
 
 
 def _is_as_wanted(image: Any, labels: Mapping[str, str]) -> bool:

@@ -72,7 +72,7 @@ def surroundings(
     is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
     has_bridge = any(network.name == "bridge" for network in engine.networks.list())
     return Surroundings(
-        arguments={"SYSTEM_PACKAGES": ""} if wheels else proxies,
+        arguments={"SYSTEM_PACKAGES": "", "WINDOWS": "no"} if wheels else proxies,
         network="host" if wheels or is_here or not has_bridge else None,
         ca_bundle=ca_bundle.read_bytes() if ca_bundle else b"",
         wheels=wheels,

@@ -1,16 +1,86 @@
-"""What of a Dockerfile decides about the order of builds: its stages, and what they begin from."""
+"""What of a Dockerfile decides about its build: instructions, stages, what they begin from."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
-_CONTINUED = re.compile(r"\\[ \t]*\n")
-_INSTRUCTION = re.compile(r"^[ \t]*(ARG|FROM)[ \t]+(.+?)[ \t]*$", re.IGNORECASE)
 _VARIABLE = re.compile(r"\$(?:\{(\w+)(?::-([^}]*))?\}|(\w+))")
+_HEREDOC = re.compile(r"(?:^|\s)\d*<<(-?)([\"']?)([A-Za-z_][\w.-]*)\2(?=[\s;|&)]|$)")
+_FLAG = re.compile(r"--(\w[\w-]*)")
 _NOTHING: Mapping[str, str] = MappingProxyType({})
+
+# What only BuildKit understands of the instructions that the classic builder knows, too.
+_FLAGS_OF_BUILDKIT = {
+    "RUN": {"mount", "network", "security", "device"},
+    "COPY": {"link", "chmod", "parents", "exclude"},
+    "ADD": {"link", "chmod", "checksum", "keep-git-dir", "exclude", "unpack"},
+}
+_ARGUMENT_OF_BUILDKIT = re.compile(r"\b(?:TARGET|BUILD)(?:PLATFORM|OS|ARCH|VARIANT)\b")
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """One instruction.
+
+    Attributes:
+        name: in capital letters.
+        text: what stands behind the name, on one line; without its heredocs.
+        first: the number of its first line, from 1.
+        last: the number of its last line, those of heredocs included.
+        heredocs: the names of its heredocs (``<<EOF``).
+    """
+
+    name: str
+    text: str
+    first: int
+    last: int
+    heredocs: tuple[str, ...] = ()
+
+    @property
+    def flags(self) -> list[str]:
+        """The names of its options: those before everything else."""
+        names = []
+        for word in self.text.split():
+            match = _FLAG.match(word)
+            if match is None:
+                break
+            names.append(match[1])
+        return names
+
+
+def instructions(text: str) -> Iterator[Instruction]:
+    """The instructions of a Dockerfile, in order."""
+    lines = text.splitlines()
+    found = [re.match(r"#\s*escape\s*=\s*(\S)", line, re.IGNORECASE) for line in _directives(text)]
+    escape = next((match[1] for match in found if match), "\\")
+    at = 0
+    while at < len(lines):
+        parts: list[str] = []
+        first, goes_on = at, True
+        while goes_on and at < len(lines):
+            line = lines[at].strip()
+            at += 1
+            if not line or line.startswith("#"):
+                goes_on = bool(parts)  # within an instruction they do not count
+                continue
+            goes_on = line.endswith(escape)
+            parts.append(line[:-1].strip() if goes_on else line)
+        name, _, rest = " ".join(parts).partition(" ")
+        name, rest = name.upper(), rest.strip()
+        heredocs = _HEREDOC.findall(rest) if name in _FLAGS_OF_BUILDKIT else []
+        for strips, _quote, end in heredocs:
+            while at < len(lines):
+                line = lines[at].lstrip("\t") if strips else lines[at]
+                at += 1
+                if line == end:
+                    break
+        if name:
+            yield Instruction(name, rest, first + 1, at, tuple(each[2] for each in heredocs))
 
 
 def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
@@ -22,16 +92,13 @@ def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
     values: dict[str, str] = {}
     images: list[str] = []
     stages: set[str] = set()
-    for line in _CONTINUED.sub(" ", text).splitlines():
-        match = _INSTRUCTION.match(line)
-        if match is None:
+    for each in instructions(text):
+        if each.name == "ARG" and not images:
+            for name, default in _declared(each):
+                values[name] = arguments.get(name, _filled(default, values))
+        if each.name != "FROM":
             continue
-        if match[1].upper() == "ARG":
-            if not images:
-                name, _, default = match[2].partition("=")
-                values[name] = arguments.get(name, _filled(_unquoted(default), values))
-            continue
-        words = [word for word in match[2].split() if not word.startswith("--")]
+        words = [word for word in each.text.split() if not word.startswith("--")]
         image = _filled(words[0], values) if words else ""
         if image not in stages:
             images.append(image)
@@ -42,19 +109,35 @@ def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
 
 def arguments_of(text: str) -> set[str]:
     """The names of all build arguments that it declares."""
-    return set(re.findall(r"^[ \t]*ARG[ \t]+(\w+)", text, re.IGNORECASE | re.MULTILINE))
+    return {
+        name for each in instructions(text) if each.name == "ARG" for name, _ in _declared(each)
+    }
+
+
+def needs_buildkit(text: str) -> tuple[Instruction, str] | None:
+    """The first instruction that the classic builder cannot do, and what of it; ``None``: none."""
+    for each in instructions(text):
+        further = _FLAGS_OF_BUILDKIT.get(each.name, set())
+        if each.heredocs:
+            return each, f"{each.name} <<{each.heredocs[0]}"
+        if flags := [flag for flag in each.flags if flag in further]:
+            return each, f"{each.name} --{flags[0]}"
+        if each.name in ("ARG", "FROM") and (match := _ARGUMENT_OF_BUILDKIT.search(each.text)):
+            return each, f"{each.name} {match[0]}"
+    return None
+
+
+def has_syntax_line(text: str) -> bool:
+    """Whether it names its own frontend (``# syntax=...``), which a registry has."""
+    return any(re.match(r"#\s*syntax\s*=", line, re.IGNORECASE) for line in _directives(text))
 
 
 def after_each_from(text: str, lines: str) -> str:
     """The Dockerfile with ``lines`` behind each ``FROM``: they count in all of its stages."""
+    ends = {each.last for each in instructions(text) if each.name == "FROM"}
     found = []
-    is_from = False
-    for line in text.splitlines():
-        found.append(line)
-        is_from = is_from or bool(re.match(r"[ \t]*FROM[ \t]", line, re.IGNORECASE))
-        if is_from and not line.rstrip().endswith("\\"):
-            found.append(lines)
-            is_from = False
+    for number, line in enumerate(text.splitlines(), 1):
+        found += [line, lines] if number in ends else [line]
     return "\n".join(found) + "\n"
 
 
@@ -65,8 +148,12 @@ def on_images(text: str, tags: Mapping[str, str]) -> str:
         name = match[2].removesuffix(":latest")
         return f"{match[1]}{tags[name]}" if name in tags else match[0]
 
-    head = r"(?im)^([ \t]*(?:FROM[ \t]+(?:--\S+[ \t]+)*|ARG[ \t]+\w+=[\"']?))([^\s\"']+)"
-    return re.sub(head, renamed, text)
+    head = r"(?i)^([ \t]*(?:FROM[ \t]+(?:--\S+[ \t]+)*|ARG[ \t]+\w+=[\"']?))([^\s\"']+)"
+    begins = {each.first for each in instructions(text) if each.name in ("FROM", "ARG")}
+    return "".join(
+        re.sub(head, renamed, line) if number in begins else line
+        for number, line in enumerate(text.splitlines(keepends=True), 1)
+    )
 
 
 def label_line(labels: Mapping[str, str]) -> str:
@@ -79,5 +166,20 @@ def _filled(text: str, values: Mapping[str, str]) -> str:
     return _VARIABLE.sub(lambda m: values.get(m[1] or m[3], "") or m[2] or "", text)
 
 
-def _unquoted(text: str) -> str:
-    return text.strip().strip("\"'")
+def _declared(instruction: Instruction) -> Iterator[tuple[str, str]]:
+    """The names, and the defaults, of the arguments that an ``ARG`` declares."""
+    try:
+        words = shlex.split(instruction.text)
+    except ValueError:  # a quotation mark too many: the engine says so
+        words = instruction.text.split()
+    for word in words:
+        name, _, default = word.partition("=")
+        yield name, default
+
+
+def _directives(text: str) -> Iterator[str]:
+    """The lines for the parser, which stand above everything else."""
+    for line in text.splitlines():
+        if not re.match(r"#\s*\w+\s*=", line):
+            return
+        yield line

@@ -95,6 +95,22 @@ def engine_faults(doing: str) -> Iterator[None]:
         raise EnvironmentFault(f"{doing}: {error}") from error
 
 
+def engine_socket(engine: DockerClient) -> str:
+    """The Unix socket of the engine.
+
+    Raises:
+        EnvironmentFault: if it is reached in another way. It may be on another machine then, where
+            the folders of the project and of the run are not.
+    """
+    path = getattr(engine.api.get_adapter(engine.api.base_url), "socket_path", None)
+    if path is None:
+        raise EnvironmentFault(
+            f"the Docker engine at {engine.api.base_url} may be on another machine: set"
+            " DOCKER_HOST to the socket of one on this machine (unix:///var/run/docker.sock)"
+        )
+    return str(path)
+
+
 def explain(text: str) -> str:
     """What the engine said, on one line, with a remedy where there is a known one."""
     said = " ".join(text.split())

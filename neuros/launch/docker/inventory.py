@@ -8,10 +8,11 @@ from pathlib import Path
 
 from docker import DockerClient
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.launch.docker.engine import engine_faults
 from neuros.launch.docker.images import ADDED, CONTAINER, DIGEST, FOLDER, PYTHON
 from neuros.launch.docker.recipes import find_recipe
+from neuros.project.suggest import did_you_mean, listed
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,18 @@ def remove_images(engine: DockerClient, containers: Collection[str]) -> Iterator
     """Remove what was built for these containers, or for all if none is named; yields the tags.
 
     Raises:
+        UsageError: if nothing was built for one of them; all images stay then.
         EnvironmentFault: if an image is in use.
     """
-    for image in reversed(inventory(engine)):
+    images = inventory(engine)
+    built = {image.container for image in images}
+    if unknown := [name for name in containers if name not in built]:
+        hint = did_you_mean(unknown[0], built) if len(unknown) == 1 else ""
+        raise UsageError(
+            f"NeuROS has built no image for {listed(unknown)}{hint and f' ({hint})'}: nothing was"
+            " removed; `neuros containers list` shows what there is"
+        )
+    for image in reversed(images):
         if not containers or image.container in containers:
             for tag in image.tags:
                 with engine_faults(f"{tag} cannot be removed"):

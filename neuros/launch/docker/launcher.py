@@ -16,13 +16,14 @@ from docker import DockerClient
 from neuros.errors import EnvironmentFault
 from neuros.launch.dead_runs import hold
 from neuros.launch.docker.container import RunningContainer
-from neuros.launch.docker.engine import Abilities, connect, engine_faults
+from neuros.launch.docker.engine import Abilities, connect, engine_faults, engine_socket
 from neuros.launch.docker.images import Image, images_for
 from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, shared_memory
 from neuros.launch.docker.watch import ContainerWatch
-from neuros.launch.host_command import log_file
+from neuros.launch.host_command import log_file, node_folder
 from neuros.launch.placement import Cores, on_cores
 from neuros.launch.run_processes import RUN_ID
+from neuros.project.load import PROJECT_FILE
 from neuros.project.model import NodeFile
 from neuros.project.resources import memory_text
 
@@ -105,8 +106,12 @@ class DockerLauncher:
         with engine_faults("the engine's events cannot be listened to"):
             watch = ContainerWatch(self._engine, environment.get(RUN_ID, ""))
         watch.start()
+        in_run_folder = _in_run_folder(nodes)
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
-            work = [threads.submit(self._start_one, node, environment, watch) for node in nodes]
+            work = [
+                threads.submit(self._start_one, node, environment, watch, in_run_folder)
+                for node in nodes
+            ]
         faults = [fault for each in work if (fault := each.exception())]
         started = [each.result() for each in work if not each.exception()]
         if not faults:
@@ -124,11 +129,17 @@ class DockerLauncher:
         return [self._description(node) for node in nodes]
 
     def _start_one(
-        self, file: NodeFile, environment: Mapping[str, str], watch: ContainerWatch
+        self,
+        file: NodeFile,
+        environment: Mapping[str, str],
+        watch: ContainerWatch,
+        in_run_folder: Sequence[Path],
     ) -> RunningContainer:
         name, mem_bytes = file.node.name, file.node.resources.mem_bytes
         with engine_faults(f"the container of node '{name}' cannot be started"):
-            container = self._engine.containers.create(**self._settings(file, environment))
+            container = self._engine.containers.create(
+                **self._settings(file, environment, in_run_folder)
+            )
             container.start()
         return RunningContainer(
             name,
@@ -139,13 +150,16 @@ class DockerLauncher:
             mem_bytes=mem_bytes,
         )
 
-    def _settings(self, file: NodeFile, environment: Mapping[str, str]) -> dict[str, Any]:
+    def _settings(
+        self, file: NodeFile, environment: Mapping[str, str], in_run_folder: Sequence[Path]
+    ) -> dict[str, Any]:
         return container_settings(
             file,
             self._images[file.node.container],
             user_for(file, self._environ, is_rootless=self._is_rootless),
             self._options,
             environment,
+            others=[path for path in in_run_folder if path != node_folder(file)],
             cores=self._placement.get(file.node.name),
             launcher_pid=os.getpid(),
         )
@@ -158,20 +172,10 @@ class DockerLauncher:
         return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
 
 
-def engine_socket(engine: DockerClient) -> str:
-    """The Unix socket of the engine.
-
-    Raises:
-        EnvironmentFault: if it is reached in another way. It may be on another machine then, where
-            the folders of the project and of the run are not.
-    """
-    path = getattr(engine.api.get_adapter(engine.api.base_url), "socket_path", None)
-    if path is None:
-        raise EnvironmentFault(
-            f"the Docker engine at {engine.api.base_url} may be on another machine: set"
-            " DOCKER_HOST to the socket of one on this machine (unix:///var/run/docker.sock)"
-        )
-    return str(path)
+def _in_run_folder(nodes: Sequence[NodeFile]) -> list[Path]:
+    """What is there before any node runs, and is not to be written by all: folders, the project."""
+    entries = sorted(nodes[0].folders.run.iterdir())
+    return [path for path in entries if path.is_dir() or path.name == PROJECT_FILE]
 
 
 def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:

@@ -56,6 +56,10 @@ class Recipe:
         """Whether it is one of NeuROS's."""
         return self.folder.parent == OWN_FOLDER
 
+    def takes(self, base: str) -> bool:
+        """Whether it begins from ``base`` if that is its ``BASE_IMAGE``."""
+        return base in images_in(self.dockerfile, {BASE_ARGUMENT: base})
+
     def parents_on(self, base: str | None) -> list[Recipe]:
         """The parents that are left where ``base`` replaces the default of ``BASE_IMAGE``."""
         if base is None:

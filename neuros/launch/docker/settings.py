@@ -2,8 +2,9 @@
 
 By default a container is locked down: the caller's user id and no capability, nothing gained by
 programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
-goes with it. It sees the project and the workspace, which it can read, and the run folder, which
-it can write.
+goes with it. It sees the project and the workspace, which it can read, and the run folder, where it
+can write new files and into a folder of its own: what the other nodes and the run itself have there
+it can only read.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ def container_settings(
     options: Sequence[str],
     environment: Mapping[str, str],
     *,
+    others: Sequence[Path] = (),
     cores: Cores | None = None,
     launcher_pid: int = 0,
 ) -> dict[str, Any]:
@@ -94,6 +96,7 @@ def container_settings(
         file: the node with the paths of this machine.
         options: of the command ``node``, as ``--debug``.
         environment: what the run adds to that of each node.
+        others: what is in the run folder and not the node's own; it can only read that.
         launcher_pid: said in a label.
     """
     node, resources = file.node, file.node.resources
@@ -106,7 +109,7 @@ def container_settings(
         "environment": _environment(file, user, environment, cores),
         "working_dir": str(FOLDERS.run),
         "labels": _labels(file, run_id, launcher_pid),
-        "mounts": _mounts(file, user, run_id),
+        "mounts": _mounts(file, user, run_id, others),
         "user": f"{user.uid}:{user.gid}",
         "group_add": [str(group) for group in user.groups],
         "cap_drop": ["ALL"],
@@ -189,7 +192,9 @@ def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
     }
 
 
-def _mounts(file: NodeFile, user: User, run_id: str) -> list[dict[str, Any]]:
+def _mounts(
+    file: NodeFile, user: User, run_id: str, others: Sequence[Path]
+) -> list[dict[str, Any]]:
     package = Path(neuros.__file__).resolve().parent
     own = node_folder(file) / "node.json"
     mounts = [
@@ -198,6 +203,7 @@ def _mounts(file: NodeFile, user: User, run_id: str) -> list[dict[str, Any]]:
         _mount(file.folders.run, FOLDERS.run, read_only=False),
         # In a folder that it may write to; but what it was told stays as it was.
         _mount(own, node_folder(inside(file)) / own.name),
+        *(_mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
         _mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
     ]
     if file.folders.workspace.is_dir():  # an installed NeuROS comes without one

@@ -12,8 +12,7 @@ import requests
 from docker.errors import DockerException, ImageNotFound
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.engine import connect, engine_faults
-from neuros.launch.docker.launcher import engine_socket
+from neuros.launch.docker.engine import connect, engine_faults, engine_socket
 from neuros.launch.guardian import Guardian
 from neuros.launch.leftover_containers import RUN_LABEL
 from neuros.launch.run_processes import RUN_ID

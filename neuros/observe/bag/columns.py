@@ -8,7 +8,13 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from neuros.observe.bag.layout import Irregular, Layout, layout_of
+from neuros.observe.bag.layout import (
+    LITTLE_ENDIAN,
+    Irregular,
+    Layout,
+    field_names,
+    layout_of,
+)
 
 Column = npt.NDArray[Any]
 
@@ -32,12 +38,22 @@ def columns_of(packets: Sequence[bytes], type_name: str, store: TypeStore) -> di
     a column of objects.
     """
     if not packets:
-        return {}
+        return _of_none(type_name, store)
     found: dict[str, list[tuple[npt.NDArray[np.intp], Column]]] = {}
     for rows, columns in _parts(packets, type_name, store):
         for name, column in columns.items():
             found.setdefault(name, []).append((rows, column))
     return {name: _join(parts, len(packets)) for name, parts in found.items()}
+
+
+def _of_none(type_name: str, store: TypeStore) -> dict[str, Column]:
+    """The columns of no message: those of one whose strings and sequences are empty."""
+    try:
+        layout = layout_of(LITTLE_ENDIAN, type_name, store.fielddefs)
+    except Irregular:
+        return {name: np.empty(0, object) for name in field_names(type_name, store.fielddefs)}
+    numbers = {name: np.zeros((0, *kind.shape), kind.base) for name, kind, _ in layout.numbers}
+    return numbers | {name: np.zeros(0, "U1") for name, _, _ in layout.texts}
 
 
 def _parts(

@@ -8,7 +8,7 @@ same lengths at the same places (plain CDR: OMG DDSI-RTPS 2.5, 10.2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -17,12 +17,13 @@ import numpy as np
 Fields: TypeAlias = "Mapping[str, Any]"
 
 HEADER_BYTES = 4
-_LITTLE_ENDIAN = b"\0\1\0\0"
+LITTLE_ENDIAN = b"\0\1\0\0"
 _NUMBERS = {
     "bool": "?", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2",
     "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8",
     "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
+_EMPTY = "structure_needs_at_least_one_member"
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 
 
@@ -56,11 +57,20 @@ def layout_of(data: bytes, type_name: str, types: Mapping[str, Any]) -> Layout:
     Raises:
         Irregular: if it has none.
     """
-    if data[:HEADER_BYTES] != _LITTLE_ENDIAN:
+    if data[:HEADER_BYTES] != LITTLE_ENDIAN:
         raise Irregular
     walk = _Walk(data, types)
     walk.message(type_name, "")
     return walk.layout
+
+
+def field_names(type_name: str, types: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The names of all fields, those of messages within the message with dots."""
+    for name, (kind, details) in types[type_name][1]:
+        if kind.value == _NAME:
+            yield from field_names(details, types, f"{prefix}{name}.")
+        elif not name.startswith(_EMPTY):
+            yield f"{prefix}{name}"
 
 
 class _Walk:
@@ -74,7 +84,7 @@ class _Walk:
 
     def message(self, type_name: str, prefix: str) -> None:
         for name, (kind, details) in self._types[type_name][1]:
-            if not name.startswith("structure_needs_at_least_one_member"):
+            if not name.startswith(_EMPTY):
                 self._field(f"{prefix}{name}", kind.value, details)
             else:
                 self._at += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -98,6 +99,8 @@ class RecordedTopic:
     def frame(self) -> Any:
         """A ``pandas.DataFrame``, one row per packet; arrays get a column for each element.
 
+        Its index ``time`` is the wall time (UTC) at which packets were sent.
+
         Raises:
             EnvironmentFault: if pandas is not installed.
         """
@@ -108,16 +111,18 @@ class RecordedTopic:
                 f"pandas is not installed for {sys.executable}: pip install pandas, or use array()"
             ) from error
         spread: dict[str, Any] = {}
-        for name, column in self.columns().items():
-            elements = column.reshape(len(column), -1).shape[1] if len(column) else 1
+        columns = self.columns()
+        for name, column in columns.items():
+            elements = math.prod(column.shape[1:])
             if column.ndim == 1:
                 spread[name] = column
             elif elements <= _MOST_COLUMNS:
-                for place, single in enumerate(column.reshape(len(column), -1).T):
+                for place, single in enumerate(column.reshape(len(column), elements).T):
                     spread[f"{name}[{place}]"] = single
             else:
                 spread[name] = list(column)
-        return pd.DataFrame(spread)
+        time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
+        return pd.DataFrame(spread, index=time.rename("time"))
 
 
 class Bag:
@@ -173,19 +178,22 @@ class Bag:
         return self.custom.get("project")
 
     def __getitem__(self, name: str) -> RecordedTopic:
-        """The topic of that name, of that connection, or of an output with one connection.
+        """The topic of that name, of that connection, or of that output.
+
+        An output sends the same packets to all its receivers; of a run that was cut off, the
+        connection that came furthest is taken.
 
         Raises:
-            KeyError: if there is none, or several; its text names those that there are.
+            KeyError: if there is none; its text names those that there are.
         """
         if name in self.topics:
             return self.topics[name]
         labels = {topic: topic.connection or "" for topic in self.topics.values()}
         fitting = [t for t, label in labels.items() if name in (label, label.partition(" -> ")[0])]
-        if len(fitting) == 1:
-            return fitting[0]
-        there = [t.connection or t.name for t in fitting or self.topics.values()]
-        raise KeyError(f"{name}: {'which of' if fitting else 'there are'} {', '.join(there)}")
+        if fitting:
+            return max(fitting, key=lambda topic: topic.count)
+        there = [topic.connection or topic.name for topic in self.topics.values()]
+        raise KeyError(f"{name}: there are {', '.join(there)}")
 
     def packets_of(self, name: str) -> list[RawPacket]:
         """All packets of a topic, by their wall time."""

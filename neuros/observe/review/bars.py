@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from neuros.observe.review.graph import shares_of
 from neuros.observe.review.run import Run
-from neuros.observe.review.spending import spending_of
 from neuros.observe.review.style import (
     BLUE,
     GREY,
@@ -29,7 +27,7 @@ _MOST_TICKS = 12
 
 def spending_figure(run: Run) -> Any | None:
     """How each node divided its time; ``None`` if none has reported."""
-    spending = spending_of(run)
+    spending = run.spending
     if not spending:
         return None
     names = list(spending)[::-1]
@@ -37,7 +35,7 @@ def spending_figure(run: Run) -> Any | None:
     axes = plain(figure.add_subplot())
     lefts = np.zeros(len(names))
     for state, shade in STATES.items():
-        shares = np.array([100 * shares_of(spending[name])[state] for name in names])
+        shares = np.array([100 * spending[name].shares[state] for name in names])
         axes.barh(names, shares, left=lefts, color=shade, label=state, height=0.65)
         for row, share in enumerate(shares):
             if share >= 6:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from neuros.observe.review.spending import Spending
+from neuros.core.spending import Spending
 from neuros.project.model import Connection
 
 WORTH_NAMING = 0.02
@@ -158,7 +158,7 @@ def _largest(node: str, spent: Spending, running_s: float) -> Step:
     elif state == "waiting":
         causes = spent.waiting
     cause = max(causes, key=lambda cause: causes[cause], default="")
-    return Step(node, state, cause, sums[state] / running_s)
+    return Step(node, state, cause, spent.share(sums[state]))
 
 
 def _held_up_by(

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from neuros.observe.report import consumed_percent
 from neuros.observe.review.run import Run
-from neuros.observe.review.spending import spending_of
 from neuros.observe.review.style import colour, new_figure, plain
 
 _Cells = Callable[[Run], float | None]
@@ -62,13 +62,13 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, int, _Cells]]:
         figures += [
             (f"{name}: discard limit", 0, _in_connection(name, "discard_limit")),
             (f"{name}: sent", 0, _in_connection(name, "sent")),
-            (f"{name}: consumed / %", 1, _delivery(name)),
+            (f"{name}: consumed / %", 1, _consumed(name)),
             (f"{name}: rate / Hz", 1, _in_connection(name, "rate_hz")),
             (f"{name}: median latency / ms", 2, _in_connection(name, "latency_ms", "p50")),
             (f"{name}: 99 % latency / ms", 2, _in_connection(name, "latency_ms", "p99")),
         ]
     for name in _all(runs, "nodes"):
-        figures += [(f"{name}: executes / %", 1, _executing(name))]
+        figures += [(f"{name}: executing / %", 1, _executing(name))]
         figures += [(f"{name}: mean processor time / % of a core", 1, _processor(name))]
     return figures
 
@@ -91,19 +91,14 @@ def _in_connection(name: str, *keys: str) -> _Cells:
     return cell
 
 
-def _delivery(name: str) -> _Cells:
-    def cell(run: Run) -> float | None:
-        figures = run.connections.get(name, {})
-        sent, consumed = figures.get("sent"), figures.get("consumed")
-        return 100 * consumed / sent if sent and consumed is not None else None
-
-    return cell
+def _consumed(name: str) -> _Cells:
+    return lambda run: consumed_percent(run.connections.get(name, {}))
 
 
 def _executing(name: str) -> _Cells:
     def cell(run: Run) -> float | None:
-        spent = spending_of(run).get(name)
-        return 100 * spent.own_s / spent.total_s if spent and spent.total_s else None
+        spent = run.spending.get(name)
+        return 100 * spent.shares["executing"] if spent and spent.total_s else None
 
     return cell
 
@@ -118,12 +113,12 @@ def _processor(name: str) -> _Cells:
 
 
 def comparison_figure(runs: Sequence[Run]) -> Any | None:
-    """Real-time factor, delivery, latency and executing share; ``None`` if no run has any."""
+    """Real-time factor, consumed packets, latency, executing share; ``None`` if no run has any."""
     panels = [
         (name, [(label, cell) for label, cell in cells])
         for name, cells in (
             ("real-time factor", [("", _of("real_time_factor"))]),
-            ("packets consumed / %", [(n, _delivery(n)) for n in _all(runs, "connections")]),
+            ("packets consumed / %", [(n, _consumed(n)) for n in _all(runs, "connections")]),
             (
                 "median latency / ms",
                 [(n, _in_connection(n, "latency_ms", "p50")) for n in _all(runs, "connections")],

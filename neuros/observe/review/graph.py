@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from neuros.core.spending import Spending
 from neuros.observe.review.run import Run
-from neuros.observe.review.spending import Spending, spending_of
 from neuros.observe.review.style import BLUE, GREY, RED, STATES, new_figure
 from neuros.project.graph import guarantee, port_names
 from neuros.project.layout import Place, lay_out
@@ -20,7 +20,7 @@ def graph_figure(run: Run) -> Any | None:
     """Nodes with how they spent their time, connections with what they carried and how fast."""
     if not run.nodes:
         return None
-    spending = spending_of(run)
+    spending = run.spending
     first = run.time_owner or next(iter(run.nodes))
     known = {
         name: end
@@ -127,27 +127,15 @@ def _draw_node(axes: Any, name: str, place: Place, spent: Spending | None) -> No
     if spent is None or spent.total_s <= 0:
         axes.text(x, y - 0.1, "never reported", ha="center", va="center", fontsize=7)
         return
-    shares = shares_of(spent)
     hook, busy_s = spent.busiest_hook
     if hook:
-        text = _short(f"{hook} {busy_s / spent.total_s:.0%}", 28)
+        text = _short(f"{hook} {spent.share(busy_s):.0%}", 28)
         axes.text(x, y - 0.03, text, ha="center", va="center", fontsize=7)
     left = x - width / 2 + 0.1
-    for state, share in shares.items():
+    for state, share in spent.shares.items():
         wide = share * (width - 0.2)
         axes.barh(y - 0.23, wide, left=left, height=0.13, color=STATES[state], linewidth=0)
         left += wide
-
-
-def shares_of(spent: Spending) -> dict[str, float]:
-    """Executing (with scheduling), waiting, blocked and idle as shares of the time."""
-    total_s = spent.total_s or 1.0
-    return {
-        "executing": spent.own_s / total_s,
-        "waiting": sum(spent.waiting.values()) / total_s,
-        "blocked": sum(spent.blocked.values()) / total_s,
-        "idle": spent.idle_s / total_s,
-    }
 
 
 def _draw_key(axes: Any, rows: float) -> None:

@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from neuros.core.spending import Spending, spending_of
 from neuros.errors import UsageError
 from neuros.observe.load_table import FILE_NAME
 from neuros.observe.packets import FOLDER, Packets, packet_figures, read_packets
@@ -64,6 +65,12 @@ class Run:
     def ends(self) -> dict[str, Connection]:
         """The connections as a project has them, by name."""
         return {name: connection_of(name, figures) for name, figures in self.connections.items()}
+
+    @cached_property
+    def spending(self) -> dict[str, Spending]:
+        """How each node that has reported spent its time."""
+        found = {name: spending_of(node, self.running_s) for name, node in self.nodes.items()}
+        return {name: spent for name, spent in found.items() if spent is not None}
 
     @cached_property
     def packets(self) -> dict[str, Packets]:

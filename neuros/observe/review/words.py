@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from neuros.core.spending import Spending
 from neuros.observe.review.bottleneck import Bottleneck, Gain, Step, find_bottleneck
 from neuros.observe.review.run import Run
-from neuros.observe.review.spending import Spending, spending_of
 
 _WORTH_A_TRY = 1.05
 _BUSY = 0.85
@@ -34,7 +34,7 @@ class Findings:
 
 def findings_of(run: Run) -> Findings:
     """Say what limits a run."""
-    spending = spending_of(run)
+    spending = run.spending
     if not spending or not run.running_s:
         return Findings(
             "What limits this run cannot be told: no node has reported how it spent its time."
@@ -43,30 +43,30 @@ def findings_of(run: Run) -> Findings:
         return _in_process(run, spending, run.running_s)
     found = find_bottleneck(spending, run.ends, run.running_s, run.time_owner)
     assert found is not None
-    reasons = [_reason(step, spending[step.node], run.running_s) for step in found.steps]
+    reasons = [_reason(step, spending[step.node]) for step in found.steps]
     reasons += _caveats(run, spending, run.running_s)
     gains = [_gain(gain, run.record) for gain in found.gains]
     if not gains:
         gains = ["No discard limit holds this run up: without them it would gain nothing."]
     best = next((gain for gain in found.gains if gain.up_to >= _WORTH_A_TRY), None)
     return Findings(
-        _headline(found, spending, run.running_s),
+        _headline(found, spending),
         tuple(reasons),
         tuple(gains),
         None if best is None else _trial(best, run),
     )
 
 
-def _headline(found: Bottleneck, spending: Mapping[str, Spending], running_s: float) -> str:
+def _headline(found: Bottleneck, spending: Mapping[str, Spending]) -> str:
     last = found.steps[-1]
     if found.root is not None and not (last.state == "idle" and not found.loop):
         hook, busy_s = spending[found.root].busiest_hook
         if not hook:
             return "Nothing limits the speed: no hook has executed."
-        text = f"{found.root}.{hook} limits the speed: it executes {busy_s / running_s:.0%} of the"
-        text += " time"
+        share = spending[found.root].share(busy_s)
+        text = f"{found.root}.{hook} limits the speed: it executes {share:.0%} of the time"
         if found.root != found.pacing:
-            own = spending[found.pacing].own_s / running_s
+            own = spending[found.pacing].shares["executing"]
             text += f", while {found.pacing}, which sets the pace, needs {own:.0%} for itself"
         return text + "."
     if last.state == "idle":
@@ -75,8 +75,8 @@ def _headline(found: Bottleneck, spending: Mapping[str, Spending], running_s: fl
             " nothing but wait for its next tick. This run is as fast as it was told to be."
         )
     if found.loop:
-        shares = ", ".join(f"{n} {spending[n].own_s / running_s:.0%}" for n in found.loop)
-        rest = 1 - sum(spending[n].own_s for n in found.loop) / running_s
+        shares = ", ".join(f"{n} {spending[n].shares['executing']:.0%}" for n in found.loop)
+        rest = 1 - sum(spending[n].shares["executing"] for n in found.loop)
         waits = f"{' and '.join(found.loop)} wait for each other"
         if len(found.loop) == 1:
             waits = f"{found.loop[0]} waits for its own packets"
@@ -100,21 +100,21 @@ def _doing(step: Step) -> str:
     return "waits for its clock" if step.state == "idle" else f"executes {step.cause}"
 
 
-def _reason(step: Step, spent: Spending, running_s: float) -> str:
+def _reason(step: Step, spent: Spending) -> str:
     if step.state == "executing":
         return f"{step.node} executes {step.share:.0%} of the time, most of it in {step.cause}."
     if step.state == "idle":
         return f"{step.node} waits for its clock {step.share:.0%} of the time."
     causes = spent.blocked if step.state == "blocked" else spent.waiting
     parts = [
-        f"{name} {seconds / running_s:.0%}"
+        f"{name} {spent.share(seconds):.0%}"
         for name, seconds in sorted(causes.items(), key=lambda item: -item[1])
-        if seconds >= 0.005 * running_s
+        if spent.share(seconds) >= 0.005
     ]
     what = "blocked" if step.state == "blocked" else "waiting for input"
     return (
         f"{step.node} is {what} {step.share:.0%} of the time ({', '.join(parts)}), and executes"
-        f" {spent.own_s / running_s:.0%}."
+        f" {spent.shares['executing']:.0%}."
     )
 
 
@@ -166,7 +166,7 @@ def _in_process(run: Run, spending: Mapping[str, Spending], running_s: float) ->
     idle = max(0.0, 1 - all_s / running_s)
     headline = (
         f"One thread runs all hooks in turn (in-process); {node}.{hook} takes the largest share:"
-        f" {busy_s / running_s:.0%} of the time."
+        f" {spending[node].share(busy_s):.0%} of the time."
     )
     if idle > 0.5:
         headline = (
@@ -175,7 +175,7 @@ def _in_process(run: Run, spending: Mapping[str, Spending], running_s: float) ->
     return Findings(
         headline,
         tuple(
-            f"{name} executes {spent.own_s / running_s:.0%} of the time."
+            f"{name} executes {spent.shares['executing']:.0%} of the time."
             for name, spent in spending.items()
         ),
         (

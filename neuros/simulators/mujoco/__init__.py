@@ -24,10 +24,7 @@ An input drives actuators: ``{"actuator": NAME}`` or ``{"actuators": [NAME, ...]
 declares one: see :mod:`neuros.simulators.mujoco.drives`.
 """
 
-from neuros.simulators.mujoco.opengl import choose_opengl
-
-choose_opengl()  # MuJoCo looks at it when it is imported, which the next line does
-
-from neuros.simulators.mujoco.simulator import MuJoCo  # noqa: E402
+import neuros.convert  # noqa: F401 (imports MuJoCo without OpenGL where that does not work)
+from neuros.simulators.mujoco.simulator import MuJoCo
 
 __all__ = ["MuJoCo"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from neuros.simulators.mujoco.declarations import (
     CommandDeclaration,
     Problems,
     SensorDeclaration,
-    did_you_mean,
 )
 from neuros.simulators.mujoco.drives import add_drive
 
@@ -47,6 +46,16 @@ def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
         f"a model is the path of a file, MJCF as text, or a mujoco.MjSpec, "
         f"not a {type(model).__name__}"
     )
+
+
+def timestep_of(model: Path | str) -> float:
+    """The timestep of a model in MJCF, a file or its text, in seconds.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    spec = mujoco.MjSpec.from_file if isinstance(model, Path) else mujoco.MjSpec.from_string
+    return float(spec(str(model)).option.timestep)
 
 
 def _resolve(node: NodeContext, model: str) -> Path:
@@ -92,17 +101,23 @@ def _from_file(node: NodeContext, path: Path) -> Any:
     return described.spec
 
 
-def add_drives(spec: Any, commands: Iterable[CommandDeclaration], problems: Problems) -> None:
-    """Add the actuators that the node file declares for joints; problems are reported."""
-    joints = [joint.name for joint in spec.joints]
+def joints_of(spec: Any) -> set[str]:
+    """The names of all joints."""
+    return {joint.name for joint in spec.joints}
+
+
+def add_drives(
+    spec: Any, joints: Collection[str], commands: Iterable[CommandDeclaration], problems: Problems
+) -> None:
+    """Add the actuators that the node file declares for some of ``joints``; problems are reported.
+
+    Joints that are missing are found when the commands are bound.
+    """
     for command in commands:
         if command.drive is None:
             continue
         for name in command.actuators:
-            if name not in joints:
-                hint = did_you_mean(name, joints)
-                problems.add(command.pointer, f"the model has no joint '{name}'{hint}")
-            elif fault := add_drive(spec, name, command.drive):
+            if name in joints and (fault := add_drive(spec, name, command.drive)):
                 problems.add(command.pointer, fault)
 
 

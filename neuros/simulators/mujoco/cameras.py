@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros.simulators.mujoco.opengl import make_context
+from neuros.simulators.mujoco.opengl import import_opengl, opengl_faults
 
 _MAX_GEOMS = 20_000
 
@@ -74,9 +74,11 @@ class Cameras:
 
     def _open(self) -> _Resources:
         buffer = self._model.vis.global_
-        gl = make_context(buffer.offwidth, buffer.offheight)
-        gl.make_current()
-        context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        make_context = import_opengl()
+        with opengl_faults():
+            gl = make_context(buffer.offwidth, buffer.offheight)
+            gl.make_current()
+            context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
         scene = mujoco.MjvScene(self._model, maxgeom=_MAX_GEOMS)
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._fine

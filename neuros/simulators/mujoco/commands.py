@@ -47,15 +47,23 @@ def bind_commands(
     """For each input the function from its packets to controls; problems are reported."""
     commands: dict[str, Command] = {}
     for declaration in declarations:
-        found = [
-            find(model, ("actuator",), name, declaration.pointer, problems)
-            for name in declaration.actuators
-        ]
+        found = [_find(model, declaration, name, problems) for name in declaration.actuators]
         actuators = [element[1] for element in found if element]
         commands[declaration.input] = _checked(
             declaration.input, _MAKERS[declaration.type](model, actuators, declaration.input)
         )
     return commands
+
+
+def _find(
+    model: Any, declaration: CommandDeclaration, name: str, problems: Problems
+) -> tuple[str, int] | None:
+    """An actuator; one that a drive has added is missing only with its joint."""
+    what = "actuator" if declaration.drive is None else "joint"
+    found = find(model, (what,), name, declaration.pointer, problems)
+    if found is None or what == "actuator":
+        return found
+    return find(model, ("actuator",), name, declaration.pointer, problems)
 
 
 def control(model: Any, actuator: str, value: float) -> Controls:

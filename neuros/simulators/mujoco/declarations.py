@@ -91,14 +91,17 @@ class CommandDeclaration:
 
 
 class Problems:
-    """Gathers what is wrong in one file, and raises all of it in one ``ModelError``."""
+    """Gathers what is wrong in one file, and raises all of it in one ``ModelError``.
 
-    def __init__(self, file: object) -> None:
-        self._file = file
+    ``hint`` stands at the end of each.
+    """
+
+    def __init__(self, file: object, hint: str = "") -> None:
+        self._file, self._hint = file, hint
         self._texts: list[str] = []
 
     def add(self, pointer: str, text: str) -> None:
-        self._texts.append(f"{self._file}: {pointer}: {text}")
+        self._texts.append(f"{self._file}: {pointer}: {text}{self._hint}")
 
     def add_text(self, text: str) -> None:
         """A problem of another file, with its address already in the text."""

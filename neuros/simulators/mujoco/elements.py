@@ -33,6 +33,11 @@ def names_of(model: Any, what: str) -> list[str]:
     return [mujoco.mj_id2name(model, _OBJECTS[what].value, index) or "" for index in range(count)]
 
 
+def has_any(model: Any, name: str) -> bool:
+    """Whether an element of any sort has this name."""
+    return any(mujoco.mj_name2id(model, sort.value, name) >= 0 for sort in _OBJECTS.values())
+
+
 def find(
     model: Any, sorts: Sequence[str], name: str, pointer: str, problems: Problems
 ) -> tuple[str, int] | None:

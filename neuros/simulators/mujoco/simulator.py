@@ -101,6 +101,7 @@ class MuJoCo:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ModelError(f"step_synchronous: count is a whole number from 1, not {count!r}")
         self._refuse_while_running("step_synchronous")
+        self._world.require_bound()
         self._wait_while_paused()
         self._refuse_to_cross(self._world.steps + count)
         self._advance_to(self._world.steps + count)
@@ -118,6 +119,7 @@ class MuJoCo:
         if output not in self._world.schedule:
             hint = did_you_mean(output, self._world.schedule)
             raise ModelError(f"no output '{output}' has a sensor{hint}")
+        self._world.require_bound()
         return self._unread.pop(output, None)
 
     # ---- it steps itself --------------------------------------------------------------------
@@ -131,6 +133,7 @@ class MuJoCo:
         self._refuse_while_running("run_asynchronous")
         if real_time_factor is not None and not 0 < real_time_factor < float("inf"):
             raise ModelError(f"real_time_factor is positive or None, not {real_time_factor!r}")
+        self._world.require_bound()
         self._world.cameras.close()  # its OpenGL belongs to this thread, not to the new one
         steps = _BOUT_STEPS
         if real_time_factor is not None:
@@ -175,6 +178,7 @@ class MuJoCo:
         """Drive the actuators that the node file declares for an input, from the next step on."""
         command = self._world.commands.get(input_name)
         if command is None:
+            self._world.require_bound()
             hint = did_you_mean(input_name, self._world.commands)
             raise ModelError(f"no input '{input_name}' has an actuator{hint}")
         self._set(lambda: command(packet))
@@ -186,7 +190,8 @@ class MuJoCo:
     def spawn_entity(self, path: str | Path, position: Sequence[float], name: str) -> None:
         """Attach the model of a file to the world at ``position`` (x, y, z in metres).
 
-        Its elements are called ``name/...``. Everything that exists keeps its state; ``model`` and
+        Its elements are called ``name/...``; sensors and actuators that the node file declares for
+        them are bound now. Everything that exists keeps its state; ``model`` and
         ``data`` are new objects, and changes that were made to the old ``model`` are gone.
         """
         with self.paused():

@@ -14,7 +14,7 @@ from neuros.ports import NodeContext
 
 _PERIOD_S = 1 / 60
 _SPACE = 32
-_CLOSE_S = 2.0
+_CLOSE_S = 4.0  # less than a node has to end; software OpenGL takes its time
 
 
 class Viewer:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,8 +12,10 @@ from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
 from neuros.simulators.mujoco import build
 from neuros.simulators.mujoco.cameras import Cameras
-from neuros.simulators.mujoco.commands import bind_commands
+from neuros.simulators.mujoco.commands import Command, bind_commands
 from neuros.simulators.mujoco.declarations import Problems, read_commands, read_sensors
+from neuros.simulators.mujoco.elements import has_any, names_of
+from neuros.simulators.mujoco.opengl import import_opengl
 from neuros.simulators.mujoco.sensors import Binding, Fill, bind
 from neuros.simulators.mujoco.timebase import Schedule, Timebase
 
@@ -29,12 +32,24 @@ _KEPT_BY_HAND = (
 )
 
 
+@dataclass(frozen=True)
+class _Bound:
+    """The declarations, bound to one model: all of them, or but for what is yet to be spawned."""
+
+    fills: Mapping[str, Fill]
+    commands: Mapping[str, Command]
+    is_complete: bool
+
+
 class World:
     """Physics in whole steps, without any notion of who steps it and when.
 
     A sensor is read by ``mj_forward`` at the state of its firing time, so that what it measures
     and its stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old).
     That leaves the physics as it is: with and without sensors it is the same, bit for bit.
+
+    A declaration that names an element called ``name/...``, which :meth:`spawn` may still bring, is
+    bound when it is there; :meth:`require_bound` says that nothing more comes.
 
     Raises ``ModelError`` with every problem of the declarations and the model at once.
     """
@@ -47,7 +62,8 @@ class World:
         try:
             self._spec, self.where = build.load_spec(node, model)
             build.prepare_rendering(self._spec, self._sensors, fine=fine)
-            build.add_drives(self._spec, self._commands, problems)
+            joints = build.joints_of(self._spec)
+            build.add_drives(self._spec, joints, self._commands, problems)
             self.model = build.compile_spec(self._spec, self.where)
         except ModelError as error:
             problems.add_text(str(error))
@@ -56,8 +72,10 @@ class World:
         self.cameras = Cameras(self.model, fine=fine)
         self.time = Timebase(self.model.opt.timestep)
         self.schedule = self._make_schedule(problems)
-        self._bind(problems)
+        self._bound = self._bind(self.model, problems)
         problems.raise_any()
+        if any(sensor.kind == "camera" for sensor in self._sensors):
+            import_opengl()  # what is missing is said now, and not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
         mujoco.mj_forward(self.model, self.data)
@@ -66,6 +84,21 @@ class World:
     def time_s(self) -> float:
         """Simulated seconds since the start, or since the last reset."""
         return self.time.seconds(self.steps)
+
+    @property
+    def commands(self) -> Mapping[str, Command]:
+        """From packets to controls, by input."""
+        return self._bound.commands
+
+    def require_bound(self) -> None:
+        """Raise ``ModelError`` if a declaration names an element that has never been spawned."""
+        if not self._bound.is_complete:
+            problems = Problems(
+                self._node.description.file,
+                "; an entity that has it must be spawned before the first step",
+            )
+            self._bind(self.model, problems, may_wait=False)
+            problems.raise_any()
 
     def step(self, count: int) -> None:
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
@@ -84,7 +117,7 @@ class World:
         packets = {}
         for output in outputs:
             packet = packets[output] = self._node.make_packet(output)
-            self._fills[output](packet, self.data, time_ns)
+            self._bound.fills[output](packet, self.data, time_ns)
         return packets
 
     def reset(self) -> None:
@@ -97,18 +130,19 @@ class World:
         """Attach the model of a file to the world; everything else keeps its state."""
         if len(position) != 3:
             raise ModelError(f"entity '{name}': a position is x, y, z in metres, not {position!r}")
-        if any(body.name.startswith(f"{name}/") for body in self._spec.bodies) or not name:
+        if not name or _is_taken(name, names_of(self.model, "body")):
             raise ModelError(f"an entity needs a name of its own: '{name}' is taken")
         child, where = build.load_spec(self._node, path)
         # First on a copy: a spec cannot go back once something that does not fit is attached.
-        trial = self._spec.copy()
-        build.attach(trial, child.copy(), position, name)
-        build.compile_spec(trial, where)
-        build.attach(self._spec, child, position, name)
+        trial, problems = self._spec.copy(), Problems(self._node.description.file)
+        self._attach(trial, child.copy(), position, name, problems)
+        self._bind(build.compile_spec(trial, where), problems)
+        problems.raise_any()
+        self._attach(self._spec, child, position, name, problems)
         before = self.data
         self.model, self.data = self._spec.recompile(self.model, before)
         self.cameras.use(self.model)
-        self._bind(Problems(self._node.description.file))
+        self._bound = self._bind(self.model, problems)
         mujoco.mj_forward(self.model, self.data)
         # recompile keeps positions, velocities, activations, controls and time. What is new comes
         # last in the world, so all that was there is still in its place.
@@ -125,13 +159,30 @@ class World:
                 problems.add(f"{sensor.pointer}/rate", str(error))
         return Schedule(periods)
 
-    def _bind(self, problems: Problems) -> None:
-        self._fills: dict[str, Fill] = {}
-        for sensor in self._sensors:
-            fill = bind(Binding(sensor, self.model, self.cameras, problems))
-            if fill:
-                self._fills[sensor.output] = fill
-        self.commands = bind_commands(self.model, self._commands, problems)
+    def _attach(
+        self, spec: Any, child: Any, position: Sequence[float], name: str, problems: Problems
+    ) -> None:
+        """Attach an entity, and add the actuators that the node file declares for its joints."""
+        before = build.joints_of(spec)
+        build.attach(spec, child, position, name)
+        build.add_drives(spec, build.joints_of(spec) - before, self._commands, problems)
+
+    def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
+        bodies = names_of(model, "body")
+
+        def can_be_bound(elements: Iterable[str]) -> bool:
+            return not may_wait or all(
+                has_any(model, name) or not _may_come(name, bodies) for name in elements
+            )
+
+        sensors = [sensor for sensor in self._sensors if can_be_bound(sensor.elements)]
+        commands = [command for command in self._commands if can_be_bound(command.actuators)]
+        fills = {}
+        for sensor in sensors:
+            if fill := bind(Binding(sensor, model, self.cameras, problems)):
+                fills[sensor.output] = fill
+        is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
+        return _Bound(fills, bind_commands(model, commands, problems), is_complete)
 
     def _look_at_warnings(self, count: int) -> None:
         for warning, number in enumerate(self.data.warning.number.tolist()):
@@ -148,3 +199,14 @@ class World:
             if warning not in self._seen_warnings:
                 self._seen_warnings.add(warning)
                 self._node.get_logger().warning(f"{self.where}: MuJoCo: {text}")
+
+
+def _may_come(element: str, bodies: Sequence[str]) -> bool:
+    """Whether an entity that is not there yet could bring an element of this name."""
+    parts = element.split("/")
+    entities = ("/".join(parts[:count]) for count in range(1, len(parts)))
+    return any(entity and not _is_taken(entity, bodies) for entity in entities)
+
+
+def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
+    return any(body.startswith(f"{entity}/") for body in bodies)

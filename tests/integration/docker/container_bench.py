@@ -20,7 +20,7 @@ from neuros.launch.run_processes import RUN_ID, RunProcesses
 from neuros.launch.sessions import Session, sessions
 
 HEAD = """
-import ctypes, json, os, pathlib, signal, socket, subprocess, sys, time
+import ctypes, errno, json, os, pathlib, signal, socket, subprocess, sys, time
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise, neuros_tick
 @neuros_finalise()
 def save(node):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import socket
@@ -17,32 +16,22 @@ from typing import Any
 
 import pytest
 from docker.errors import APIError
+from needs import cannot_run
 
-from containers import wait_until
+from containers import connected, require_containers, wait_until
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.build_steps import pulled
 from neuros.launch.docker.context import context_of
-from neuros.launch.docker.engine import connect
 from neuros.launch.docker.images import image_for
 
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Any]:
     """An engine that has NeuROS's base image."""
-    reason = ""
-    try:
-        engine = connect()
-    except EnvironmentFault as fault:
-        reason = str(fault)
-    else:
-        if not engine.images.list("neuros_python"):
-            reason = "the image of neuros_python is not built: run ./install.py"
-            engine.close()
-    if reason:
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-    yield engine
-    engine.close()
+    require_containers("neuros_python")
+    with connected() as engine:
+        yield engine
 
 
 class Bench:
@@ -241,11 +230,68 @@ class TestDockerfiles:
         assert f" : {step}" in log.read_text()
         assert f" : {step}" in out
 
+    def test_a_base_image_that_would_not_be_used_is_refused_before_anything_is_built(
+        self, bench: Bench
+    ) -> None:
+        bench.write("FROM neuros_python\n")
+        code, _, error = bench.build("--base-image", f"{bench.name}=neuros_nest")
+        assert (code, bench.tags) == (2, [])
+        assert f"{bench.recipe}/Dockerfile does not begin from BASE_IMAGE: let it begin" in error
+        code, _, error = bench.build("--base-image", "nothing=neuros_nest")
+        assert (code, bench.tags) == (2, [])
+        assert "no container 'nothing' is built here; those that are: " in error
+
+    def test_one_that_was_used_is_forgotten_when_the_dockerfile_takes_none_any_more(
+        self, bench: Bench
+    ) -> None:
+        bench.write("ARG BASE_IMAGE=scratch\nFROM ${BASE_IMAGE}\n")
+        assert bench.build("--base-image", f"{bench.name}=neuros_python")[0] == 0
+        bench.write("FROM neuros_python\nENV ANEW=1\n")
+        assert bench.build()[0] == 0
+
     def test_an_image_that_can_never_run_nodes_gets_no_name(self, bench: Bench) -> None:
         bench.write("FROM scratch\nCOPY Dockerfile /\n")
         code, _, error = bench.build()
         assert (code, bench.tags) == (4, [])
         assert f"image '{bench.name}' has no Python: take one with Python 3.10 to 3.14" in error
+
+
+class TestBuildKit:
+    """It builds where a Dockerfile takes it: nothing has to be installed or switched on."""
+
+    def test_a_step_may_mount_caches_and_files_and_all_else_is_as_ever(self, bench: Bench) -> None:
+        (bench.recipe / "hello").write_text("hello\n")
+        (bench.folder / "ca.pem").write_text("certificates\n")
+        bench.write(
+            "FROM neuros_python\nUSER 0\nARG VARIANT=cpu\n"
+            "RUN --mount=type=cache,target=/cache \\\n"
+            "    --mount=type=bind,source=hello,target=/mnt/hello \\\n"
+            '    cat /mnt/hello "$PIP_CERT" > /seen && echo $VARIANT >> /seen\nUSER 1000\n'
+        )
+        options = ("--ca-bundle", str(bench.folder / "ca.pem"), "--build-arg", "VARIANT=cuda")
+        code, out, error = bench.build(*options)
+        assert (code, f"{bench.name}: built in " in out) == (0, True), error
+        seen = bench.run("sh", "-c", "cat /seen; ls /tmp /cache; id -u").split()
+        assert seen == ["hello", "certificates", "cuda", "/cache:", "/tmp:", "1000"]
+        assert bench.engine.images.list("neuros_begin") == []
+        assert f"{bench.name}: up to date" in bench.build(*options)[1]
+
+    def test_a_step_that_fails_is_shown_with_what_it_said(self, bench: Bench) -> None:
+        bench.write("FROM neuros_python\nRUN --mount=type=cache,target=/c echo why && false\n")
+        code, out, error = bench.build()
+        assert (code, bench.tags) == (4, [])
+        assert "exit code: 1" in error
+        assert "  why\n" in out
+
+    def test_heredocs_are_built_or_the_line_and_what_it_takes_are_named(self, bench: Bench) -> None:
+        bench.write("FROM neuros_python\n\nRUN <<EOF\necho hello > /tmp/seen\nEOF\n")
+        code, _, error = bench.build()
+        if int(bench.engine.version()["Version"].split(".")[0]) >= 23:
+            assert (code, bench.run("cat", "/tmp/seen")) == (0, "hello\n")
+        else:
+            assert (code, bench.tags) == (4, [])
+            assert "line 3 of its Dockerfile (RUN <<EOF) takes Docker Engine 23 or newer" in error
+            assert "as one RUN, with && between them" in error
 
 
 class TestImagesOfUsers:
@@ -293,14 +339,10 @@ class TestImagesOfUsers:
     @pytest.fixture
     def bare(self, engine: Any) -> str:
         """An image with Python and without rclpy."""
-        for name in ("debian-python:bookworm", "debian-python:trixie"):
-            try:
-                return str(engine.images.get(name).tags[0])
-            except APIError:
-                continue
-        reason = "no image with Python alone: .ci/docker-engine start makes one"
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-        raise AssertionError
+        names = {tag for image in engine.images.list("debian-python") for tag in image.tags}
+        if not names:
+            cannot_run("an image with Python alone", ".ci/docker-engine start makes one")
+        return min(names)
 
     def test_one_without_rclpy_is_refused_with_what_adds_it(
         self, bare: str, engine: Any, bench: Bench
@@ -317,7 +359,7 @@ class TestRegistries:
     def registry(self, tmp_path: Path) -> Iterator[str]:
         """The address of a registry; it ends with the test."""
         if shutil.which("docker-registry") is None:
-            pytest.skip("there is no docker-registry: apt-get install docker-registry")
+            cannot_run("docker-registry", "apt-get install docker-registry")
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             address = f"127.0.0.1:{free.getsockname()[1]}"

@@ -16,11 +16,13 @@ import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
 from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
+from virtual_display import virtual_display
 
 from containers import require_containers, wait_until
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.launcher import DockerLauncher, engine_socket, find_containers
+from neuros.launch.docker.engine import engine_socket
+from neuros.launch.docker.launcher import DockerLauncher, find_containers
 from neuros.launch.docker.settings import container_name, shared_memory
 from neuros.launch.run_processes import RUN_ID, environ_of
 from neuros.launch.sessions import Session, guardian_environment
@@ -31,6 +33,20 @@ from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES
 
 LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
+DRAWS = """
+from neuros.visualise import VisualiseLines
+
+@neuros_initialise()
+def draw(node):
+    figure = VisualiseLines("speed of light")
+    figure.add_line("c")
+    figure.plot("c", 1.0, 0.0)
+    node.set_user_data(figure)
+
+@neuros_tick(seconds=0.1)
+def live(node):
+    pass
+"""
 LOOKS = """
 @neuros_initialise()
 def look(node):
@@ -64,6 +80,35 @@ NEEDS_MEMORY = """
 @neuros_tick(seconds=0.1)
 def grow(node):
     node.set_user_data(bytearray(400 << 20))
+"""
+INTRUDES = """
+@neuros_initialise()
+def intrude(node):
+    def answer(action, *paths):
+        try:
+            action(*paths)
+        except OSError as error:
+            return errno.errorcode[error.errno]
+        return "done"
+    run = node.run_dir.parent
+    tries = {
+        "overwrite": answer((run / "b/node.json").write_text, "{}"),
+        "remove": answer(os.remove, run / "b/node.json"),
+        "add": answer((run / "b/x").touch),
+        "move": answer(os.rename, run / "b", run / "c"),
+        "project": answer((run / "project.json").write_text, "{}"),
+        "own": answer((node.run_dir / "x").touch),
+        "run folder": answer((run / "x").touch),
+    }
+    node.shutdown(json.dumps(tries))
+"""
+FAILS_AT_ITS_END = """
+@neuros_initialise()
+def leave(node):
+    node.shutdown("done")
+@neuros_finalise()
+def fail(node):
+    raise OSError(__file__)
 """
 WRITES = """
 @neuros_tick(seconds=0.1)
@@ -126,6 +171,21 @@ def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.M
     assert "init" in seen["init"]
 
 
+def test_a_node_writes_nothing_of_another_nodes_nor_of_the_runs(bench: ContainerBench) -> None:
+    bench.project({"a": INTRUDES, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 0, finished.output
+    said = last_line(finished).partition("a ended the project: ")[2]
+    assert json.loads(said) == {
+        **dict.fromkeys(("overwrite", "remove", "add", "project"), "EROFS"),
+        "move": "EBUSY",
+        **dict.fromkeys(("own", "run folder"), "done"),
+    }
+    assert finished.run_folder is not None
+    assert json.loads((finished.run_folder / "b/node.json").read_text())["node"]["name"] == "b"
+    assert bench.has_saved("a", "b")
+
+
 def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
     if not Path("/dev/net/tun").exists():
         pytest.skip("there is no device here to let a container in to")
@@ -163,6 +223,19 @@ def test_a_display_that_is_not_there_is_said(bench: ContainerBench) -> None:
     assert "a asks for a display, and DISPLAY is not set: no windows" in finished.said("neuros")
 
 
+def test_a_figure_has_a_window_on_the_display_that_may_be_closed(bench: ContainerBench) -> None:
+    bench.project({"a": DRAWS}, a={"display": True})
+    with virtual_display() as user:
+        running = bench.start(DISPLAY=user.display)
+        user.close(user.find("speed of light"))
+        running.signal(signal.SIGINT)
+        finished = running.finish(30.0)
+    assert finished.exit_code == 130, finished.output
+    assert finished.run_folder is not None
+    assert "no window" not in finished.output
+    assert (finished.run_folder / "a" / "speed_of_light.png").stat().st_size > 0
+
+
 def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     script = bench.folder / "before"
     script.write_text("#!/usr/bin/env python3\nprint('a script in Python')\n")
@@ -173,7 +246,7 @@ def test_a_script_runs_first_inside(bench: ContainerBench) -> None:
     assert "a script in Python" in finished.output
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.needs("root")
 def test_an_ordinary_user_of_the_engine_leaves_files_of_nobody_else(bench: ContainerBench) -> None:
     uid, group = 1000, os.stat(engine_socket(bench.engine)).st_gid
     # May read what root has installed, and use the engine; nothing else that is not its own.
@@ -214,6 +287,16 @@ def test_what_a_node_may_not_write_is_named_as_it_is_called_here(bench: Containe
     assert finished.record["reason"] == last_line(finished)
 
 
+@pytest.mark.parametrize("plugin", [WRITES, FAILS_AT_ITS_END], ids=["running", "at its end"])
+def test_what_ended_a_run_is_said_once(bench: ContainerBench, plugin: str) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    finished = bench.launch()
+    assert finished.exit_code == 1, finished.output
+    said = [text for text in finished.said("neuros") if "'a' failed" in text]
+    assert said == [last_line(finished)]
+    assert "/neuros/project" not in finished.output
+
+
 def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -> None:
     bench.project({"a": RUNS, "b": RUNS})
     running = bench.start_and_wait("a", "b")
@@ -239,7 +322,10 @@ def test_nodes_that_cannot_end_are_killed(bench: ContainerBench) -> None:
     running = bench.start_and_wait("a", "b")
     running.signal(signal.SIGINT)
     finished = running.finish(15.0)
-    assert "'a': not ended after 5 s, killed" in finished.output
+    assert (
+        "node 'a' had to be killed 5 s after the end began: 'a' was still executing 'hold';"
+        " finalise hook 'save' of 'a' did not run" in finished.output
+    )
     assert finished.exit_code == 130
     assert bench.has_saved("b")
 
@@ -254,6 +340,19 @@ def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     running.process.wait()
     wait_until(lambda: not bench.left(), GONE_WITHIN_S)
     assert bench.has_saved("b") or bench.has_saved("a", "b")
+
+
+@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
+def test_no_paused_container_outlives_a_killed_launcher_either(
+    bench: ContainerBench, plugin: str
+) -> None:
+    bench.project({"a": plugin, "b": RUNS})
+    running = bench.start_and_wait("a", "b")
+    pause(bench, running)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    wait_until(lambda: not bench.left(), GONE_WITHIN_S)
+    assert bench.has_saved("b") or bench.has_saved("a", "b"), "it was resumed, and ended by itself"
 
 
 @pytest.mark.acceptance
@@ -443,6 +542,13 @@ def neuros(*arguments: str) -> str:
         text=True,
         timeout=30.0,
     ).stdout
+
+
+def pause(bench: ContainerBench, running: Running) -> None:
+    """Pause all containers of a run."""
+    run = bench.session(running).run
+    for container in bench.engine.containers.list(filters={"label": f"neuros.run={run}"}):
+        container.pause()
 
 
 def guardian_of(session: Session) -> int:

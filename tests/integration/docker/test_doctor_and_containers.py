@@ -7,6 +7,7 @@ import os
 import pytest
 
 from containers import require_containers
+from neuros.cli.main import main
 from neuros.doctor.containers import look_at_containers
 from neuros.doctor.delivery import prove_delivery
 from neuros.doctor.findings import State
@@ -30,3 +31,13 @@ def test_images_pass_from_container_to_container() -> None:
     finding = prove_delivery("docker")
     assert finding.state is State.GOOD, finding
     assert "docker: packets arrived: 20 of 20 on camera.image -> eye.image" in finding.text
+
+
+def test_an_image_that_is_to_be_removed_and_is_not_there_is_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["containers", "remove", "neuros_pithon"]) == 2
+    assert capsys.readouterr().err == (
+        "neuros: NeuROS has built no image for 'neuros_pithon' (did you mean 'neuros_python'?):"
+        " nothing was removed; `neuros containers list` shows what there is\n"
+    )

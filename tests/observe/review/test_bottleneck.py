@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import pytest
 
+from neuros.core.spending import Spending
 from neuros.observe.review.bottleneck import Bottleneck, find_bottleneck
-from neuros.observe.review.spending import Spending
 from neuros.project.model import Connection
 
 TEN_S = 10.0

@@ -1,12 +1,15 @@
-"""How the nodes spent the time in which all of them ran: without start and end."""
+"""How nodes spent the time in which all of them ran: the same for table, report and figures.
+
+That time counts from when the last node had initialised until the end was asked for (``running_s``
+of ``run.json``). A node executes (its hooks, and the scheduling between them), waits for input, is
+blocked by an output, or idles between ticks; the four shares add up to 1.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-from neuros.observe.review.run import Run
 
 
 @dataclass(frozen=True)
@@ -40,35 +43,32 @@ class Spending:
         rest = sum(self.waiting.values()) + sum(self.blocked.values()) + self.idle_s
         return self.own_s + rest
 
+    def share(self, seconds: float) -> float:
+        """Seconds as a share of all of it, from 0 to 1."""
+        return seconds / (self.total_s or 1.0)
 
-def spending_of(run: Run) -> dict[str, Spending]:
-    """By node, for those that have reported.
+    @property
+    def shares(self) -> dict[str, float]:
+        """Executing (with scheduling), waiting, blocked and idle; together 1."""
+        return {
+            "executing": self.share(self.own_s),
+            "waiting": self.share(sum(self.waiting.values())),
+            "blocked": self.share(sum(self.blocked.values())),
+            "idle": self.share(self.idle_s),
+        }
+
+
+def spending_of(node: Mapping[str, Any], running_s: float | None) -> Spending | None:
+    """How a node of ``run.json`` spent its time; ``None`` if it has not reported.
 
     The books of a node begin with it. Initialise hooks are left out; what then is longer than the
     run was under way is the wait for nodes that began later, and for the end. It is taken off what
     the node waited for longest: which it was, sums cannot tell.
     """
-    return {
-        name: _spending(node["accounting"], _initialisers(run, name), run.running_s)
-        for name, node in run.nodes.items()
-        if node.get("accounting")
-    }
-
-
-def _initialisers(run: Run, node: str) -> set[str]:
-    trace = run.traces.get(node)
-    hooks = trace.hooks if trace is not None else ()
-    kinds: dict[str, set[str]] = {}
-    for name, kind in hooks:
-        kinds.setdefault(name, set()).add(kind)
-    return {name for name, found in kinds.items() if found == {"initialise"}}
-
-
-def _spending(
-    accounting: Mapping[str, Any], initialisers: set[str], running_s: float | None
-) -> Spending:
-    hooks = accounting.get("executing", {})
-    executing = {name: s for name, s in hooks.items() if name not in initialisers}
+    accounting = node.get("accounting")
+    if not accounting:
+        return None
+    executing = _without_initialising(accounting.get("executing", {}), node.get("hooks") or {})
     scheduling_s = accounting.get("scheduling", 0.0)
     rests = {
         (state, name): s
@@ -76,7 +76,7 @@ def _spending(
         for name, s in accounting.get(state, {}).items()
     }
     rests["idle", ""] = accounting.get("idle", 0.0)
-    if running_s is not None:
+    if running_s:
         surplus_s = sum(executing.values()) + scheduling_s + sum(rests.values()) - running_s
         for cause in sorted(rests, key=lambda cause: rests[cause], reverse=True):
             taken_s = min(max(surplus_s, 0.0), rests[cause])
@@ -87,3 +87,11 @@ def _spending(
         return {name: s for (kind, name), s in rests.items() if kind == state and s > 0}
 
     return Spending(executing, of("waiting"), of("blocked"), rests["idle", ""], scheduling_s)
+
+
+def _without_initialising(
+    executing: Mapping[str, float], hooks: Mapping[str, Mapping[str, Any]]
+) -> dict[str, float]:
+    """Seconds by hook without those of ``neuros_initialise``; a function may have other marks."""
+    rest = {name: s - hooks.get(name, {}).get("initialise_s", 0.0) for name, s in executing.items()}
+    return {name: s for name, s in rest.items() if s > 0}

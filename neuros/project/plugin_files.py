@@ -1,0 +1,493 @@
+"""What a plugin declares, found out without running it.
+
+Only what is written as a literal is looked at. A name that is computed, a hook inside of an ``if``,
+a decorator of another library: of those nothing is said, here or in
+:mod:`neuros.project.plugin_checks`.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeAlias
+
+from neuros.project.suggest import did_you_mean
+
+_HOOKS = "neuros.hooks"
+_ARGUMENTS = {
+    "neuros_initialise": ("inputs", "outputs"),
+    "neuros_tick": ("seconds", "inputs", "outputs"),
+    "neuros_function": ("inputs", "outputs"),
+    "neuros_finalise": (),
+}
+_FOR_TOOLS = ("HookKind", "HookSpec", "InputSpec", "OutputSpec", "hook_specs_of")
+PUBLIC_NAMES = ("All", "Optional", *_ARGUMENTS, *_FOR_TOOLS)
+"""What there is in ``neuros.hooks``."""
+
+# Packages whose functions are no hooks; those of any other one may be.
+_WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "numpy", "rclpy", "scipy"}
+# With these, a plugin may make hooks in ways that are not to be seen.
+_DYNAMIC = {"__import__", "eval", "exec", "globals", "import_module", "locals", "setattr", "vars"}
+# What later versions of Python know: the node may run on one of those.
+_NEWER = (
+    ((3, 11), re.compile(r"\s*except\s*\*")),
+    ((3, 12), re.compile(r"\s*(type\s+\w+|((async\s+)?def|class)\s+\w+\s*\[)")),
+    ((3, 14), re.compile(r"\s*except\s[^(]*,|.*\b[tT][rR]?['\"]")),
+)
+_Function: TypeAlias = "ast.FunctionDef | ast.AsyncFunctionDef"
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something about a line of a plugin; line and column count from 1."""
+
+    line: int
+    column: int
+    text: str
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class DeclaredPort:
+    """A port as a hook names it; ``name`` is ``None`` where it is computed."""
+
+    name: str | None
+    line: int
+    column: int
+    is_all: bool = False
+    is_optional: bool = False
+
+
+@dataclass(frozen=True)
+class DeclaredHook:
+    """A hook that the plugin has in any case; its ports are ``None`` where they are computed."""
+
+    name: str
+    inputs: tuple[DeclaredPort, ...] | None
+    outputs: tuple[DeclaredPort, ...] | None
+
+
+@dataclass
+class PluginFile:
+    """A plugin, read.
+
+    Attributes:
+        hooks: those that are known.
+        mistakes: what would keep a node from starting, whatever its ports are.
+        doubts: what may be a mistake.
+        imports: the modules that it imports.
+        texts: all text constants.
+        model_arguments: what is given to ``MuJoCo`` as its model.
+        sets_timestep: whether it may change the timestep of a model.
+    """
+
+    path: Path
+    hooks: list[DeclaredHook] = field(default_factory=list)
+    mistakes: list[Remark] = field(default_factory=list)
+    doubts: list[Remark] = field(default_factory=list)
+    imports: frozenset[str] = frozenset()
+    texts: frozenset[str] = frozenset()
+    model_arguments: tuple[ast.expr, ...] = ()
+    sets_timestep: bool = False
+
+
+def read_plugin(path: Path) -> PluginFile | None:
+    """What a plugin declares; ``None`` if the file cannot be read, or is a compiled one."""
+    if path.suffix != ".py":
+        return None
+    try:
+        status = path.stat()
+        return _read(path, status.st_mtime_ns, status.st_size)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=256)
+def _read(path: Path, *_: int) -> PluginFile:
+    plugin, source = PluginFile(path), path.read_bytes()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of syntax: whoever runs it will hear them
+            tree = ast.parse(source, str(path))
+            compile(tree, str(path), "exec", dont_inherit=True)
+    except SyntaxError as error:
+        remark = Remark(error.lineno or 1, error.offset or 1, f"syntax error: {error.msg}")
+        (plugin.doubts if _may_be_newer(error, source) else plugin.mistakes).append(remark)
+    except ValueError as error:  # a NUL character, up to Python 3.11
+        plugin.mistakes.append(Remark(1, 1, f"syntax error: {error}"))
+    except RecursionError:
+        pass
+    else:
+        _Reader(plugin, tree).read()
+    return plugin
+
+
+def _may_be_newer(error: SyntaxError, source: bytes) -> bool:
+    """Whether it may be right in a later version of Python."""
+    lines = source.decode("utf-8", "replace").splitlines()
+    line = lines[error.lineno - 1] if error.lineno and error.lineno <= len(lines) else ""
+    if sys.version_info < (3, 12) and (error.msg or "").startswith("f-string"):
+        return True
+    return any(sys.version_info < version and form.match(line) for version, form in _NEWER)
+
+
+class _Reader:
+    """Reads one plugin.
+
+    A name means what it is bound to where all its bindings, wherever they are, are the same.
+    """
+
+    def __init__(self, plugin: PluginFile, tree: ast.Module) -> None:
+        self._plugin = plugin
+        self._tree = tree
+        self._nodes = [*ast.walk(tree)]
+        self._origins: dict[str, set[str]] = {}
+        self._stars: list[str] = []
+        for node in self._nodes:
+            self._bind(node)
+
+    def read(self) -> None:
+        plugin, nodes = self._plugin, self._nodes
+        self._read_statements()
+        if not plugin.hooks and not plugin.mistakes and not self._may_have_hooks():
+            hint = "mark functions with @neuros_function or @neuros_tick from neuros.hooks"
+            plugin.mistakes.append(Remark(1, 1, "declares no hooks", hint))
+        constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+        plugin.texts = frozenset(value for value in constants if isinstance(value, str))
+        plugin.model_arguments = tuple(self._model_arguments())
+        attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
+        plugin.sets_timestep = any(
+            node.attr in ("opt", "option")
+            or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
+            for node in attributes
+        )
+
+    def _read_statements(self) -> None:
+        """What is executed in any case when the plugin is imported."""
+        lines: dict[str, int] = {}  # of the last hook of each name
+        for statement in (
+            each for each, is_certain in _module_level(self._tree.body) if is_certain
+        ):
+            if isinstance(statement, ast.ImportFrom):
+                self._check_import(statement)
+            if not isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
+                continue
+            name, line = statement.name, statement.lineno
+            if name in lines:
+                text = f"hook '{name}' is lost: line {line} defines another '{name}'"
+                self._plugin.doubts.append(Remark(lines.pop(name), 1, text))
+            if isinstance(statement, _FUNCTIONS) and self._read_function(statement):
+                lines[name] = line
+
+    # ------------------------------------------------------------------ what names mean
+
+    def _bind(self, node: ast.AST) -> None:
+        def bind(name: str, origin: str) -> None:
+            self._origins.setdefault(name, set()).add(origin)
+
+        if isinstance(node, ast.Import):
+            self._plugin.imports |= {alias.name for alias in node.names}
+            for alias in node.names:
+                top = alias.name.partition(".")[0]
+                bind(alias.asname or top, alias.name if alias.asname else top)
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            self._plugin.imports |= {module}
+            for alias in node.names:
+                if alias.name == "*":
+                    self._stars.append(module)
+                else:
+                    bind(alias.asname or alias.name, f"{module}.{alias.name}")
+        elif isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
+            bind(node.id, "")
+        elif isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
+            bind(node.name, "")
+
+    def _check_import(self, node: ast.ImportFrom) -> None:
+        for alias in node.names if node.module == _HOOKS and not node.level else ():
+            if alias.name not in ("*", *PUBLIC_NAMES):
+                hint = did_you_mean(alias.name, PUBLIC_NAMES)
+                self._mistake(node, f"neuros.hooks has no '{alias.name}'", hint)
+
+    def _meaning(self, expression: ast.expr) -> str:
+        """The dotted name behind an expression, empty if it is not known."""
+        if isinstance(expression, ast.Attribute):
+            base = self._meaning(expression.value)
+            return f"{base}.{expression.attr}" if base else ""
+        if not isinstance(expression, ast.Name):
+            return ""
+        origins = self._origins.get(expression.id, set())
+        if not origins and self._stars == [_HOOKS] and expression.id in PUBLIC_NAMES:
+            return f"{_HOOKS}.{expression.id}"
+        return next(iter(origins)) if len(origins) == 1 else ""
+
+    def _of_hooks(self, expression: ast.expr) -> str:
+        """The name that something has in ``neuros.hooks``, empty if it is not from there."""
+        module, _, name = self._meaning(expression).rpartition(".")
+        if module == _HOOKS:
+            return name
+        is_forgotten = (
+            isinstance(expression, ast.Name)
+            and expression.id in PUBLIC_NAMES
+            and expression.id not in self._origins
+            and not self._stars
+        )
+        if is_forgotten:
+            assert isinstance(expression, ast.Name)
+            import_ = f"from neuros.hooks import {expression.id}"
+            self._mistake(expression, f"'{expression.id}' is not imported", import_)
+            return expression.id
+        return ""
+
+    def _may_have_hooks(self) -> bool:
+        """Whether hooks may come from somewhere else."""
+        if any(module != _HOOKS for module in self._stars):
+            return True
+        for node in self._nodes:
+            names = {getattr(node, "id", None), getattr(node, "attr", None)}
+            if names & (_DYNAMIC | {*_ARGUMENTS}):
+                return True
+            if isinstance(node, ast.ImportFrom) and not _brings_no_functions(node):
+                return True
+        return False
+
+    def _model_arguments(self) -> Iterator[ast.expr]:
+        for node in self._nodes:
+            if isinstance(node, ast.Call) and self._meaning(node.func) in (
+                "neuros.simulators.mujoco.MuJoCo",
+                "neuros.simulators.mujoco.simulator.MuJoCo",
+            ):
+                given = [k.value for k in node.keywords if k.arg == "model"] or node.args[1:2]
+                yield self._value(given[0]) if given else ast.Constant(None)
+
+    def _value(self, expression: ast.expr) -> ast.expr:
+        """What a name is bound to, once and for all; anything else as it is."""
+        if isinstance(expression, ast.Name):
+            name = expression.id
+            made = [each for each in self._nodes if getattr(each, "targets", None)]
+            values = [a.value for a in made if isinstance(a, ast.Assign) and _binds(a, name)]
+            stores = [n for n in self._nodes if isinstance(n, ast.Name) and n.id == name]
+            if sum(not isinstance(n.ctx, ast.Load) for n in stores) == len(values) == 1:
+                return values[0]
+        return expression
+
+    # ------------------------------------------------------------------ hooks
+
+    def _read_function(self, function: _Function) -> bool:
+        """Read the hooks that a function is; returns whether it is any."""
+        marks = [(each, self._kind(each)) for each in function.decorator_list]
+        is_plain = all(kind for _, kind in marks)
+        for decorator, kind in marks:
+            if not kind:
+                continue
+            hook = self._hook(function, decorator, kind)
+            self._plugin.hooks.append(hook)
+            if is_plain and hook.inputs is not None:
+                self._check_signature(function, hook.inputs)
+        if is_plain and marks:
+            self._check_kind_of_function(function)
+        return any(kind for _, kind in marks)
+
+    def _kind(self, decorator: ast.expr) -> str:
+        called = decorator.func if isinstance(decorator, ast.Call) else decorator
+        name = self._of_hooks(called)
+        return name if name in _ARGUMENTS else ""
+
+    def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> DeclaredHook:
+        def fail(node: ast.AST, text: str, hint: str = "") -> None:
+            self._mistake(node, f"hook '{function.name}': {text}", hint)
+
+        if not isinstance(decorator, ast.Call):
+            fail(decorator, f"@{kind} needs parentheses")
+            return DeclaredHook(function.name, None, None)
+        names, given = _ARGUMENTS[kind], dict[str, ast.expr]()
+        is_known = not any(isinstance(each, ast.Starred) for each in decorator.args)
+        if is_known and len(decorator.args) > len(names):
+            takes = ", ".join(names) or "no arguments"
+            fail(decorator, f"@{kind} takes {takes}, but is given {len(decorator.args)}")
+        given |= zip(names, decorator.args, strict=False) if is_known else ()
+        for keyword in decorator.keywords:
+            if keyword.arg is None:
+                is_known = False
+            elif keyword.arg not in names:
+                hint = did_you_mean(keyword.arg, names)
+                fail(keyword.value, f"@{kind} has no argument '{keyword.arg}'", hint)
+            else:
+                given[keyword.arg] = keyword.value
+        if not is_known:
+            return DeclaredHook(function.name, None, None)
+        if kind == "neuros_tick":
+            self._check_seconds(function, decorator, given.get("seconds"))
+        sides = [
+            self._ports(function, given.get(side), is_input=side == "inputs")
+            for side in ("inputs", "outputs")
+        ]
+        return DeclaredHook(function.name, *sides)
+
+    def _check_seconds(
+        self, function: _Function, decorator: ast.expr, seconds: ast.expr | None
+    ) -> None:
+        who = f"hook '{function.name}'"
+        if seconds is None:
+            self._mistake(decorator, f"{who}: @neuros_tick needs seconds", "seconds=0.02")
+            return
+        try:
+            value = ast.literal_eval(seconds)
+        except (TypeError, ValueError):
+            return
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self._mistake(seconds, f"{who}: seconds={value!r} is not a number")
+        elif not (math.isfinite(value) and value > 0):
+            self._mistake(seconds, f"{who}: seconds={value!r} is not a positive time")
+
+    def _ports(
+        self, function: _Function, written: ast.expr | None, *, is_input: bool
+    ) -> tuple[DeclaredPort, ...] | None:
+        if written is None or (isinstance(written, ast.Constant) and written.value is None):
+            return ()
+        if isinstance(written, ast.Dict):
+            return None  # its keys are the ports
+        is_list = isinstance(written, ast.List | ast.Tuple | ast.Set)
+        entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
+        ports = [self._port(function, entry, is_input=is_input) for entry in entries]
+        if any(port is None for port in ports):
+            return None
+        found = tuple(port for port in ports if port)
+        if not is_list and any(port.name is None for port in found):
+            return None  # it may be a list of ports
+        side, names = "input" if is_input else "output", [port.name for port in found]
+        for port in found:
+            if port.name is not None and names.index(port.name) != found.index(port):
+                self._plugin.mistakes.append(
+                    Remark(
+                        port.line,
+                        port.column,
+                        f"hook '{function.name}': {side} '{port.name}' is named twice",
+                    )
+                )
+        return found
+
+    def _port(self, function: _Function, entry: ast.expr, *, is_input: bool) -> DeclaredPort | None:
+        """One port; ``None`` where even their number is not known."""
+        if isinstance(entry, ast.Starred):
+            return None
+        inner, wrappers = entry, list[str]()
+        while isinstance(inner, ast.Call) and (
+            (name := self._of_hooks(inner.func)) in ("All", "Optional")
+        ):
+            arguments = [*inner.args, *(keyword.value for keyword in inner.keywords)]
+            if len(arguments) != 1:
+                break
+            wrappers.append(name)
+            inner = arguments[0]
+        column = entry.col_offset + 1
+        if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
+            allowed = ((), ("Optional",), ("All",), ("Optional", "All"))
+            if not is_input and "All" in wrappers:
+                text = f"output '{inner.value}' is wrapped in All, which is for inputs only"
+                self._mistake(entry, f"hook '{function.name}': {text}")
+            elif tuple(wrappers) not in allowed:
+                self._not_a_port(function, entry, is_input=is_input)
+            return DeclaredPort(
+                inner.value, entry.lineno, column, "All" in wrappers, "Optional" in wrappers
+            )
+        if isinstance(inner, ast.Constant | ast.Dict | ast.List | ast.Tuple | ast.Set):
+            self._not_a_port(function, entry, is_input=is_input)
+        return DeclaredPort(None, entry.lineno, column)
+
+    def _not_a_port(self, function: _Function, entry: ast.expr, *, is_input: bool) -> None:
+        more = ", Optional(name), All(name) or Optional(All(name))"
+        allowed = f"a name{more}" if is_input else "a name or Optional(name)"
+        side = "input" if is_input else "output"
+        text = f"{ast.unparse(entry)} is not an {side}"
+        self._mistake(entry, f"hook '{function.name}': {text}", f"give {allowed}")
+
+    def _check_signature(self, function: _Function, inputs: Sequence[DeclaredPort]) -> None:
+        """Whether it can be called with the node and its inputs."""
+        takes = function.args
+        plain = [each.arg for each in (*takes.posonlyargs, *takes.args)]
+        needed = len(plain) - len(takes.defaults)
+        given = 1 + len(inputs)
+        is_too_much = given > len(plain) and takes.vararg is None
+        lacks = [
+            each.arg
+            for each, default in zip(takes.kwonlyargs, takes.kw_defaults, strict=True)
+            if default is None
+        ]
+        names = [port.name or "..." for port in inputs]
+        gets = f"gets ({', '.join(['node', *names])})"
+        shown = [*plain, *([f"*{takes.vararg.arg}"] if takes.vararg else []), *lacks]
+        if is_too_much or given < needed or lacks:
+            self._mistake(
+                function, f"hook '{function.name}' {gets}, but takes ({', '.join(shown)})"
+            )
+        elif plain[1:] != names and sorted(plain[1:]) == sorted(names) and len(set(names)) > 1:
+            self._plugin.doubts.append(
+                Remark(
+                    function.lineno,
+                    function.col_offset + 1,
+                    f"hook '{function.name}' {gets}, and takes ({', '.join(shown)})",
+                    "packets come in the order of the declaration",
+                )
+            )
+
+    def _check_kind_of_function(self, function: _Function) -> None:
+        who = f"hook '{function.name}'"
+        if isinstance(function, ast.AsyncFunctionDef):
+            hint = "only callbacks of ROS may be coroutines"
+            self._mistake(function, f"{who} is a coroutine, and would never run", hint)
+        elif any(isinstance(node, ast.Yield | ast.YieldFrom) for node in _own_nodes(function)):
+            text = f"{who} has 'yield', and would never run"
+            self._mistake(function, text, "a hook returns its packets")
+
+    def _mistake(self, node: ast.AST, text: str, hint: str = "") -> None:
+        line, column = getattr(node, "lineno", 1), getattr(node, "col_offset", 0) + 1
+        remark = Remark(line, column, text, hint)
+        if remark not in self._plugin.mistakes:
+            self._plugin.mistakes.append(remark)
+
+
+def _binds(assignment: ast.Assign, name: str) -> bool:
+    return any(isinstance(each, ast.Name) and each.id == name for each in assignment.targets)
+
+
+def _module_level(
+    body: Sequence[ast.stmt], *, is_certain: bool = True
+) -> Iterator[tuple[ast.stmt, bool]]:
+    """Every statement outside of functions and classes, and whether it is executed in any case."""
+    for statement in body:
+        yield statement, is_certain
+        if isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
+            continue
+        for name in ("body", "orelse", "finalbody"):
+            yield from _module_level(getattr(statement, name, ()), is_certain=False)
+        for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
+            yield from _module_level(part.body, is_certain=False)
+
+
+def _own_nodes(function: _Function) -> Iterator[ast.AST]:
+    """What is in a function, but not in those that it defines itself."""
+    waiting: list[ast.AST] = [*function.body]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if not isinstance(node, (*_FUNCTIONS, ast.Lambda, ast.ClassDef)):
+            waiting += ast.iter_child_nodes(node)
+
+
+def _brings_no_functions(node: ast.ImportFrom) -> bool:
+    """Whether what is imported cannot be a hook: a function of Python's own library, or a class."""
+    top = (node.module or "").partition(".")[0]
+    if node.level == 0 and (top in sys.stdlib_module_names or top in _WITHOUT_HOOKS):
+        return True
+    if node.level == 0 and top == "neuros":
+        return True
+    return all(alias.name[:1].isupper() for alias in node.names)

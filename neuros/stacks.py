@@ -1,0 +1,116 @@
+"""Where a node stands in its plugin: told of hooks that run for long, and of nodes that are killed.
+
+A node tells it in its reports (:func:`stack_in`). While a library holds Python's global lock it
+cannot report: then a thread in C, faulthandler's, writes the stack to a file of the node
+(:class:`StackFile`), which the supervisor reads (:func:`held_stack`). No signal is needed for that,
+so no system call of a plugin is interrupted, and it is the same in containers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import os
+import re
+import sys
+import threading
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+LONG_S = 5.0
+"""A hook that runs for this long is named."""
+
+FILE_NAME = ".stack"
+HELD_S = 4.0
+"""A global lock that is held for this long has the stack written; nodes report more often."""
+
+_THREAD = re.compile(r"(?:Current thread|Thread) 0x0*(?P<ident>[0-9a-f]+)\b.*:")
+_FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
+
+
+class Stack(NamedTuple):
+    """The calls from a hook on, the most recent last, as Python shows them."""
+
+    node: str
+    hook: str
+    text: str
+
+
+class StackFile:
+    """The file of a process; it stays empty, but for its first line, as long as that can report.
+
+    Args:
+        folder: where to make it.
+        plugins: the files of plugins, by the name of the node.
+    """
+
+    def __init__(self, folder: Path, plugins: Mapping[str, Path]) -> None:
+        head = {
+            "main": f"{threading.main_thread().ident or 0:x}",
+            "plugins": {name: _as_dumped(str(path)) for name, path in plugins.items()},
+        }
+        self._head = json.dumps(head).encode() + b"\n"
+        self._descriptor = os.open(
+            folder / FILE_NAME, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
+        )
+        os.write(self._descriptor, self._head)
+
+    def renew(self) -> None:
+        """The process reports: only if it cannot do so again for a while the stack is written."""
+        faulthandler.dump_traceback_later(HELD_S, repeat=True, file=self._descriptor)
+        if os.fstat(self._descriptor).st_size != len(self._head):
+            os.ftruncate(self._descriptor, len(self._head))
+
+
+def stack_in(node: str, plugin: Path) -> Stack | None:
+    """Where the main thread stands in a plugin, ``None`` if it does not. Any other thread."""
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    return _from_plugin({node: str(plugin)}, traceback.extract_stack(frame)) if frame else None
+
+
+def held_stack(folder: Path) -> Stack | None:
+    """Where the process with this file stands, ``None`` if it is able to report that itself."""
+    try:
+        head, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
+        known = json.loads(head)
+    except (OSError, ValueError):
+        return None
+    threads: dict[str, list[traceback.FrameSummary]] = {}  # of the last time that it was written
+    frames: list[traceback.FrameSummary] = []
+    for line in lines:
+        if match := _THREAD.match(line):
+            frames = threads[match["ident"]] = []
+        elif match := _FRAME.match(line):
+            frames.insert(
+                0, traceback.FrameSummary(match["file"], int(match["line"]), match["name"])
+            )
+    main = threads.pop(known["main"], [])
+    found = (_from_plugin(known["plugins"], frames) for frames in (main, *threads.values()))
+    return next((stack for stack in found if stack), None)
+
+
+def remove_stack_files(folders: Sequence[Path]) -> None:
+    """Remove those that there are."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            (folder / FILE_NAME).unlink()
+
+
+def _from_plugin(
+    plugins: Mapping[str, str], frames: Sequence[traceback.FrameSummary]
+) -> Stack | None:
+    """The stack from the first call in one of the plugins on."""
+    nodes = {path: node for node, path in reversed([*plugins.items()])}
+    for place, frame in enumerate(frames):
+        if frame.filename in nodes:
+            text = "".join(traceback.format_list(list(frames[place:]))).rstrip("\n")
+            return Stack(nodes[frame.filename], frame.name, text)
+    return None
+
+
+def _as_dumped(path: str) -> str:
+    """As faulthandler writes it."""
+    return path.encode("ascii", "backslashreplace").decode()

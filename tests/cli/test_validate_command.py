@@ -1,0 +1,163 @@
+"""``neuros validate``: what it finds besides the mistakes in project files."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import neuros
+from neuros.cli.main import main
+from neuros.errors import ProjectError
+
+MODEL = '<mujoco><option timestep="0.002"/><worldbody><body name="box"/></worldbody></mujoco>'
+IMU = {
+    "name": "imu",
+    "type": "sensor_msgs/msg/Imu",
+    "mujoco": {"sensor": "imu", "element": "box", "rate": 48},
+}
+TOO_FAST = "48 Hz is a period of 10.4167 timesteps of 0.002 s, which is not a whole number"
+HEAD = "import os\nfrom neuros.hooks import *\nfrom neuros.simulators.mujoco import MuJoCo\n"
+HOOK = "@neuros_initialise()\ndef begin(node):\n    "
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(plugin: str, **keys: Any) -> None:
+    Path("robot.py").write_text(plugin)
+    node = {"name": "robot", "container": "neuros_mujoco", "plugin": "robot.py", **keys}
+    Path("project.json").write_text(json.dumps({"nodes": [node], "connections": []}))
+
+
+@pytest.mark.parametrize(
+    ("plugin", "environment"),
+    [
+        (f"{HOOK}MuJoCo(node, 'box.xml')", {}),
+        (f"{HOOK}MuJoCo(node, model=str(node.resolve_path('box.xml')))", {}),
+        (f"{HOOK}MuJoCo(node, os.environ['MODEL'])", {"MODEL": "#box.xml"}),
+        (f"PATH = os.environ.get('MODEL', 'x')\n{HOOK}MuJoCo(node, PATH)", {"MODEL": "box.xml"}),
+        (f"XML = '{MODEL}'\n{HOOK}MuJoCo(node, XML)", {}),
+        (f"from world import make\n{HOOK}make(node)", {}),
+    ],
+    ids=["file", "resolved", "path in a variable", "name in a variable", "text", "module"],
+)
+def test_a_rate_that_does_not_fit_the_model_is_named(
+    plugin: str, environment: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("box.xml").write_text(MODEL)
+    if "world" in plugin:
+        Path("world.py").write_text(f"{HEAD}def make(node): return MuJoCo(node, 'box.xml')")
+    write(HEAD + plugin, outputs=[IMU], environment=environment)
+    assert main(["validate", "."]) == 3
+    said = capsys.readouterr().err
+    assert said.startswith(f"project.json:1:{said.split(':')[2]}: /nodes/0/outputs/0/mujoco/rate: ")
+    assert TOO_FAST in said
+
+
+@pytest.mark.parametrize(
+    "plugin",
+    [
+        f"{HOOK}MuJoCo(node, make())\ndef make(): ...",
+        f"{HOOK}MuJoCo(node, 'box.xml').model.opt.timestep = 0.001",
+        f"{HOOK}(MuJoCo(node, 'box.xml'), MuJoCo(node, 'other.xml'))",
+        f"{HOOK}MuJoCo(node, 'robot.urdf')",
+        f"{HOOK}MuJoCo(node)",
+    ],
+    ids=["computed", "another timestep", "two models", "no MJCF", "no model"],
+)
+def test_what_is_not_known_of_the_model_is_no_problem(plugin: str) -> None:
+    Path("box.xml").write_text(MODEL)
+    write(HEAD + plugin, outputs=[IMU])
+    assert main(["validate", "."]) == 0
+
+
+def test_a_model_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("box.xml").write_text("<mujoco><bodi/></mujoco>")
+    write(f"{HEAD}{HOOK}MuJoCo(node, 'box.xml')", outputs=[IMU])
+    assert main(["validate", "."]) == 3
+    assert capsys.readouterr().err.startswith("box.xml: ")
+
+
+def test_importing_finds_what_reading_cannot(capfd: pytest.CaptureFixture[str]) -> None:
+    write(
+        "import os\nfrom neuros.hooks import *\nprint('imported in', os.environ['PLACE'])\n"
+        "NAME = 'wheel' + 's'\n@neuros_tick(1, outputs=NAME)\ndef f(node): pass\n",
+        environment={"PLACE": "Sheffield"},
+    )
+    assert main(["validate", "."]) == 0
+    assert "imported" not in "".join(capfd.readouterr())
+    assert main(["validate", ".", "--import", "--set", "nodes.robot.environment.PLACE=York"]) == 3
+    said = capfd.readouterr().err.splitlines()
+    assert said[0] == "imported in York"
+    assert said[1].startswith("node 'robot': ")
+    assert said[1].endswith("hook 'f': node 'robot' declares no output 'wheels' (it has none)")
+    assert said[2] == "1 problem; nothing was started"
+
+
+def test_a_plugin_that_ends_python_is_named(capfd: pytest.CaptureFixture[str]) -> None:
+    write("import os\nfrom neuros.hooks import *\nos.abort()\n@neuros_tick(1)\ndef f(node): ...")
+    assert main(["validate", ".", "--import"]) == 3
+    how = "importing the plugin ended its process: killed by SIGABRT"
+    assert f"node 'robot': {how}" in capfd.readouterr().err
+
+
+def test_python_programs_get_the_same_as_warnings_and_errors() -> None:
+    Path("box.xml").write_text(MODEL)
+    write(
+        f"{HEAD}{HOOK}MuJoCo(node, 'box.xml'), os.environ['SPEED']",
+        outputs=[IMU],
+        container="neuros_mujocco",
+    )
+    meant = r"node 'robot': there is no container 'neuros_mujocco' .did you mean 'neuros_mujoco'"
+    with pytest.warns(UserWarning, match=meant):
+        project = neuros.Project.from_file(".")
+    setting = "nodes.robot.environment.SPEDE"
+    with pytest.warns(UserWarning, match="reads SPEDE .did you mean 'SPEED'"):
+        project.check_with({setting: 1})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        project.check_with({"nodes.robot.environment.SPEED": 1})
+    with pytest.raises(ProjectError, match=TOO_FAST):
+        project.validate()
+
+
+def test_a_sweep_over_what_nothing_reads_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+    write(
+        "import os\nfrom neuros.hooks import *\nSPEED = os.environ.get('SPEED')\n"
+        "@neuros_initialise()\ndef f(node): node.shutdown(SPEED)\n",
+        container="neuros_python",
+    )
+    arguments = ["--set", "nodes.robot.environment.SPEDE=1", "--backend", "in-process"]
+    assert main(["sweep", ".", *arguments]) == 0
+    assert capsys.readouterr().err == (
+        "warning: --set nodes.robot.environment.SPEDE=1:1:1: nothing in the plugin of node 'robot'"
+        " reads SPEDE (did you mean 'SPEED'?)\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("recipe", "is_said"),
+    [
+        ({"requirements.txt": "numpy\n"}, True),
+        ({"Dockerfile": "RUN add ros-jazzy-arm-msgs\n"}, False),
+    ],
+    ids=["not named", "named"],
+)
+def test_a_message_type_of_which_a_container_of_ones_own_says_nothing_is_a_warning(
+    recipe: dict[str, str], is_said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path("containers/arm")
+    folder.mkdir(parents=True)
+    for name, text in recipe.items():
+        (folder / name).write_text(text)
+    port = {"name": "joints", "type": "arm_msgs/msg/Joints", "external_topic": "joints"}
+    write(f"{HEAD}@neuros_function('joints')\ndef f(node, x): ...", container="arm", inputs=[port])
+    assert main(["validate", "."]) == 0
+    said = "/nodes/0/inputs/0/type: unknown message type 'arm_msgs/msg/Joints': there is no message"
+    assert (said in capsys.readouterr().err) is is_said

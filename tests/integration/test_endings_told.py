@@ -1,0 +1,141 @@
+"""What did not go well at the end is said, and no exit code 0; a loop in lockstep ends at once."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ending_bench import RELAY, SINK, Bench, assert_ended, last_line, made_bench
+from endings import RUNS
+from launching import BACKENDS
+
+
+@pytest.fixture(params=BACKENDS)
+def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    with made_bench(tmp_path, request.param) as bench:
+        yield bench
+
+
+# ------------------------------------------------------------------ killed
+
+
+HOLDS = """
+@neuros_initialise(outputs="o")
+def begin(node):
+    return node.make_packet("o")
+@neuros_tick(seconds=0.5)
+def hold(node):
+    node.shutdown("enough", drain_s=0.2)
+    deep()
+def deep():
+    ctypes.PyDLL(None).sleep(30)
+"""
+HANGS = """
+@neuros_finalise()
+def close(node):
+    while True:
+        time.sleep(0.1)
+"""
+
+
+def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood(
+    bench: Bench,
+) -> None:
+    file = bench.project("gil.o -> good.x", gil=HOLDS, hangs=RUNS + HANGS, good=SINK)
+    budgets = {"lost_packets": {"gil.o -> good.x": 0}}
+    file.write_text(json.dumps({**json.loads(file.read_text()), "budgets": budgets}))
+    finished = bench.launch()
+    assert finished.exit_code == finished.record["exit_code"] == 1
+    held = r"had to be killed 5 s after the end began: 'gil' was still executing 'hold';"
+    assert re.search(
+        f"nodes? 'gil'.* {held} finalise hook 'save' of 'gil' did not run", finished.output
+    )
+    assert "gil was at this point when it was killed:\n" in finished.output
+    assert "in hold\n" in finished.record["nodes"]["gil"]["stack"]
+    assert "in deep" in finished.record["nodes"]["gil"]["stack"]
+    assert len(finished.record["broken_budgets"]) == 1, "it is not known what was lost"
+    if bench.back_end == "process":
+        assert (
+            "node 'hangs' had to be killed 5 s after the end began:"
+            " finalise hook 'close' of 'hangs' did not finish" in finished.output
+        )
+        assert "hangs was at this point when it was killed:\n" in finished.output
+        assert "in close\n" in finished.record["nodes"]["hangs"]["stack"]
+        assert bench.saved("good", "hangs")
+    assert not list(bench.folder.rglob(".stack"))
+
+
+def test_so_is_one_whose_finalise_hook_hangs_though_all_else_went_well(tmp_path: Path) -> None:
+    with made_bench(tmp_path, "in-process") as bench:
+        bench.project(a=RUNS + HANGS, b=RUNS)
+        assert_ended(
+            bench.launch("--duration", "0.5"),
+            1,
+            "nodes 'a' and 'b' had to be killed 5 s after the end began: finalise hook 'close' of"
+            " 'a' did not finish; finalise hook 'save' of 'b' did not run",
+        )
+
+
+def test_two_ctrl_c_while_hooks_finalise_are_no_good_end(bench: Bench) -> None:
+    bench.project(a=RUNS + HANGS)
+    running = bench.start("--duration", "0.5")
+    running.wait_for("all is saved")
+    running.signal(2)
+    running.wait_for("already ending")
+    running.signal(2)
+    why = r"killed by Ctrl\+C before its nodes had ended: 0.5 s are over"
+    assert_ended(running.finish(5.0), 130, why)
+
+
+# ------------------------------------------------------------------ as Python programs end
+
+
+WRITES = """
+import atexit, gzip
+@neuros_initialise()
+def begin(node):
+    global KEPT
+    KEPT = open(node.run_dir / "global", "w")
+    files = [open(node.run_dir / "user data", "w"), gzip.open(node.run_dir / "packed", "wt")]
+    files.append(files)  # only the garbage collector will find it
+    node.set_user_data(files)
+    for number in range(1000):
+        for file in (KEPT, *files[:2]):
+            print(number, file=file)
+    atexit.register(note, node, "at exit")
+"""
+
+
+def test_a_node_ends_as_a_python_program_ends(bench: Bench) -> None:
+    import gzip
+
+    bench.project(a=WRITES + RUNS)
+    finished = bench.launch("--duration", "0.2")
+    assert_ended(finished, 0, "0.2 s are over")
+    assert finished.run_folder is not None
+    folder = finished.run_folder / "a"
+    rows = "".join(f"{number}\n" for number in range(1000))
+    assert (folder / "global").read_text() == rows
+    assert (folder / "user data").read_text() == rows
+    assert gzip.decompress((folder / "packed").read_bytes()).decode() == rows
+    assert (folder / "at exit").exists()
+
+
+# ------------------------------------------------------------------ lockstep
+
+
+def test_a_loop_in_lockstep_ends_after_one_more_round(bench: Bench) -> None:
+    begins = "@neuros_initialise(outputs='o')\ndef begin(node):\n    return node.make_packet('o')\n"
+    bench.project("a.o -> b.x", "b.o -> a.x", "a.o -> c.x", a=begins + RELAY, b=RELAY, c=SINK)
+    finished = bench.launch("--duration", "0.5")
+    assert_ended(finished, 0, "0.5 s are over")
+    assert "not drained" not in finished.output
+    connections = finished.record["connections"]
+    assert all(c["lost"] == 0 and c["received"] == c["sent"] > 10 for c in connections)
+    there, back, aside = connections
+    assert there["unread"] + back["unread"] == 1, "the one packet of the loop"
+    assert aside["unread"] == 0
+    assert last_line(finished) == "0.5 s are over"
