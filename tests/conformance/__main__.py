@@ -66,13 +66,22 @@ def _violations(backend: str, meter: LoadMeter, project: Project) -> Sequence[Vi
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m tests.conformance", description=__doc__)
     parser.add_argument("--runs", type=int, default=100, help="so many projects (100)")
-    parser.add_argument("--backend", action="append", choices=BACKENDS,
-                        help="may be given several times; else in-process and process")
+    parser.add_argument(
+        "--backend",
+        action="append",
+        choices=BACKENDS,
+        help="may be given several times; else in-process and process",
+    )
     parser.add_argument("--seed", type=int, default=1, help="the same seed, the same projects (1)")
     parser.add_argument("--only", type=int, help="only the project of this number")
     parser.add_argument("--jobs", type=int, default=2, help="so many runs at a time (2)")
-    parser.add_argument("--shrink", type=int, default=60, metavar="RUNS",
-                        help="for making one smaller, at most so many runs (60; 0: not at all)")
+    parser.add_argument(
+        "--shrink",
+        type=int,
+        default=60,
+        metavar="RUNS",
+        help="for making one smaller, at most so many runs (60; 0: not at all)",
+    )
     parser.add_argument("--folder", type=Path, default=KEPT, help="where what fails is kept")
     return parser.parse_args()  # fmt: skip
 

@@ -447,7 +447,10 @@ def ring() -> Story:
         Node("step", (step,), {"x": INT}, {"o": INT}),
         Node("control", (control,), {"x": INT}, {"o": INT}),
     )
-    connections = (Connection("step", "o", "control", "x", 0), Connection("control", "o", "step", "x", 0))
+    connections = (
+        Connection("step", "o", "control", "x", 0),
+        Connection("control", "o", "step", "x", 0),
+    )
     story = Story(Project(nodes, connections, "duration", 9.0))
     story.run("step.step", 0, None).run("control.control", 2, [("step.o", 1)])
     story.run("step.step", 4, None)  # what control sent is still on its way

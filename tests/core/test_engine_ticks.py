@@ -86,6 +86,7 @@ def test_a_due_tick_hook_takes_its_turn_among_the_others():
     bench.pass_time(1.0)
     assert bench.ran == ["f", "t"]
 
+
 def test_a_tick_that_is_due_takes_its_turn_whatever_event_comes_first():
     """The loop may have much to do before it gets to the timer."""
     bench = Bench(function("main"), tick("t", 0.1))
