@@ -10,7 +10,8 @@ hello       when it is there                                          nodes, pid
 report      once per second, on demand, at the end                    node, ... (see runtime)
 hooks       what a node's plugin declares, once it is loaded           node, hooks, finalise
 first_hook  when a node has started its first hook                    node
-finalising  when a node starts a finalise hook                        node, hook
+finalising  when a node starts a finalise hook; "": it closes what it  node, hook
+            holds; null: it has
 shutdown    when a plugin calls ``node.shutdown``                     node, reason, drain_s
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines

@@ -57,10 +57,9 @@ def read(folder: Path, entry: Entry) -> Reading:
     """What a run has left behind. Raises ``OSError`` or ``UsageError`` where that is not all."""
     past = open_run(folder)
     asked_ns = [int(ns) for ns in read_packets(folder, past.connection(_ASKED)).sent_ns]
-    ticks = intervals_of(asked_ns, THINK_S)
-    figures = interval_figures(ticks)
+    figures = interval_figures(intervals_of(asked_ns, THINK_S))
     remarks = {"backend": past.record["backend"]}
-    return Reading(entry.title, entry.name, {**figures, **_in_seconds(figures)}, remarks, ticks)
+    return Reading(entry.title, entry.name, {**figures, **_in_seconds(figures)}, remarks, None)
 
 
 def _in_seconds(figures: dict[str, float | None]) -> dict[str, float]:
@@ -71,21 +70,17 @@ def _in_seconds(figures: dict[str, float | None]) -> dict[str, float]:
 
 
 def show(readings: Readings, folder: Path) -> Sequence[Section]:
-    """The table and the histogram."""
-    from benchmarks.reproduce.tick_figures import draw_ticks
-
+    """The table."""
     (name,) = PARTS
     figures = {**VOTING, "added_ms": 1e3 * (VOTING["mean_s"] - THINK_S)}
     rows = {**readings, _PUBLISHED: [Reading("", _PUBLISHED, figures, {}, None)]}
     table = LAYOUT.fill({name: f"{PARTS[name]}, here", _PUBLISHED: _PUBLISHED}, rows)
-    ticks = {PARTS[name]: [each.series for each in readings[name]]}
-    picture = draw_ticks(ticks, folder / "voting_histogram.png")
     text = (
         "An interval is the time from one question to the next: the 5 s in which the voters think,"
         " at the same time, and what sending the question, three votes, and waiting for all of"
         " them adds. Published intervals are between lines of the log of the node that asks."
     )
-    return [Section("Interval between questions", [text], table, [picture])]
+    return [Section("Interval between questions", [text], table)]
 
 
 KIND = Kind(

@@ -77,7 +77,7 @@ def _delivery(titles: Titles, readings: Readings, file: Path) -> Path:
             _mark(axes, names, published.DELIVERY_PERCENT.get(label, {}))
             axes.set_xlim(0, 105)
             axes.set_title(label, loc="left", fontsize=9)
-        drawn.legend(*every[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+        drawn.legend(*every[-1].get_legend_handles_labels(), loc="outside upper right", ncols=2)
         drawn.supxlabel("packets consumed, of those sent (%)", fontsize=9)
     return file
 

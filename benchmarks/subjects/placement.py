@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.launching import launch
+from benchmarks.launching import RUN_S, launch
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import (
     CORE_EACH,
@@ -37,7 +37,7 @@ PLACES = (UNPINNED, KERNEL, CORE_EACH)
 DEFAULT = "default"
 SIMULATED_S = 10.0
 Figures = Callable[[], Mapping[str, float]]
-_SPIN = "while True: pass"
+_SPIN = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(10_000))"
 _ENDLESS = 10**9
 
 
@@ -110,7 +110,7 @@ def under(situation: str, place: str, measure: Figures) -> Mapping[str, float]:
 
 @contextlib.contextmanager
 def busy(count: int) -> Iterator[None]:
-    """So many processes that never pause, on whichever core the kernel chooses."""
+    """So many processes that never pause, on any core; they end with the benchmark."""
     with contextlib.ExitStack() as stack:
         for _ in range(count):
             command = [sys.executable, "-S", "-c", _SPIN]
@@ -124,7 +124,7 @@ def another_run(place: str) -> Iterator[None]:
     """Another run of the same project, placed alike, which ends with the block."""
     with placed_project(IMU_PACKET, _ENDLESS, place) as folder:
         command = [sys.executable, "-m", "neuros.cli", "launch", str(folder), *options_of(place)]
-        command += ["--backend", "process", "-o", str(folder / "run")]
+        command += ["--backend", "process", "-o", str(folder / "run"), "--duration", f"{RUN_S:g}"]
         process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )

@@ -19,5 +19,6 @@ def add_observation(launch: argparse.ArgumentParser) -> None:
         "--digests",
         action="store_true",
         help="also in process, keep a digest of every packet for `neuros verify`; each packet is"
-        " serialised for it there (on the other back ends digests are always kept)",
+        " serialised for it there (on the other back ends digests are always kept, in process"
+        " where all connections are lossless and it costs under 2 %% of the processor time)",
     )

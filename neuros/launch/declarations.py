@@ -54,7 +54,7 @@ class Declarations:
         }
         self._hooks: dict[str, list[DeclaredHook]] = {}
         self._finalisers: dict[str, list[str]] = {}
-        self._finalising: dict[str, str] = {}
+        self._finalising: dict[str, str | None] = {}
 
     def take(self, message: Mapping[str, Any]) -> None:
         """Take the message ``hooks`` (see :mod:`neuros.control`) of a node."""
@@ -71,10 +71,10 @@ class Declarations:
             for place, hook in enumerate(message["hooks"])
         ]
 
-    def note_finalising(self, node: str, hook: str) -> None:
-        """A node has started this finalise hook."""
+    def note_finalising(self, node: str, hook: str | None) -> None:
+        """A node has started this finalise hook; ``""``: to close what it holds; ``None``: done."""
         self._finalising[node] = hook
-        if hook in self._finalisers.get(node, ()):
+        if hook and hook in self._finalisers.get(node, ()):
             self._finalisers[node].remove(hook)
 
     def is_finalising(self, node: str) -> bool:
@@ -84,8 +84,11 @@ class Declarations:
     def unfinished(self, node: str) -> list[str]:
         """What a node that has not made its final report owes: clauses about its finalise hooks."""
         clauses = []
-        if hook := self._finalising.get(node):
+        hook = self._finalising.get(node)
+        if hook:
             clauses.append(f"finalise hook '{hook}' of '{node}' did not finish")
+        elif hook is not None:
+            clauses.append(f"what '{node}' has registered with node.on_close did not end")
         if names := self._finalisers.get(node):
             hooks = " and ".join(f"'{name}'" for name in names)
             noun = "hook" if len(names) == 1 else "hooks"

@@ -118,16 +118,14 @@ def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]
     now = time.monotonic()
     kill_at, give_up_at = now + grace_s, now + grace_s + KILL_DEADLINE_S
     pause_s = _POLL_S / 5
-    if processes.alive():
-        resume()
-    has_killed = False
+    resume_at = [now, kill_at]
     while (alive := processes.alive()) and time.monotonic() < give_up_at:
         if time.monotonic() >= kill_at:
             _kill(alive)
             pause_s = _POLL_S / 5
-            if not has_killed:
-                has_killed = True
-                resume()
+        if resume_at and time.monotonic() >= resume_at[0]:
+            del resume_at[0]
+            resume()
         time.sleep(max(0.001, min(pause_s, abs(kill_at - time.monotonic()))))
         pause_s = min(_POLL_S, pause_s * 2)
 

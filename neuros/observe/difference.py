@@ -93,7 +93,8 @@ def _compare_connection(
         remarks.append(
             f"{name}: not compared, there are neither digests nor a recording of it in"
             f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process digests are kept with"
-            " --digests, and never of packets that a node sends to itself)"
+            " --digests, or unasked where no packet may be lost and they are cheap; never of what a"
+            " node sends to itself)"
         )
         return 0
     compared = _first_difference(in_a.sent, in_b.sent)

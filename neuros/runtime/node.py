@@ -192,9 +192,11 @@ class NodeRuntime:
                 if spec.kind is HookKind.FINALISE:
                     self._tell("finalising", node=self.name, hook=spec.name)
                     self._guard(partial(self._effects.run, spec))
+        self._tell("finalising", node=self.name, hook="")
         if self._keeper is not None:
             self._keeper.close()
         self._host.close()
+        self._tell("finalising", node=self.name, hook=None)
 
     # ------------------------------------------------------------------ inbox
 

@@ -65,7 +65,7 @@ def describe(error: BaseException) -> str:
     lines = "".join(traceback.format_exception_only(type(error), error)).splitlines()
     # A syntax error shows the place first, indented.
     line = next(line for line in lines if line and not line.startswith(" ")).strip()
-    hint = _hint(error) or nest2_hint(error, line.partition(": ")[2])
+    hint = nest2_hint(error, line.partition(": ")[2]) or _hint(error)
     return f"{line} ({hint})" if hint else line
 
 
@@ -79,10 +79,10 @@ def _hint(error: BaseException) -> str:
     if isinstance(error, FileNotFoundError) and _is_relative(error.filename):
         if _innermost_file(error).endswith("/subprocess.py"):
             return ""  # it is a program, and is looked for on the PATH
-        name = os.fsdecode(error.filename)
+        name, folder = os.fsdecode(error.filename), os.path.realpath("/proc/self/cwd")
         return (
-            f"relative to the current folder, which is {os.getcwd()}; a file beside the plugin,"
-            f" or of the project, is node.resolve_path({name!r})"
+            f"relative to the current folder, which is {folder}; a file beside the plugin, or of"
+            f" the project, is node.resolve_path({name!r})"
         )
     return ""
 

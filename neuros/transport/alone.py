@@ -98,8 +98,6 @@ class Alone:
 
     def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
         self.loop = loop
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
         self._context = rclpy.Context()
         rclpy.init(
             args=["--ros-args", "--disable-external-lib-logs"],
@@ -107,6 +105,8 @@ class Alone:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._ros_node = plain_node(file, self._context)
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
 
     def transport(self, file: NodeFile) -> _Nowhere:
         """One that carries nothing."""

@@ -127,7 +127,6 @@ def _message(kind: Any) -> tuple[WriteItem, ReadItem]:
 
 
 def _reader(kind: Any, parts: tuple[Part, ...]) -> ReadItem:
-    """All slots are set in one go, without a turn of the interpreter for each."""
     layout = schema(kind)
     kinds, fill, fixed = layout.kinds, layout.fill, [value for *_, value in layout.switches]
     readers = tuple(part.read for part in parts)

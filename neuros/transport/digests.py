@@ -8,6 +8,8 @@ speed (a camera's 921,600 bytes in 0.03 ms, where BLAKE2b takes 1.6 ms and CRC-3
 
 from __future__ import annotations
 
+import statistics
+import time
 from array import array
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -22,6 +24,10 @@ from neuros.transport.message_buffers import MessageBuffers, message_buffers
 
 Digest: TypeAlias = Callable[[Any, bytes], int]
 """From a packet, and the bytes that it travels as, to its digest."""
+
+_WARMING_UP, _TRIED = 16, 48
+_DEAR = 0.02
+"""Share of a run that digests may cost where nobody has asked for them."""
 
 Digests: TypeAlias = "dict[Connection, array[int]]"
 
@@ -47,6 +53,51 @@ def digest_of(packet: Any) -> int:
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
         return _digest(message_carrier(kind).encode(buffers.leave_out(packet)), buffers, packet)
     return _whole(message_carrier(kind).encode(packet))
+
+
+class TriedDigest:
+    """Digests of packets in memory, for as long as they are cheap: that is found out once.
+
+    A packet in memory is serialised for its digest alone. Of the first packets it is measured how
+    long that takes, the median, as a share of the processor time in which they are sent; if that is
+    too much, no packet of the process is digested any more. (Neither figure is larger for it that
+    the machine does something else meanwhile.)
+
+    Args:
+        clock: monotonic, nanoseconds.
+        worked: processor time of the process, nanoseconds.
+    """
+
+    def __init__(
+        self,
+        digest: Callable[[Any], int] = digest_of,
+        clock: Callable[[], int] = time.perf_counter_ns,
+        worked: Callable[[], int] = time.process_time_ns,
+    ) -> None:
+        self._digest = digest
+        self._clock = clock
+        self._worked = worked
+        self._worked_before_ns = 0
+        self._seen = 0
+        self._took_ns: list[int] | None = []
+        self._is_dear = False
+
+    def __call__(self, packet: Any) -> int | None:
+        """The digest of a packet; ``None``: they are too dear, and none are kept."""
+        if self._took_ns is None:
+            return None if self._is_dear else self._digest(packet)
+        begun_ns = self._clock()
+        found = self._digest(packet)
+        self._seen += 1
+        if self._seen == _WARMING_UP:  # its class is known now, its code is in the caches
+            self._worked_before_ns = self._worked()
+        elif self._seen > _WARMING_UP:
+            self._took_ns.append(self._clock() - begun_ns)
+            if len(self._took_ns) == _TRIED:
+                in_all_ns = statistics.median(self._took_ns) * _TRIED
+                self._is_dear = in_all_ns > _DEAR * (self._worked() - self._worked_before_ns)
+                self._took_ns = None
+        return None if self._is_dear else found
 
 
 class _LargeDigest:

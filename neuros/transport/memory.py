@@ -82,8 +82,8 @@ class MemoryTransport:
     """Carries the packets of one node to the others in the same process.
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
-    serialised for one, which is not done here otherwise. ``digests_of`` tells of which connections
-    they are kept.
+    serialised for one, which is not done here otherwise. Once it gives ``None``, none are kept any
+    more. ``digests_of`` tells of which connections they are kept.
 
     Attributes:
         make_packet: a new message with default values, for a type in ROS notation.
@@ -94,7 +94,7 @@ class MemoryTransport:
         file: NodeFile,
         hub: MemoryHub,
         outside: Outside,
-        digest: Callable[[Any], int] | None = None,
+        digest: Callable[[Any], int | None] | None = None,
         digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
         self._name = file.node.name
@@ -132,7 +132,7 @@ class MemoryTransport:
         """
         if not self._is_open:
             return
-        if self.digests:
+        if self._digest is not None and self.digests:
             self._note_digest([c for c in connections if c in self.digests], packet)
         last = connections[-1]
         for connection in connections[:-1]:
@@ -179,9 +179,21 @@ class MemoryTransport:
         if not connections or self._digest is None:
             return
         digest = self._digest(packet)
+        if digest is None:
+            self._forget_digests()
+            return
         for connection in connections:
             self.digests[connection].append(digest)
             self._channels[connection].announce(digest)
+
+    def _forget_digests(self) -> None:
+        """Keep none of what this node sends; half of them would tell nobody anything."""
+        self._digest = None
+        for connection, channel in self._channels.items():
+            if connection in self.digests:
+                channel.forget_digests()
+                del self.digests[connection][:]
+                del self._hub.received[connection][:]
 
     def _is_unshared(self, packet: Any) -> bool:
         """Whether the hook gave the packet up, and no part of it is held anywhere."""
@@ -221,6 +233,10 @@ class _Channel:
     def announce(self, digest: int) -> None:
         """The digest of the packet that is sent next."""
         self._digests.append(digest)
+
+    def forget_digests(self) -> None:
+        """None are kept of the packets under way."""
+        self._digests.clear()
 
     def send(self, packet: Any) -> None:
         if len(self._packets) < self._window:

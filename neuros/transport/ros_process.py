@@ -17,7 +17,7 @@ from neuros.transport.callbacks import Fail, PluginCallbacks
 from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
-from neuros.transport.digests import digest_of
+from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
@@ -36,8 +36,9 @@ _CROWD = 16
 class RosProcess:
     """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
 
-    ``digests``: in memory, too, where a packet is serialised only for that. ``record``: at least
-    those that tell which packets have arrived where some may be lost.
+    ``digests``: in memory, too, where a packet is serialised only for that; where all connections
+    are lossless they are kept unasked, if that is cheap. ``record``: at least those that tell which
+    packets have arrived where some may be lost; the packets themselves are in the bag.
 
     Attributes:
         has_leftovers: whether :meth:`close` has left ROS as it was. Python would destroy it at its
@@ -67,16 +68,18 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
         self._loop = RosLoop(self._context, on_failure)
         self._has_digests = digests
+        is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
+        self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
         self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
         self._ros_nodes: dict[str, PlainNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
 
     @property
     def loop(self) -> RosLoop:
@@ -93,13 +96,13 @@ class RosProcess:
             transport = RosTransport(file, ros_node, self._loop)
         else:
             outside = RosOutside(file, ros_node, self._loop)
-            digest = digest_of if self._has_digests or self._is_recorded else None
+            is_asked = self._has_digests or self._is_recorded
             transport = MemoryTransport(
                 file,
                 self._hub,
                 outside,
-                digest,
-                lambda c: self._has_digests or not c.is_reliable,
+                digest_of if is_asked else self._tried_digest,
+                lambda c: not self._is_recorded or self._has_digests or not c.is_reliable,
             )
         self._transports.append(transport)
         return transport

@@ -122,6 +122,10 @@ BASIC_TYPES = {
 """By their names in IDL."""
 
 
+_MANY = 15
+"""Slots; fewer are set one by one, which takes less than to prepare for all of them."""
+
+
 class Schema:
     """The fields of a message class, those of single messages within it laid out beside its own.
 
@@ -131,7 +135,6 @@ class Schema:
         places: the slots that lead to each of these.
         switches: slots that hold no field (whether setters check): whose of these, name and value.
         leaves: all fields that hold no single message, in the order of the definition.
-        values: gets the values of all leaves of a message.
         fill: puts into new messages of ``kinds`` what belongs there: those behind the first one,
             the values of ``switches``, and those of all leaves.
     """
@@ -149,7 +152,6 @@ class Schema:
                 self._add(field.slot, schema(field.type.message))
             else:
                 self.leaves.append(Leaf((field.slot,), 0, field))
-        self.values = getter([leaf.path for leaf in self.leaves])
         self.fill = self._filler()
 
     def _add(self, slot: str, inner: Schema) -> None:
@@ -162,14 +164,21 @@ class Schema:
         ]
 
     def _filler(self) -> Callable[[list[Any], list[Any]], Any]:
-        """All slots are set in one go, without a turn of the interpreter for each."""
+        """Many slots are set in one go, without a turn of the interpreter for each."""
         place_of = {path: place for place, path in enumerate(self.places)}
         targets = [(place_of[path[:-1]], path[-1]) for path in self.places[1:]]
         targets += [(owner, slot) for owner, slot, _ in self.switches]
         targets += [(leaf.owner, leaf.field.slot) for leaf in self.leaves]
         owners = _items([owner for owner, _ in targets])
         names = [slot for _, slot in targets]
-        return lambda made, values: deque(map(setattr, owners(made), names, values), maxlen=0)
+        if len(names) > _MANY:
+            return lambda made, values: deque(map(setattr, owners(made), names, values), maxlen=0)
+
+        def fill(made: list[Any], values: list[Any]) -> None:
+            for message, name, value in zip(owners(made), names, values):  # noqa: B905, it costs
+                setattr(message, name, value)
+
+        return fill
 
 
 @cache

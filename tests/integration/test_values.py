@@ -62,9 +62,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(params=[*BACKENDS, "docker"])
 def back_end(request: pytest.FixtureRequest) -> str:
-    if request.param == "docker":
+    return available(request.param)
+
+
+def available(back_end: str) -> str:
+    if back_end == "docker":
         require_containers()
-    return str(request.param)
+    return back_end
 
 
 class TestWhatFits:
@@ -106,47 +110,30 @@ class TestWhatFits:
             assert main(["verify", *folders]) == 0, capsys.readouterr().out
 
 
-class TestWhatDoesNotFit:
-    @pytest.mark.parametrize(
-        ("wrong", "hook", "text"),
-        [
-            (
-                "text",
-                "send",
-                "packet for output 'twist': field 'linear.x' must be float64, but is 'fast' (str)",
-            ),
-            (
-                "range",
-                "send",
-                "packet for output 'count': field 'data' must be uint8: 0 to 255, but is 300 (int)",
-            ),
-            (
-                "nested",
-                "send",
-                "packet for output 'poses': field 'poses[3].position.y' must be float64,"
-                " but is 'up' (str)",
-            ),
-            (
-                "external",
-                "say",
-                "packet for output 'said': field 'data' must be float64, but is 'loud' (str)",
-            ),
-        ],
-    )
-    def test_it_ends_the_run_with_its_place_and_nothing_is_sent(
-        self, back_end: str, run: Run, wrong: str, hook: str, text: str
-    ) -> None:
-        if back_end == "docker" and wrong != "nested":
-            pytest.skip("one is enough")
-        finished = run(back_end, wrong)
-        assert finished.exit_code == 1, finished.output
-        last = finished.output.splitlines()[-1]
-        assert re.search(rf"/source\.py:\d+: hook '{hook}': ", last), last
-        assert last.endswith(text)
-        if hook == "send":
-            assert {each["sent"] for each in finished.record["connections"]} == {0}
-            assert finished.run_folder is not None
-            assert not list((finished.run_folder / "book").glob("twist"))
+REFUSED = {
+    "text": "packet for output 'twist': field 'linear.x' must be float64, but is 'fast' (str)",
+    "range": "packet for output 'count': field 'data' must be uint8: 0 to 255, but is 300 (int)",
+    "nested": "packet for output 'poses': field 'poses[3].position.y' must be float64,"
+    " but is 'up' (str)",
+    "external": "packet for output 'said': field 'data' must be float64, but is 'loud' (str)",
+}
+RUNS = [*itertools.product(BACKENDS, REFUSED), ("docker", "nested")]  # of containers, one
+
+
+@pytest.mark.parametrize(("where", "wrong"), RUNS)
+def test_what_does_not_fit_ends_the_run_with_its_place_and_nothing_is_sent(
+    where: str, wrong: str, run: Run
+) -> None:
+    finished = run(available(where), wrong)
+    assert finished.exit_code == 1, finished.output
+    last = finished.output.splitlines()[-1]
+    hook = "say" if wrong == "external" else "send"
+    assert re.search(rf"/source\.py:\d+: hook '{hook}': ", last), last
+    assert last.endswith(REFUSED[wrong])
+    if hook == "send":
+        assert {each["sent"] for each in finished.record["connections"]} == {0}
+        assert finished.run_folder is not None
+        assert not list((finished.run_folder / "book").glob("twist"))
 
 
 EVERYTHING = """

@@ -149,6 +149,27 @@ host.report(stack={stack})
     assert outcome.stacks == {"b": stack[2]}
 
 
+def test_hooks_that_have_finished_are_not_blamed(run: Run) -> None:
+    closes = f"""
+host.up()
+host.tell('hooks', hooks=[], finalise=['save'])
+host.wait_for('stop')
+host.tell('finalising', hook='save')
+host.tell('finalising', hook='')
+{DEAF}
+"""
+    outcome = run(
+        a=SHUTS_DOWN,
+        b=closes,
+        c=closes.replace("hook='')", "hook='')\nhost.tell('finalising', hook=None)"),
+    )
+    assert sorted(outcome.failures) == [
+        "node 'b' had to be killed 5 s after the end began:"
+        " what 'b' has registered with node.on_close did not end",
+        "node 'c' had to be killed 5 s after the end began: its process did not end",
+    ]
+
+
 def test_a_report_behind_the_final_one_does_not_count(run: Run) -> None:
     outcome = run(a=SHUTS_DOWN + "; host.report(late=True)")
     assert outcome.has_final_report("a")

@@ -302,7 +302,7 @@ _port = st.one_of(
 _ports = st.one_of(_port, st.lists(_port, max_size=2).map(lambda ports: f"[{', '.join(ports)}]"))
 
 
-@settings(deadline=None)  # the node is really loaded
+@settings(deadline=None, max_examples=50)  # the node is really loaded
 @given(inputs=_ports, outputs=_ports)
 def test_the_judgement_is_that_of_a_node_that_loads_the_plugin(
     tmp_path_factory: pytest.TempPathFactory, inputs: str, outputs: str

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
 from neuros.transport.carriers import message_carrier
-from neuros.transport.digests import digest_for, digest_of
+from neuros.transport.digests import TriedDigest, digest_for, digest_of
 from neuros.transport.large_packets import LargeInput, LargeOutput, is_parcel
 from neuros.transport.message_buffers import message_buffers
 
@@ -74,3 +74,41 @@ def test_a_parcel_has_the_digest_of_the_whole_message_at_both_ends(
     assert digest_for(Image)(received, data) == whole, "also once its buffers have been fetched"
     receiver.close()
     sender.close()
+
+
+class Sender:
+    """Digests one packet after another, with a clock of its own."""
+
+    def __init__(self, digest_ns: int, between_ns: int, stumbles: bool = False) -> None:
+        self._now_ns = self._count = 0
+        self._costs = digest_ns, between_ns, stumbles
+        self.tried = TriedDigest(self._digest, lambda: self._now_ns, lambda: self._now_ns)
+
+    def _digest(self, packet: int) -> int:
+        digest_ns, _, stumbles = self._costs
+        self._count += 1
+        stumble_ns = 10_000_000 if stumbles and self._count == 30 else 0
+        self._now_ns += 1_000_000 if self._count == 1 else digest_ns + stumble_ns
+        return packet
+
+    def send(self, packets: int) -> list[int | None]:
+        found = []
+        for number in range(packets):
+            found.append(self.tried(number))
+            self._now_ns += self._costs[1]
+        return found
+
+
+def test_digests_that_are_cheap_are_kept_of_all_packets() -> None:
+    assert Sender(digest_ns=15_000, between_ns=1_000_000).send(200) == [*range(200)]
+
+
+def test_digests_that_are_dear_are_given_up_soon() -> None:
+    found = Sender(digest_ns=15_000, between_ns=100_000).send(200)
+    assert found[:60] == [*range(60)]
+    assert found[70:] == [None] * 130
+
+
+def test_one_digest_that_was_interrupted_does_not_make_them_dear() -> None:
+    sender = Sender(digest_ns=15_000, between_ns=1_000_000, stumbles=True)
+    assert None not in sender.send(200)
