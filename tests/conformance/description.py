@@ -1,4 +1,4 @@
-"""What a small project consists of: a plain description that is drawn, run, judged, shrunk and kept.
+"""What a small project consists of: a plain description, drawn, run, judged, shrunk and kept.
 
 All nodes run one plugin (``plugin.py``), which reads from its environment which hooks it has and
 what they do; so a description says everything, and a kept one is a JSON file.
@@ -131,7 +131,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Project:
-    """A project, and how it is ended: ``duration`` (drained) or ``interrupt``, after ``seconds``."""
+    """A project, and what ends it after ``seconds``: ``duration`` (drained) or ``interrupt``."""
 
     nodes: tuple[Node, ...]
     connections: tuple[Connection, ...] = ()

@@ -26,6 +26,7 @@ The rules by name, as :class:`Violation` has them:
 ``tick``           one execution per due time, never before it
 ``counts``         ``run.json`` says what was observed, and its ledger closes
 ``end``            the exit code is right, the end comes in time, and nothing is left
+``killed``         every node ends by itself, within the time that it has for that
 ``drain``          after the end was asked for, nothing that sends unasked starts any more
 =================  ============================================================================
 """
@@ -41,7 +42,18 @@ from functools import cached_property
 from .description import Connection, Hook, Node, Project, Taken
 from .running import Execution, Observed
 
-TIMED = {"window", "oldest first", "optional", "fresh", "fair", "awake", "age", "tick", "drain"}
+TIMED = {
+    "window",
+    "oldest first",
+    "optional",
+    "fresh",
+    "fair",
+    "awake",
+    "age",
+    "tick",
+    "drain",
+    "killed",
+}
 """Rules that compare times of different processes: a machine that stands still can break them."""
 
 MS = 1_000_000
@@ -285,7 +297,7 @@ class Judge:
             intake.starts_ns.append(each.start_ns)
 
     def _whole_number(self, c: Connection, byte: int, last: int, now_ns: int) -> int:
-        """The number whose last byte is known: the next such, or the newest where any may be lost."""
+        """The number that ends in a byte: the next such, or the newest where any may be lost."""
         first = last + 1 + (byte - last - 1) % 256
         if c.is_reliable:
             return first
@@ -409,13 +421,13 @@ class Judge:
         return self.busy_elsewhere[node].within(from_ns, to_ns)
 
     def _waiting_since(self, c: Connection, intake: _Intake, position: int) -> int:
-        """When the packet was sent for which the mailbox is no longer empty; ``_NEVER``: unknown."""
+        """When the packet was sent that ended the mailbox's emptiness; ``_NEVER``: unknown."""
         sent = self.sent_ns[c.origin]
         number = position + 1 if self._lost(c) == 0 else intake.after(position)
         return sent[number - 1] if number is not None and number <= len(sent) else _NEVER
 
     def _lost(self, c: Connection) -> int | None:
-        """How many packets of a connection were lost in transport, ``None`` if that is not known."""
+        """How many packets of a connection were lost in transport; ``None``: unknown."""
         if c.is_reliable:
             return 0
         counters = self.seen.connection(str(c))
@@ -618,7 +630,7 @@ class Judge:
         begin_ns = self.begin_ns[node.name]
         if has_initialisers and starts[0] < begin_ns + period_ns:
             yield Violation("tick", f"{node.name}.{hook.name} ran before its first due time")
-        # Some phase has a due time between each two starts. A note is made a moment after the start,
+        # Some phase has a due time between each two starts. A note is made a moment after a start,
         # and later still where the machine does something else just then.
         slack_ns = period_ns // 4
         pairs = [(a - slack_ns, b) for a, b in itertools.pairwise(starts) if b - a < period_ns]
@@ -635,7 +647,7 @@ class Judge:
             default=0,
         )
         if early > 1 + len(starts) // 20:
-            text = f"{node.name}.{hook.name} ran {early} times more often than every {hook.seconds:g} s"
+            text = f"{node.name}.{hook.name} ran {early} times before it was due again"
             yield Violation("tick", text)
         yield from self._missed_ticks(node, hook, starts)
 
@@ -751,7 +763,8 @@ class Judge:
             if code != 1:
                 yield Violation("end", f"a deadlock with exit code {code}")
         elif code == 1:
-            yield Violation("end", f"failed: {reason}")
+            rule = "killed" if "had to be killed" in reason else "end"
+            yield Violation(rule, f"failed: {reason}")
         elif code == 130:
             if self.project.end != "interrupt" and self.last_start_ns:
                 yield Violation("end", f"exit code 130: {reason}")

@@ -7,6 +7,7 @@ outruns its hook beside one that must not wait.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,7 +34,7 @@ def drawn(count: int, number: int) -> list[Project]:
 
 
 def _drawn(number: int) -> Project:
-    """One: those that hypothesis tries after each other are alike, so each has a seed of its own."""
+    """One: those that hypothesis tries after each other are alike, so each has its own seed."""
     found: list[Project] = []
 
     @seed(number)
@@ -253,7 +254,7 @@ def pipelines(draw: Draw) -> Project:
     chain = [node.name for node in nodes]
     connections = [
         Connection(a, "o", b, "x", draw(st.sampled_from([0, 0, 0, 2])), draw(QUEUES))
-        for a, b in zip(chain, chain[1:], strict=False)
+        for a, b in itertools.pairwise(chain)
     ]
     return finished(draw, nodes, connections)
 
