@@ -174,6 +174,7 @@ def test_a_model_comes_as_file_text_or_spec(tmp_path):
         MuJoCo(SimulatedNode(), 3)
 
 
+@pytest.mark.needs("OpenGL")
 def test_the_spec_of_the_plugin_is_not_touched():
     spec = mujoco.MjSpec.from_string(WORLD)
     camera = {"sensor": "camera", "element": "eye", "rate": 10, "width": 4000, "height": 10}

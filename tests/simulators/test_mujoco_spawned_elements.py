@@ -80,6 +80,7 @@ def test_a_drive_is_given_to_the_joint_that_is_spawned(tmp_path: Path) -> None:
     assert sim.model.nu == 3 + 1 + 2  # of the world, of the robot, of the node file
 
 
+@pytest.mark.needs("OpenGL")
 def test_a_camera_of_a_spawned_robot_sees(tmp_path: Path) -> None:
     keys = {"sensor": "camera", "element": "robot/eye", "rate": 50, "width": 1000, "height": 8}
     node, sim = simulation(tmp_path, {"image": ("sensor_msgs/msg/Image", keys)})
