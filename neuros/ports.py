@@ -76,8 +76,11 @@ class Transport(Protocol):
         Whoever reads them takes them away. Connections of which none are kept are left out.
         """
 
+    def note_execution(self) -> None:
+        """A hook has ended: what has reached the node meanwhile comes before the next one."""
+
     def has_taken_in(self) -> bool:
-        """Whether all that has reached this node, from wherever, has been handled."""
+        """Whether that has been handled."""
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""
@@ -129,7 +132,7 @@ class EventLoop(Protocol):
         """Whether all that had come from outside has been handled; at a loop-back it has."""
 
     def note_execution(self) -> None:
-        """A hook, or a callback of a plugin, has run: meanwhile something may have arrived."""
+        """A hook, or a callback of a plugin, has ended: something may have arrived meanwhile."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Handle ``event`` after everything that already waits. Loop thread only."""

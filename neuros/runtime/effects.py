@@ -56,6 +56,7 @@ class NodeEffects:
         # Nothing is to be added to these: each call that is left out counts.
         self.acknowledge = transport.acknowledge
         self.has_taken_in = transport.has_taken_in
+        self._note_execution = transport.note_execution
         self._keeper = keeper
         self._sampler = sampler
         self._enter = enter
@@ -70,7 +71,7 @@ class NodeEffects:
             self.has_run = True
             self._on_first_hook()
         box = [self.run(hook.spec, arguments)]
-        self._loop.note_execution()
+        self._note_execution()
         del arguments  # else a packet that the hook passes on would count as held
         if hook.spec.kind is HookKind.INITIALISE:
             self._on_initialised()

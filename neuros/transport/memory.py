@@ -40,7 +40,7 @@ class MemoryHub:
 
     Attributes:
         received: where the digests of what is received go, by connection.
-        coming: by node, the packets that are on their way to it, a queue for each connection.
+        arrivals: what is on its way to each node.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class MemoryHub:
         self.loop = loop
         self.post = loop.post
         self.copy = copy
-        self.coming: dict[str, list[deque[Any]]] = defaultdict(list)
+        self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self.received: dict[Connection, array[int]] = {}
         self.inboxes: dict[str, Inbox] = {}
         self._waiting: list[Connection] = []
@@ -66,8 +66,16 @@ class MemoryHub:
                 self._register(connection)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender of a connection how far its receiver has come."""
-        self.inboxes[connection.source_node].on_acknowledgement(connection, position)
+        """Tell the sender of a connection, as an event, how far its receiver has come."""
+        self.arrivals[connection.source_node].acknowledgements.append(position)
+        self.post(partial(self._acknowledge, connection))
+
+    def _acknowledge(self, connection: Connection) -> None:
+        sender = connection.source_node
+        arrivals = self.arrivals[sender]
+        arrivals.note()
+        position = arrivals.acknowledgements.popleft()
+        self.inboxes[sender].on_acknowledgement(connection, position)
 
     def leave(self, name: str) -> None:
         """Let what is under way to a node go nowhere."""
@@ -99,7 +107,7 @@ class MemoryTransport:
     ) -> None:
         self._name = file.node.name
         self._loop = hub.loop
-        self._coming = hub.coming[file.node.name]
+        self._arrivals = hub.arrivals[file.node.name]
         self._connections = file.connections
         self._hub = hub
         self._outside = outside
@@ -148,16 +156,17 @@ class MemoryTransport:
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
-        if not self._is_open:
-            return
-        self._hub.post(partial(self._hub.acknowledge, connection, position))
+        if self._is_open:
+            self._hub.acknowledge(connection, position)
+
+    def note_execution(self) -> None:
+        """A hook has ended: what is on its way here comes before the next one."""
+        self._arrivals.owe()
+        self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        """Whether no packet is on its way here, from within the process or from outside."""
-        for packets in self._coming:  # a loop, since any() over a generator takes thrice as long
-            if packets:
-                return False
-        return self._loop.has_taken_in
+        """Whether all has arrived that was on its way when the last hook of the node ended."""
+        return not self._arrivals.owed and self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not joined yet."""
@@ -204,6 +213,35 @@ class MemoryTransport:
         return False
 
 
+class _Arrivals:
+    """What is on its way to one node, each an event that waits in the loop.
+
+    Attributes:
+        acknowledgements: positions, oldest first.
+        packets: a queue for each connection.
+        owed: how much of it was on its way when the last hook of the node ended, and still is.
+    """
+
+    __slots__ = ("acknowledgements", "owed", "packets")
+
+    def __init__(self) -> None:
+        self.acknowledgements: deque[int] = deque()
+        self.packets: list[deque[Any]] = []
+        self.owed = 0
+
+    def owe(self) -> None:
+        """A hook has ended."""
+        owed = len(self.acknowledgements)
+        for packets in self.packets:
+            owed += len(packets)
+        self.owed = owed
+
+    def note(self) -> None:
+        """Something arrives."""
+        if self.owed:
+            self.owed -= 1
+
+
 class _Nobody:
     """Takes the place of a node that has left."""
 
@@ -220,14 +258,15 @@ class _Channel:
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 
-    __slots__ = ("_connection", "_digests", "_hub", "_packets", "_window")
+    __slots__ = ("_arrivals", "_connection", "_digests", "_hub", "_packets", "_window")
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
         self._connection = connection
         self._window = connection.window
         self._packets: deque[Any] = deque(maxlen=self._window)
-        hub.coming[connection.destination_node].append(self._packets)
+        self._arrivals = hub.arrivals[connection.destination_node]
+        self._arrivals.packets.append(self._packets)
         self._digests: deque[int] = deque(maxlen=connection.window)
 
     def announce(self, digest: int) -> None:
@@ -248,4 +287,5 @@ class _Channel:
             self._hub.received[self._connection].append(self._digests.popleft())
         connection = self._connection
         inbox = self._hub.inboxes[connection.destination_node]
+        self._arrivals.note()
         inbox.on_packet(connection, self._packets.popleft())

@@ -112,8 +112,12 @@ class RosTransport:
                 self._large.settle(connection, position)
             self._acknowledgements[connection](encode_position(position))
 
+    def note_execution(self) -> None:
+        """A hook has ended."""
+        self._loop.note_execution()
+
     def has_taken_in(self) -> bool:
-        """Whether all that has reached this node has been handled."""
+        """Whether all that had reached this node when the last hook ended has been handled."""
         return self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
