@@ -9,7 +9,6 @@ from __future__ import annotations
 from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
-from functools import partial
 from typing import Any, Protocol
 
 from neuros.ports import EventLoop, Inbox
@@ -65,18 +64,6 @@ class MemoryHub:
                 self._waiting.remove(connection)
                 self._register(connection)
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender of a connection, as an event, how far its receiver has come."""
-        self.arrivals[connection.source_node].acknowledgements.append(position)
-        self.post(partial(self._acknowledge, connection))
-
-    def _acknowledge(self, connection: Connection) -> None:
-        sender = connection.source_node
-        arrivals = self.arrivals[sender]
-        arrivals.note()
-        position = arrivals.acknowledgements.popleft()
-        self.inboxes[sender].on_acknowledgement(connection, position)
-
     def leave(self, name: str) -> None:
         """Let what is under way to a node go nowhere."""
         if name in self.inboxes:
@@ -122,6 +109,9 @@ class MemoryTransport:
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
         }
+        self._ways_back = {
+            c: _WayBack(hub, c) for c in elsewhere if c.destination_node == self._name
+        }
 
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
@@ -157,11 +147,14 @@ class MemoryTransport:
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
         if self._is_open:
-            self._hub.acknowledge(connection, position)
+            self._ways_back[connection].send(position)
 
     def note_execution(self) -> None:
         """A hook has ended: what is on its way here comes before the next one."""
-        self._arrivals.owe()
+        owed = 0
+        for queue in self._arrivals.queues:
+            owed += len(queue)
+        self._arrivals.owed = owed
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
@@ -217,29 +210,15 @@ class _Arrivals:
     """What is on its way to one node, each an event that waits in the loop.
 
     Attributes:
-        acknowledgements: positions, oldest first.
-        packets: a queue for each connection.
+        queues: packets and acknowledgements, by connection.
         owed: how much of it was on its way when the last hook of the node ended, and still is.
     """
 
-    __slots__ = ("acknowledgements", "owed", "packets")
+    __slots__ = ("owed", "queues")
 
     def __init__(self) -> None:
-        self.acknowledgements: deque[int] = deque()
-        self.packets: list[deque[Any]] = []
+        self.queues: list[deque[Any]] = []
         self.owed = 0
-
-    def owe(self) -> None:
-        """A hook has ended."""
-        owed = len(self.acknowledgements)
-        for packets in self.packets:
-            owed += len(packets)
-        self.owed = owed
-
-    def note(self) -> None:
-        """Something arrives."""
-        if self.owed:
-            self.owed -= 1
 
 
 class _Nobody:
@@ -266,7 +245,7 @@ class _Channel:
         self._window = connection.window
         self._packets: deque[Any] = deque(maxlen=self._window)
         self._arrivals = hub.arrivals[connection.destination_node]
-        self._arrivals.packets.append(self._packets)
+        self._arrivals.queues.append(self._packets)
         self._digests: deque[int] = deque(maxlen=connection.window)
 
     def announce(self, digest: int) -> None:
@@ -287,5 +266,30 @@ class _Channel:
             self._hub.received[self._connection].append(self._digests.popleft())
         connection = self._connection
         inbox = self._hub.inboxes[connection.destination_node]
-        self._arrivals.note()
+        if self._arrivals.owed:
+            self._arrivals.owed -= 1
         inbox.on_packet(connection, self._packets.popleft())
+
+
+class _WayBack:
+    """The acknowledgements that are on their way on one connection."""
+
+    __slots__ = ("_arrivals", "_connection", "_hub", "_positions")
+
+    def __init__(self, hub: MemoryHub, connection: Connection) -> None:
+        self._hub = hub
+        self._connection = connection
+        self._positions: deque[int] = deque()
+        self._arrivals = hub.arrivals[connection.source_node]
+        self._arrivals.queues.append(self._positions)
+
+    def send(self, position: int) -> None:
+        self._positions.append(position)
+        self._hub.post(self._deliver)
+
+    def _deliver(self) -> None:
+        if self._arrivals.owed:
+            self._arrivals.owed -= 1
+        connection = self._connection
+        inbox = self._hub.inboxes[connection.source_node]
+        inbox.on_acknowledgement(connection, self._positions.popleft())
