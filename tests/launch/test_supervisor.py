@@ -94,7 +94,8 @@ def test_but_not_longer_than_it_was_said(run: Run) -> None:
 
 PACKET_IS_LOST = """
 host.connections['{side}']['a.o -> b.x'] = {{
-    'sent': 3, 'received': 2, 'acknowledged': 2, 'is_blocked': False}}
+    'sent': 3, 'received': 2, 'acknowledged': 2, 'is_blocked': False, 'is_reliable': True,
+    'unread': 0, 'taker': None}}
 """
 
 
@@ -231,8 +232,8 @@ def test_every_failure_is_noted_and_the_first_decides(run: Run) -> None:
 
 
 def test_a_deadlock_names_its_cycle(run: Run) -> None:
-    blocked = "{{'sent': 1, 'acknowledged': 0, 'outstanding': 1, 'is_blocked': True}}"
-    unread = "{{'received': 1, 'acknowledged': 0}}"
+    blocked = "{{'sent': 1, 'acknowledged': 0, 'outstanding': 1, 'is_blocked': True, 'is_reliable': True}}"
+    unread = "{{'received': 1, 'acknowledged': 0, 'unread': 1, 'taker': None}}"
     stuck = (
         f"host.connections['outgoing']['{{0}}.o -> {{1}}.x'] = {blocked}\n"
         f"host.connections['incoming']['{{1}}.o -> {{0}}.x'] = {unread}\n" + WELL_BEHAVED
