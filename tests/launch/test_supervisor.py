@@ -232,7 +232,10 @@ def test_every_failure_is_noted_and_the_first_decides(run: Run) -> None:
 
 
 def test_a_deadlock_names_its_cycle(run: Run) -> None:
-    blocked = "{{'sent': 1, 'acknowledged': 0, 'outstanding': 1, 'is_blocked': True, 'is_reliable': True}}"
+    blocked = (
+        "{{'sent': 1, 'acknowledged': 0, 'outstanding': 1, 'is_blocked': True,"
+        " 'is_reliable': True}}"
+    )
     unread = "{{'received': 1, 'acknowledged': 0, 'unread': 1, 'taker': None}}"
     stuck = (
         f"host.connections['outgoing']['{{0}}.o -> {{1}}.x'] = {blocked}\n"
