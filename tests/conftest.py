@@ -5,12 +5,14 @@ depends on the machine: it has tests of its own, which name it.
 """
 
 import os
+import sys
 from collections.abc import Iterator
 
 import pytest
 from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
+LOADING = sys.getdlopenflags()
 
 
 @pytest.fixture(autouse=True)
@@ -21,6 +23,14 @@ def environment_as_found() -> Iterator[None]:
     if dict(os.environ) != found:
         os.environ.clear()
         os.environ.update(found)
+
+
+@pytest.fixture(autouse=True)
+def libraries_share_no_symbols() -> Iterator[None]:
+    """NEST has them do so from its import on; of two ROS messages with one name one breaks then."""
+    sys.setdlopenflags(LOADING)
+    yield
+    sys.setdlopenflags(LOADING)
 
 
 @pytest.hookimpl(tryfirst=True)

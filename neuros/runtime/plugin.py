@@ -34,6 +34,9 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
         raise PluginError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    # NEST has all libraries after it share their symbols. Then of two ROS messages with one name
+    # (KeyValue, GoalStatus) the second is taken for the first.
+    flags = sys.getdlopenflags()
     try:
         spec.loader.exec_module(module)
     except NeurosError:
@@ -45,6 +48,8 @@ def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
         raise PluginError(
             f"{path}{line}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
         ) from error
+    finally:
+        sys.setdlopenflags(flags)
     specs = hook_specs_of(vars(module))
     if not specs:
         raise PluginError(

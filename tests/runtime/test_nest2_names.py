@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from neuros.errors import HookError, PluginError
 from neuros.runtime.nest2 import FUNCTIONS, MODELS, PARAMETERS, nest2_hint
+from neuros.runtime.plugin import load_plugin
 from neuros.snn import reset_kernel
 from neuros.testing import PluginHarness
 
@@ -141,3 +143,15 @@ def test_other_errors_get_no_hint(error: Exception) -> None:
 def test_another_mistake_with_nest_gets_no_hint(tmp_path: Path) -> None:
     assert "NEST 2" not in error_of('nest.Create("spike_recordr")', tmp_path)
     assert "NEST 2" not in error_of("nodes.set(V_q=1.0)", tmp_path)
+
+
+def test_after_a_plugin_that_imports_nest_libraries_share_no_symbols(tmp_path: Path) -> None:
+    """Else of two messages with one name, in two packages, the second is taken for the first."""
+    plugin = tmp_path / "plugin.py"
+    plugin.write_text(
+        "import nest\nfrom neuros.hooks import neuros_initialise\n"
+        "@neuros_initialise()\ndef begin(node): ...\n"
+    )
+    before = sys.getdlopenflags()
+    load_plugin(plugin, "node")
+    assert sys.getdlopenflags() == before
