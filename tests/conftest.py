@@ -33,6 +33,13 @@ def libraries_share_no_symbols() -> Iterator[None]:
     sys.setdlopenflags(LOADING)
 
 
+@pytest.hookimpl(hookwrapper=True)
+def pytest_make_collect_report() -> Iterator[None]:
+    """Nor after modules that import NEST."""
+    yield
+    sys.setdlopenflags(LOADING)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What a test's marker ``needs`` names has to be there."""
