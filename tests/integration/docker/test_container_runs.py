@@ -82,8 +82,10 @@ def grow(node):
     node.set_user_data(bytearray(400 << 20))
 """
 INTRUDES = """
-@neuros_initialise()
+@neuros_tick(seconds=0.05)
 def intrude(node):
+    if not (node.run_dir.parent / "b/up").exists():
+        return
     def answer(action, *paths):
         try:
             action(*paths)
@@ -172,7 +174,8 @@ def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.M
 
 
 def test_a_node_writes_nothing_of_another_nodes_nor_of_the_runs(bench: ContainerBench) -> None:
-    bench.project({"a": INTRUDES, "b": RUNS})
+    up = "@neuros_initialise()\ndef up(node):\n    (node.run_dir / 'up').touch()\n"
+    bench.project({"a": INTRUDES, "b": RUNS + up})
     finished = bench.launch()
     assert finished.exit_code == 0, finished.output
     said = last_line(finished).partition("a ended the project: ")[2]
@@ -183,6 +186,7 @@ def test_a_node_writes_nothing_of_another_nodes_nor_of_the_runs(bench: Container
     }
     assert finished.run_folder is not None
     assert json.loads((finished.run_folder / "b/node.json").read_text())["node"]["name"] == "b"
+    assert bench.has_saved("a", "b")
 
 
 def test_a_node_gets_the_device_that_it_asks_for(bench: ContainerBench) -> None:
