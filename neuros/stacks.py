@@ -1,8 +1,9 @@
 """Where a node stands in its plugin: told of hooks that run for long, and of nodes that are killed.
 
 A node tells it in its reports (:func:`stack_in`). While a library holds Python's global lock it
-cannot report: then a thread in C, faulthandler's, writes the stack to a file of the node
-(:class:`StackFile`), which the supervisor reads (:func:`held_stack`). No signal is needed for that,
+cannot report, and after its last report it does not: then a thread in C, faulthandler's, writes the
+stack to a file of the node (:class:`StackFile`), which the supervisor reads (:func:`held_stack`,
+:func:`held_threads`). No signal is needed for that,
 so no system call of a plugin is interrupted, and it is the same in containers.
 """
 
@@ -90,6 +91,19 @@ def held_stack(folder: Path) -> Stack | None:
     main = threads.pop(known["main"], [])
     found = (_from_plugin(known["plugins"], frames) for frames in (main, *threads.values()))
     return next((stack for stack in found if stack), None)
+
+
+def held_threads(folder: Path) -> str:
+    """Where all threads of the process with this file stood when it could not report any more.
+
+    As faulthandler shows them, the most recent call first; empty if there is nothing of the kind.
+    """
+    try:
+        _, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
+    except (OSError, ValueError):
+        return ""
+    begins = [place for place, line in enumerate(lines) if line.startswith("Timeout (")]
+    return "\n".join(lines[begins[-1] + 1 :]) if begins else ""
 
 
 def remove_stack_files(folders: Sequence[Path]) -> None:

@@ -145,15 +145,16 @@ class Ending:
     def _fail_to_end(self, process: RunningNode) -> None:
         """Its nodes have had their time."""
         nodes = "node" if len(process.names) == 1 else "nodes"
-        unfinished = []
+        unfinished, otherwise = [], "its process did not end"
         for name in process.names:
             if self._outcome.has_final_report(name):
                 continue
+            otherwise = "it did not come to its end"
             hook = self._watch.executing(name)
             if hook and not self._declarations.is_finalising(name):
                 unfinished.append(f"'{name}' was still executing '{hook}'")
             unfinished += self._declarations.unfinished(name)
-        why = "; ".join(unfinished) or "its process did not end"
+        why = "; ".join(unfinished) or otherwise
         self._outcome.fail(
             f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
         )
@@ -176,9 +177,14 @@ class Ending:
         self.phase = Phase.KILLED
         self._deadline_s = time.monotonic() + STOP_S
         for process in self._processes:
+            first, stacks = process.names[0], self._outcome.stacks
             for name in process.names:
                 if stack := self._watch.stack_of(name):
-                    self._outcome.stacks[name] = stack.text
+                    stacks[name] = stack.text
                     text = f"{name} was at this point when it was killed"
                     self._output.log("ERROR", with_stack(text, stack))
+            if stacks.keys().isdisjoint(process.names) and (text := self._watch.threads_of(first)):
+                stacks[first] = text
+                where = f"{names_of(process)} stood when killed, the most recent call first"
+                self._output.log("ERROR", f"where the threads of {where}:\n{text}")
             self._processes.kill(process)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros.stacks import LONG_S, Stack, held_stack
+from neuros.stacks import LONG_S, Stack, held_stack, held_threads
 
 STALL_S = 5.0
 """After this long, nodes are asked why nothing moves."""
@@ -160,6 +160,10 @@ class Watch:
             return held
         stack = self._reports.get(name, {}).get("stack")
         return Stack(*stack) if stack else None
+
+    def threads_of(self, name: str) -> str:
+        """Where the threads of a node's process were if that has not reported for seconds."""
+        return held_threads(self._run_folder / self._hosts.get(name, name))
 
     def executing(self, name: str) -> str:
         """The hook that a node executes, as far as is known; empty if there is none."""

@@ -59,7 +59,7 @@ class ControlThread(threading.Thread):
                         self._on_signal()
                     elif not self._on_lines():
                         return
-                if time.monotonic() >= next_report_s:
+                if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + REPORT_S
                     self._try(self._process.report)
 

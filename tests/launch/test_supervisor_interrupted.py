@@ -109,9 +109,32 @@ def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None
     outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
     assert outcome.exit_code == 1
     assert outcome.reason == (
-        "node 'b' had to be killed 5 s after the end began: its process did not end"
+        "node 'b' had to be killed 5 s after the end began: it did not come to its end"
     )
     assert 5 <= run.lasted_s < 6.5
+
+
+def test_of_a_process_that_does_not_end_it_is_said_where_its_threads_were(run: Run) -> None:
+    stuck = """
+import faulthandler, json, os
+host.up()
+host.wait_for('stop')
+host.report(is_final=True)
+os.makedirs('b', exist_ok=True)
+file = open('b/.stack', 'wb', 0)
+file.write(json.dumps({'main': '0', 'plugins': {}}).encode() + b'\\n')
+faulthandler.dump_traceback_later(0.5, file=file)
+def in_teardown():
+    __import__('time').sleep(60)
+in_teardown()
+"""
+    outcome = run(a=SHUTS_DOWN, b=stuck)
+    assert outcome.reason == (
+        "node 'b' had to be killed 5 s after the end began: its process did not end"
+    )
+    assert "in in_teardown" in outcome.stacks["b"]
+    where = "where the threads of 'b' stood when killed, the most recent call first:\n"
+    assert where + outcome.stacks["b"] in run.output.said
 
 
 def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
@@ -166,7 +189,7 @@ host.tell('finalising', hook='')
     assert sorted(outcome.failures) == [
         "node 'b' had to be killed 5 s after the end began:"
         " what 'b' has registered with node.on_close did not end",
-        "node 'c' had to be killed 5 s after the end began: its process did not end",
+        "node 'c' had to be killed 5 s after the end began: it did not come to its end",
     ]
 
 
