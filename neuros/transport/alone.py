@@ -22,6 +22,7 @@ from neuros.transport.carriers import message_carrier
 from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import plain_node, without_spinning
+from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 Event = Callable[[], None]
@@ -159,5 +160,4 @@ class Alone:
     def close(self) -> None:
         """Give up ROS."""
         self._no_spinning.close()
-        self._ros_node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        give_up(self._context, [self._ros_node])

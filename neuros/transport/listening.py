@@ -22,6 +22,7 @@ from neuros.transport.dds_profile import dds_environment
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.teardown import give_up
 
 _LOOK_S = 0.1
 _DEPTH = 1000
@@ -75,8 +76,7 @@ class Listener:
         if not self._is_stopping:
             loop.run()
         loop.close()
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+        give_up(context, [node])
 
     def stop(self) -> None:
         """Have :meth:`run` return. Any thread."""

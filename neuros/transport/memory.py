@@ -151,15 +151,12 @@ class MemoryTransport:
 
     def note_execution(self) -> None:
         """A hook has ended: what is on its way here comes before the next one."""
-        owed = 0
-        for queue in self._arrivals.queues:
-            owed += len(queue)
-        self._arrivals.owed = owed
+        self._arrivals.first = self._arrivals.sent
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
         """Whether all has arrived that was on its way when the last hook of the node ended."""
-        return not self._arrivals.owed and self._loop.has_taken_in
+        return self._arrivals.arrived >= self._arrivals.first and self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not joined yet."""
@@ -207,18 +204,18 @@ class MemoryTransport:
 
 
 class _Arrivals:
-    """What is on its way to one node, each an event that waits in the loop.
+    """The packets and acknowledgements for one node, each of them an event in the loop.
 
     Attributes:
-        queues: packets and acknowledgements, by connection.
-        owed: how much of it was on its way when the last hook of the node ended, and still is.
+        sent: how many have been sent so far, but for packets that were lost in transport.
+        arrived: how many of them have arrived.
+        first: how many come before the next hook: those sent until the last one had ended.
     """
 
-    __slots__ = ("owed", "queues")
+    __slots__ = ("arrived", "first", "sent")
 
     def __init__(self) -> None:
-        self.queues: list[deque[Any]] = []
-        self.owed = 0
+        self.sent = self.arrived = self.first = 0
 
 
 class _Nobody:
@@ -245,7 +242,6 @@ class _Channel:
         self._window = connection.window
         self._packets: deque[Any] = deque(maxlen=self._window)
         self._arrivals = hub.arrivals[connection.destination_node]
-        self._arrivals.queues.append(self._packets)
         self._digests: deque[int] = deque(maxlen=connection.window)
 
     def announce(self, digest: int) -> None:
@@ -257,17 +253,17 @@ class _Channel:
         self._digests.clear()
 
     def send(self, packet: Any) -> None:
-        if len(self._packets) < self._window:
-            self._hub.post(self._deliver)  # else an event is on its way for the one that is lost
+        if len(self._packets) < self._window:  # else an event is on its way for one that is lost
+            self._arrivals.sent += 1
+            self._hub.post(self._deliver)
         self._packets.append(packet)
 
     def _deliver(self) -> None:
         if self._digests:
             self._hub.received[self._connection].append(self._digests.popleft())
+        self._arrivals.arrived += 1
         connection = self._connection
         inbox = self._hub.inboxes[connection.destination_node]
-        if self._arrivals.owed:
-            self._arrivals.owed -= 1
         inbox.on_packet(connection, self._packets.popleft())
 
 
@@ -281,15 +277,14 @@ class _WayBack:
         self._connection = connection
         self._positions: deque[int] = deque()
         self._arrivals = hub.arrivals[connection.source_node]
-        self._arrivals.queues.append(self._positions)
 
     def send(self, position: int) -> None:
+        self._arrivals.sent += 1
         self._positions.append(position)
         self._hub.post(self._deliver)
 
     def _deliver(self) -> None:
-        if self._arrivals.owed:
-            self._arrivals.owed -= 1
+        self._arrivals.arrived += 1
         connection = self._connection
         inbox = self._hub.inboxes[connection.source_node]
         inbox.on_acknowledgement(connection, self._positions.popleft())

@@ -15,6 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
+from neuros.transport.teardown import give_up
 
 _LAST_S = 5.0
 _POLL_S = 0.01
@@ -79,8 +80,7 @@ def play(
             publisher.wait_for_all_acked(Duration(seconds=_LAST_S))
         return count
     finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+        give_up(context, [node])
 
 
 def _qos(topic: PlayedTopic) -> QoSProfile:

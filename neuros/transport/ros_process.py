@@ -25,6 +25,7 @@ from neuros.transport.plain_node import PlainNode, plain_node, without_spinning
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
+from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 _LINGER_S = 0.05
@@ -169,9 +170,7 @@ class RosProcess:
         if self.has_leftovers:
             return
         self._loop.close()
-        for ros_node in self._ros_nodes.values():
-            ros_node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        give_up(self._context, self._ros_nodes.values())
 
     def _is_in_a_crowd(self) -> bool:
         """Whether many nodes of other processes are in the domain."""

@@ -11,6 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.messages import message_class
+from neuros.transport.teardown import give_up
 
 message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
 
@@ -57,8 +58,7 @@ class RosProgram:
     def close(self) -> None:
         """End it."""
         self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        give_up(self._context, [self.node])
 
     def __enter__(self) -> RosProgram:
         return self

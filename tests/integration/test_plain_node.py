@@ -11,6 +11,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
+from neuros.transport.teardown import give_up
 
 message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
 
@@ -21,8 +22,7 @@ def node() -> Iterator[PlainNode]:
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = PlainNode("robot", context)
     yield node
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+    give_up(context, [node])
 
 
 TYPE_DESCRIPTIONS = ["robot/get_type_description"]

@@ -24,6 +24,7 @@ from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.messages import message_class
 from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.teardown import give_up
 
 LIMIT_S = 20.0
 
@@ -93,8 +94,7 @@ def plugin(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
         yield made
         made.callbacks.close()
         made.loop.close()
-        made.ros.destroy_node()
-        rclpy.shutdown(context=context)
+        give_up(context, [made.ros])
 
 
 def fail(*_: Any) -> None:
@@ -206,8 +206,7 @@ def test_parameters_of_the_project_can_be_declared_again_with_their_value() -> N
     with pytest.raises(rclpy.exceptions.ParameterAlreadyDeclaredException):
         node.declare_parameter("gain.p", 0.0)
     assert node.get_parameter("list").type_ == Parameter.Type.INTEGER_ARRAY
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+    give_up(context, [node])
 
 
 WAITING = Path(__file__).parent / "waiting"
