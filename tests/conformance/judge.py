@@ -52,7 +52,6 @@ TIMED = {
     "age",
     "tick",
     "drain",
-    "killed",
 }
 """Rules that compare times of different processes: a machine that stands still can break them."""
 
