@@ -17,6 +17,7 @@ from typing import Any
 from neuros.api.live import LiveRun
 from neuros.api.project import Project as Loaded
 from neuros.errors import NeurosError
+from neuros.launch.domain import choose_domain
 
 from .description import Project
 
@@ -138,12 +139,16 @@ def run_in(
     observed = Observed(backend)
     begin_ns = time.monotonic_ns()
     duration = seconds if project.end == "duration" else None
-    try:
-        live = Loaded(file, {}).start(backend=backend, duration=duration, output=run_folder)
-        _wait(live, project, run_folder, seconds, observed)
-    except NeurosError as error:
-        observed.error = str(error)
-        return observed
+    # Projects with external topics would all go to domain 0, and hear each other.
+    with choose_domain(None, {}, False) as domain:
+        try:
+            live = Loaded(file, {}).start(
+                backend=backend, duration=duration, output=run_folder, domain_id=domain.id
+            )
+            _wait(live, project, run_folder, seconds, observed)
+        except NeurosError as error:
+            observed.error = str(error)
+            return observed
     observed.ended_ns = time.monotonic_ns()
     observed.late_ns = meter.worst_ns(begin_ns)
     observed.left = _left(run_folder)
