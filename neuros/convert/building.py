@@ -1,4 +1,4 @@
-"""What all parts of a conversion share while they build an ``MjSpec``."""
+"""State of a conversion while it builds an ``MjSpec``."""
 
 from __future__ import annotations
 

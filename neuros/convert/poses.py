@@ -1,4 +1,4 @@
-"""Places and orientations: what SDF writes as x, y, z, roll, pitch, yaw."""
+"""Poses: position and rotation, which SDF writes as x, y, z, roll, pitch, yaw."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ from neuros.convert.report import Report
 Vector = npt.NDArray[np.float64]
 
 
-def _no_turn() -> Vector:
-    return np.eye(3)
-
-
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Where something is, and how it is turned, seen from something else.
@@ -31,7 +27,7 @@ class Pose:
     """
 
     position: Vector = field(default_factory=lambda: np.zeros(3))
-    rotation: Vector = field(default_factory=_no_turn)
+    rotation: Vector = field(default_factory=lambda: np.eye(3))
 
     def __matmul__(self, other: Pose) -> Pose:
         """``other``, which is seen from here, seen from where this one is seen from."""
@@ -74,7 +70,7 @@ def turning_z_to(direction: Vector) -> Vector:
 
 
 def read_pose(owner: Element, report: Report) -> Pose:
-    """The pose that ``owner`` writes in its ``<pose>``, whatever that is relative to."""
+    """The pose in the ``<pose>`` of ``owner``, relative to what that names."""
     element = owner.child("pose")
     if element is None or not element.text:
         return Pose()

@@ -13,12 +13,19 @@ from typing import Any
 
 import mujoco
 
-from neuros.convert.converted import Converted
-from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.flat import box_flat_meshes, has_flat_meshes
-from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of, why_unread
+from neuros.convert.joints import follow_joint
+from neuros.convert.meshes import (
+    Triangles,
+    box_flat_meshes,
+    fill,
+    has_flat_meshes,
+    needs_conversion,
+    triangles_of,
+    why_unread,
+)
+from neuros.convert.output import Converted
 from neuros.convert.report import Report
 from neuros.errors import Problem
 

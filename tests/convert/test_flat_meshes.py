@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.convert.find import Finder
-from neuros.convert.flat import _convex_hull
+from neuros.convert.meshes import _convex_hull
 from neuros.convert.output import write_mjcf
 from neuros.convert.poses import from_rpy
 from neuros.convert.urdf import read_urdf
