@@ -9,9 +9,9 @@ import numpy as np
 
 from neuros.convert.elements import Element
 from neuros.convert.meshes import Meshes
-from neuros.convert.poses import Pose
 from neuros.convert.report import Report
 from neuros.convert.scopes import Link
+from neuros.convert.values import Pose
 
 
 @dataclass

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.numbers import word
 from neuros.convert.report import Report
+from neuros.convert.values import word
 from neuros.errors import Problem
 
 _OVERRIDDEN = ("pose", "static", "placement_frame")

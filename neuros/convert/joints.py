@@ -11,11 +11,10 @@ import numpy as np
 
 from neuros.convert.building import Building, set_first
 from neuros.convert.elements import Element
-from neuros.convert.numbers import is_true, number, vector, word
-from neuros.convert.poses import Pose, Vector
 from neuros.convert.report import Report
 from neuros.convert.scopes import Scope
 from neuros.convert.tree import Branch, Joint
+from neuros.convert.values import Pose, Vector, is_true, number, vector, word
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +26,7 @@ class Axis:
 
 
 def anchor(joint: Joint) -> Pose:
-    """Where a joint is, in the world."""
+    """The pose of a joint in the world."""
     scope = joint.scope
     return scope.pose @ scope.place(joint.element.name, joint.element)
 

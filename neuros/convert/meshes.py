@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from neuros.convert.elements import Element
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.poses import Pose, Vector, from_quaternion
 from neuros.convert.report import Report
+from neuros.convert.values import Pose, Vector, from_quaternion
 
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
@@ -152,7 +152,7 @@ def _is_text_stl(file: Path) -> bool:
 def triangles_of(file: Path) -> Triangles | None:
     """The triangles of a file of another kind in metres; ``None`` if nothing here reads it.
 
-    The axes are taken as they are, as Gazebo does, whatever the file calls up.
+    The axes stay unchanged, as in Gazebo, whichever of them the file calls up.
     """
     try:
         import trimesh
@@ -197,7 +197,7 @@ def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Sl
     """Turn the colliding geoms of flat meshes into boxes, in a spec that was never compiled.
 
     ``made`` are the triangles of meshes that have no file. Returns the geoms; those that only show
-    a flat mesh stay as they are.
+    a flat mesh stay unchanged.
     """
     boxed = []
     for mesh in list(spec.meshes):

@@ -104,7 +104,7 @@ class NotTaken:
         place: ``file:line`` of the first one.
         path: its path in the document.
         why: the reason, in words.
-        count: how many of the same kind there are, for the same reason.
+        count: how many of its kind there are, for this reason.
     """
 
     place: str
@@ -134,7 +134,7 @@ class Report:
         self._notes.append((element, why))
 
     def remark(self, element: Element, why: str) -> None:
-        """The same about something whose children are still to be read."""
+        """Note an element whose children are still to be read."""
         element.taken = True
         self._notes.append((element, why))
 

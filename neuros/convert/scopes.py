@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from neuros.convert.elements import Element
-from neuros.convert.numbers import is_true, word
-from neuros.convert.poses import Pose, read_pose
 from neuros.convert.report import Report
+from neuros.convert.values import Pose, is_true, read_pose, word
 
 _OWN = ("", "__model__", "world")
 
@@ -87,7 +86,7 @@ class Scope:
             yield from ((scope, element) for element in scope.element.each(tag))
 
     def place(self, name: str, asking: Element) -> Pose:
-        """Where a frame is, in this scope's own frame; problems are reported of ``asking``."""
+        """The pose of a frame in this scope's own frame; problems are reported of ``asking``."""
         head, _, rest = name.partition("::")
         if rest:
             if head in self.models:
@@ -177,7 +176,7 @@ class Scope:
 
 
 def relative_to(owner: Element) -> str:
-    """What the pose of ``owner`` says that it is relative to; empty if it does not."""
+    """The frame that the pose of ``owner`` is relative to; empty if it names none."""
     pose = owner.child("pose")
     if pose is None:
         return ""

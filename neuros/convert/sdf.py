@@ -17,14 +17,13 @@ from neuros.convert.find import Finder
 from neuros.convert.includes import Includer
 from neuros.convert.joints import add_actuators, add_joints, add_mimics, close_loop, is_known
 from neuros.convert.meshes import Meshes, box_flat_meshes, has_flat_meshes
-from neuros.convert.numbers import is_true, number, vector, word
 from neuros.convert.output import Converted
-from neuros.convert.poses import Pose, Vector, read_pose
 from neuros.convert.report import Report
 from neuros.convert.scopes import Link, Scope, place_all, read_scope
 from neuros.convert.sensors import add_frames, add_joint_sensors, add_link_sensors
 from neuros.convert.shapes import add_shapes, light_colour, share_masks
 from neuros.convert.tree import Branch, Joint, Tree, grow
+from neuros.convert.values import Pose, Vector, is_true, number, read_pose, vector, word
 
 
 def convert_sdf(file: Path, finder: Finder) -> Converted:
@@ -208,7 +207,7 @@ def is_computed(link: Element) -> bool:
 
 
 def read_inertia(link: Element, report: Report) -> Inertia:
-    """What ``<inertial>`` says, SDF's defaults where it says nothing: 1 kg and 1 kg m²."""
+    """Read ``<inertial>``; SDF's defaults are 1 kg and 1 kg m²."""
     inertial = link.child("inertial")
     if inertial is None:
         report.remark(link, "no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")

@@ -15,10 +15,9 @@ import numpy as np
 from neuros.convert.building import Building, put
 from neuros.convert.elements import Element
 from neuros.convert.joints import anchor
-from neuros.convert.numbers import number, vector, word
-from neuros.convert.poses import Pose
 from neuros.convert.scopes import Link, Scope
 from neuros.convert.tree import Branch
+from neuros.convert.values import Pose, number, vector, word
 
 _KINDS = mujoco.mjtSensor
 _SIMPLE = {

@@ -11,10 +11,9 @@ import numpy as np
 
 from neuros.convert.building import Building, put
 from neuros.convert.elements import Element
-from neuros.convert.numbers import is_true, number, vector
-from neuros.convert.poses import Pose, from_quaternion, turning_z_to
 from neuros.convert.report import Report
 from neuros.convert.scopes import Link
+from neuros.convert.values import Pose, from_quaternion, is_true, number, turning_z_to, vector
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _TYPES = mujoco.mjtGeom
@@ -68,7 +67,7 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
         geom.meshname = shape.mesh
     pose = link.scope.read_pose(element, link.pose)
     put(geom, pose @ shape.pose, link.pose)
-    noting = element if element.tag == "collision" else None  # nobody asks for a visual by name
+    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
     geom.name = building.name("geom", f"{link.name}/{element.name}", noting)
     mesh = element.child("geometry", "mesh")
     if shape.mesh and mesh is not None and element.tag == "collision":
