@@ -14,11 +14,34 @@ from neuros.convert.elements import Element
 from neuros.convert.report import Report
 from neuros.convert.scopes import Scope
 from neuros.convert.tree import Branch, Joint
-from neuros.convert.values import Pose, Vector, is_true, number, vector, word
+from neuros.convert.values import Pose, Vector, is_true, number, text_of, vector
+
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_BALL = mujoco.mjtJoint.mjJNT_BALL
+_NO_LIMIT = 1e15
+_UNLIMITED_ENDS = (-1e16, 1e16)
+# The kinds of joints in MuJoCo that each type consists of, by the element with its axis.
+_PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
+    "revolute": ((_HINGE, "axis"),),
+    "continuous": ((_HINGE, "axis"),),
+    "prismatic": ((_SLIDE, "axis"),),
+    "universal": ((_HINGE, "axis"), (_HINGE, "axis2")),
+    "revolute2": ((_HINGE, "axis"), (_HINGE, "axis2")),
+    "screw": ((_HINGE, "axis"), (_SLIDE, "axis")),
+    "gearbox": ((_HINGE, "axis"),),
+    "ball": ((_BALL, ""),),
+    "fixed": (),
+}
+_HALF_HINGE_M = 0.05
+_SOFT = "closes a loop: a soft constraint in MuJoCo, not a joint"
+_CONNECT = mujoco.mjtEq.mjEQ_CONNECT
+_WELD = mujoco.mjtEq.mjEQ_WELD
+_POSITION, _VELOCITY = "JointPositionController", "JointController"
+_STIFF_GAIN = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
+class _Axis:
     """An axis of a joint: its direction in the world (unit length), and what limits it."""
 
     element: Element | None
@@ -31,21 +54,21 @@ def anchor(joint: Joint) -> Pose:
     return scope.pose @ scope.place(joint.element.name, joint.element)
 
 
-def read_axis(joint: Joint, tag: str, report: Report) -> Axis:
+def _read_axis(joint: Joint, tag: str, report: Report) -> _Axis:
     """An axis in the world."""
     element = joint.element.child(tag)
     if element is None:
         if joint.type not in ("fixed", "ball") and tag == "axis2":
             report.problem(joint.element, f"a {joint.type} joint needs an <axis2>")
-        return Axis(None, anchor(joint).rotation @ np.array([0.0, 0.0, 1.0]))
+        return _Axis(None, anchor(joint).rotation @ np.array([0.0, 0.0, 1.0]))
     xyz = element.child("xyz")
     direction = np.array(vector(element, "xyz", report, (0.0, 0.0, 1.0)))
     length = np.linalg.norm(direction)
     if not length:
         report.problem(xyz or element, "the axis has no direction: its length is zero")
-        return Axis(element, np.array([0.0, 0.0, 1.0]))
+        return _Axis(element, np.array([0.0, 0.0, 1.0]))
     frame = _frame_of_axis(joint, element, xyz, report)
-    return Axis(element, frame.rotation @ (direction / length))
+    return _Axis(element, frame.rotation @ (direction / length))
 
 
 def _frame_of_axis(joint: Joint, axis: Element, xyz: Element | None, report: Report) -> Pose:
@@ -72,25 +95,6 @@ def _is_old(scope: Scope) -> bool:
     return False
 
 
-_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-_BALL = mujoco.mjtJoint.mjJNT_BALL
-_NO_LIMIT = 1e15
-_UNLIMITED_ENDS = (-1e16, 1e16)
-
-# The kinds of joints in MuJoCo that each type consists of, by the element with its axis.
-_PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
-    "revolute": ((_HINGE, "axis"),),
-    "continuous": ((_HINGE, "axis"),),
-    "prismatic": ((_SLIDE, "axis"),),
-    "universal": ((_HINGE, "axis"), (_HINGE, "axis2")),
-    "revolute2": ((_HINGE, "axis"), (_HINGE, "axis2")),
-    "screw": ((_HINGE, "axis"), (_SLIDE, "axis")),
-    "gearbox": ((_HINGE, "axis"),),
-    "ball": ((_BALL, ""),),
-    "fixed": (),
-}
-
-
 def is_known(joint: Joint, report: Report) -> bool:
     """Whether there is such a type of joint; a problem is reported."""
     if joint.type in _PARTS:
@@ -111,7 +115,7 @@ def add_joints(building: Building, branch: Branch) -> None:
     names = []
     # MuJoCo moves a body by its joints in their order, the first one hangs on the parent.
     for kind, tag in reversed(parts) if branch.is_turned else parts:
-        axis = read_axis(joint, tag, building.report) if tag else None
+        axis = _read_axis(joint, tag, building.report) if tag else None
         made = body.add_joint(type=kind, pos=place.position)
         suffix = f"/{tag}" if len(parts) > 1 else ""
         if joint.type == "screw":
@@ -125,7 +129,7 @@ def add_joints(building: Building, branch: Branch) -> None:
                 _read_dynamics(axis.element, made, joint.type, building.report)
     building.joints[joint.name] = names
     if joint.type == "screw":
-        couple_screw(building, joint, names)
+        _couple_screw(building, joint, names)
     if joint.type == "gearbox":
         building.report.remark(joint.element, "a gearbox is a hinge without its gears in MuJoCo")
 
@@ -161,7 +165,7 @@ def _set_range(joint: Any, lower: float, upper: float) -> None:
     joint.range, joint.limited = [lower, upper], True
 
 
-def couple_screw(building: Building, joint: Joint, names: list[str]) -> None:
+def _couple_screw(building: Building, joint: Joint, names: list[str]) -> None:
     """A screw is a hinge and a slide of which the one follows the other."""
     report, element = building.report, joint.element
     pitch = number(element, "screw_thread_pitch", report, 0.0)
@@ -171,20 +175,20 @@ def couple_screw(building: Building, joint: Joint, names: list[str]) -> None:
         pitch = -2 * math.pi / old if old else 0.0
     turn = next(name for name in names if name.endswith("/turn"))
     slide = next(name for name in names if name.endswith("/slide"))
-    follow(building, slide, turn, 0.0, pitch / (2 * math.pi))
+    _follow(building, slide, turn, 0.0, pitch / (2 * math.pi))
     report.remark(
         element, "a screw is a hinge and a slide, held together by a soft constraint in MuJoCo"
     )
 
 
-def follow(building: Building, joint: str, leader: str, offset: float, ratio: float) -> None:
+def _follow(building: Building, joint: str, leader: str, offset: float, ratio: float) -> None:
     """Let the position of one joint be ``offset`` + ``ratio`` times that of another."""
     equality = follow_joint(building.spec, joint, leader, offset, ratio)
     equality.name = building.name("equality", f"{joint} follows {leader}", None)
 
 
 def follow_joint(spec: Any, joint: str, leader: str, offset: float, ratio: float) -> Any:
-    """Add the constraint of :func:`follow` to a spec, without a name; returns it."""
+    """Add the constraint to a spec, without a name of its own; returns it."""
     equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
     equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
     equality.name1, equality.name2 = joint, leader
@@ -202,7 +206,7 @@ def add_mimics(building: Building, scope: Scope) -> None:
             mimic = element.child(tag, "mimic") if element.child(tag) else None
             if mimic is None:
                 continue
-            leader = mimic.attributes.get("joint") or word(mimic, "joint")
+            leader = mimic.attributes.get("joint") or text_of(mimic, "joint")
             mine = building.joints.get(inner.prefix + element.name, [])
             theirs = building.joints.get(inner.prefix + leader.replace("::", "/"), [])
             if len(mine) != 1 or len(theirs) != 1:
@@ -211,13 +215,7 @@ def add_mimics(building: Building, scope: Scope) -> None:
             ratio = number(mimic, "multiplier", report, 1.0)
             offset = number(mimic, "offset", report, 0.0)
             reference = number(mimic, "reference", report, 0.0)
-            follow(building, mine[0], theirs[0], offset - ratio * reference, ratio)
-
-
-_HALF_HINGE_M = 0.05
-_SOFT = "closes a loop: a soft constraint in MuJoCo, not a joint"
-_CONNECT = mujoco.mjtEq.mjEQ_CONNECT
-_WELD = mujoco.mjtEq.mjEQ_WELD
+            _follow(building, mine[0], theirs[0], offset - ratio * reference, ratio)
 
 
 def close_loop(building: Building, joint: Joint) -> None:
@@ -228,7 +226,7 @@ def close_loop(building: Building, joint: Joint) -> None:
         _hold(building, joint, _WELD, place.position, "")
     elif joint.type in ("revolute", "continuous"):
         # Held at two points of its axis, it can turn about nothing else.
-        direction = read_axis(joint, "axis", report).direction
+        direction = _read_axis(joint, "axis", report).direction
         for end, name in ((-_HALF_HINGE_M, "/1"), (_HALF_HINGE_M, "/2")):
             _hold(building, joint, _CONNECT, place.position + end * direction, name)
     elif joint.type == "ball":
@@ -256,10 +254,6 @@ def _hold(building: Building, joint: Joint, kind: object, point: Vector, suffix:
     elif kind == _WELD:
         data[10] = 1.0  # as much against turning as against moving; the pose is the present one
     equality.data = data
-
-
-_POSITION, _VELOCITY = "JointPositionController", "JointController"
-_STIFF_GAIN = 1000.0
 
 
 def add_actuators(building: Building, scope: Scope) -> None:
@@ -301,7 +295,7 @@ def _set_gains(actuator: Any, plugin: Element, kind: str, report: Report) -> Non
     if kind == _POSITION:
         actuator.set_to_position(kp=gain, kv=max(0.0, number(plugin, "d_gain", report, 0.1)))
     else:
-        if word(plugin, "use_force_commands") not in ("true", "1"):
+        if text_of(plugin, "use_force_commands") not in ("true", "1"):
             report.remark(plugin, "Gazebo sets the velocity; here a gain (kv) holds it")
         actuator.set_to_velocity(kv=gain)
     least = number(plugin, "cmd_min", report, -math.inf)

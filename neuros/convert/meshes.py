@@ -23,11 +23,15 @@ from neuros.convert.values import Pose, Vector, from_quaternion
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
-SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 """Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
+
+_FLAT = 1e-4  # how thick, at most, by how long
+_THICKNESS_M = 0.01
+_RECTANGULAR = 0.999  # of its area, at least
 
 
 @dataclass
@@ -72,7 +76,7 @@ class Meshes:
         """Report the meshes that MuJoCo cannot use, once a model with them does not compile."""
         for mesh in self.spec.meshes:
             try:
-                compile_alone(mesh, self.made.get(mesh.name))
+                _compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
                 text = " ".join(str(error).removeprefix("Error: ").split())
                 self.report.problem(self._places[mesh.name], f"MuJoCo cannot use the mesh: {text}")
@@ -93,7 +97,7 @@ class Meshes:
         self._places[name] = uri
         mesh = self.spec.add_mesh(name=name, scale=scale)
         if not is_solid:  # a thin shell may be open, or flat
-            mesh.inertia = SHELL
+            mesh.inertia = _SHELL
         if triangles is None:
             mesh.file = str(file)
         else:
@@ -102,14 +106,14 @@ class Meshes:
         return name
 
 
-def compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
+def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
     """The ``MjModel`` of one mesh, which collides unless it ``is_shown_only``.
 
     ``triangles`` are its own, if it has no file. Raises ``ValueError``.
     """
     trial = mujoco.MjSpec()
     alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
-    alone.inertia = SHELL if is_shown_only else mesh.inertia
+    alone.inertia = _SHELL if is_shown_only else mesh.inertia
     if triangles is not None:
         fill(alone, triangles)
     geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
@@ -167,11 +171,6 @@ def triangles_of(file: Path) -> Triangles | None:
     return np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces, np.int32)
 
 
-_FLAT = 1e-4  # how thick, at most, by how long
-_THICKNESS_M = 0.01
-_RECTANGULAR = 0.999  # of its area, at least
-
-
 @dataclass(frozen=True)
 class Slab:
     """A flat mesh as a box: half lengths in metres; ``pose`` is seen from the mesh."""
@@ -212,7 +211,7 @@ def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Sl
             geom.size, geom.pos, geom.quat = slab.half_lengths, pose.position, pose.quaternion
             boxed.append((geom, slab))
         if len(colliding) < len(geoms):
-            mesh.inertia = SHELL
+            mesh.inertia = _SHELL
         else:
             made.pop(mesh.name, None)
             spec.delete(mesh) if hasattr(spec, "delete") else mesh.delete()  # until MuJoCo 3.3
@@ -222,7 +221,7 @@ def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Sl
 def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
     """``None`` where a mesh is not flat, or is at fault in another way."""
     try:
-        model = compile_alone(mesh, triangles, is_shown_only=True)
+        model = _compile_alone(mesh, triangles, is_shown_only=True)
     except ValueError:
         return None
     # MuJoCo moves a mesh to its centre of mass, and turns it to its principal axes.

@@ -13,6 +13,9 @@ import mujoco
 from neuros.convert.meshes import Triangles
 from neuros.convert.report import NotTaken
 
+MARK = "made by `neuros convert`"
+"""Stands in the first line of every file that is written here, and may be overwritten."""
+
 
 @dataclass(frozen=True)
 class Converted:
@@ -30,10 +33,6 @@ class Converted:
     made_meshes: dict[str, Triangles]
     bodies: int
     joints: int
-
-
-MARK = "made by `neuros convert`"
-"""Stands in the first line of every file that is written here, and may be overwritten."""
 
 
 def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 
 from neuros.convert.elements import Element
 from neuros.convert.report import Report
-from neuros.convert.values import Pose, is_true, read_pose, word
+from neuros.convert.values import Pose, is_true, read_pose, text_of
 
 _OWN = ("", "__model__", "world")
+_KINDS = ("link", "joint", "frame", "model")
 
 
 @dataclass(eq=False)
@@ -166,7 +167,7 @@ class Scope:
         if element.tag == "model":
             return self.models[name], "__model__"
         if element.tag == "joint":
-            return self, word(element, "child")
+            return self, text_of(element, "child")
         return self, element.attributes.get("attached_to") or "__model__"
 
     def _unknown(self, name: str, asking: Element) -> None:
@@ -182,9 +183,6 @@ def relative_to(owner: Element) -> str:
         return ""
     # Until SDF 1.6 the attribute was called "frame".
     return pose.attributes.get("relative_to") or pose.attributes.get("frame") or ""
-
-
-_KINDS = ("link", "joint", "frame", "model")
 
 
 def read_scope(
@@ -237,7 +235,7 @@ def _add_frame(scope: Scope, element: Element) -> None:
         return
     default = ""
     if element.tag == "joint":
-        default = word(element, "child")
+        default = text_of(element, "child")
     elif element.tag == "frame":
         default = element.attributes.get("attached_to", "")
     base = relative_to(element) or default

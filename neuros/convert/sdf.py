@@ -23,7 +23,19 @@ from neuros.convert.scopes import Link, Scope, place_all, read_scope
 from neuros.convert.sensors import add_frames, add_joint_sensors, add_link_sensors
 from neuros.convert.shapes import add_shapes, light_colour, share_masks
 from neuros.convert.tree import Branch, Joint, Tree, grow
-from neuros.convert.values import Pose, Vector, is_true, number, read_pose, vector, word
+from neuros.convert.values import Pose, Vector, is_true, number, read_pose, text_of, vector
+
+_ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_DEFAULTS = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+_TOLERANCE = 1e-9
+_GRAVITY = (0.0, 0.0, -9.8)
+_MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
+_TYPES = mujoco.mjtLightType
+_LIGHTS = {
+    "directional": _TYPES.mjLIGHT_DIRECTIONAL,
+    "point": _TYPES.mjLIGHT_POINT,
+    "spot": _TYPES.mjLIGHT_SPOT,
+}
 
 
 def convert_sdf(file: Path, finder: Finder) -> Converted:
@@ -85,7 +97,7 @@ def _grow(scope: Scope, report: Report) -> Tree:
 
 
 def _end(scope: Scope, joint: Element, side: str, report: Report) -> Link | None:
-    name = word(joint, side)
+    name = text_of(joint, side)
     if not name:
         report.problem(joint, f"<{side}> is missing: which link is the {side}?")
         return None
@@ -94,7 +106,7 @@ def _end(scope: Scope, joint: Element, side: str, report: Report) -> Link | None
 
 def _build(building: Building, scope: Scope, tree: Tree) -> None:
     if scope.element.tag == "world":
-        read_world(building, scope)
+        _read_world(building, scope)
     for branch in tree.branches:
         _add_body(building, branch)
     share_masks(building)
@@ -105,7 +117,7 @@ def _build(building: Building, scope: Scope, tree: Tree) -> None:
     add_mimics(building, scope)
     add_actuators(building, scope)
     add_frames(building, scope)
-    add_lights(building, scope)
+    _add_lights(building, scope)
     _exclude_contacts(building, scope)
 
 
@@ -115,13 +127,13 @@ def _add_body(building: Building, branch: Branch) -> None:
     building.bodies[id(link)] = body
     body.name = building.name("body", link.name, link.element)
     put(body, link.pose, Pose() if branch.parent is None else branch.parent.pose)
-    is_solid = is_computed(link.element) and not link.is_static
+    is_solid = _is_computed(link.element) and not link.is_static
     if link.is_static:
         inertial = link.element.child("inertial")
         if inertial is not None:
             inertial.take_all()  # what never moves needs none
     elif not is_solid:
-        set_inertia(body, read_inertia(link.element, report))
+        _set_inertia(body, _read_inertia(link.element, report))
     if not is_true(link.element, "gravity", report, default=True):
         body.gravcomp = 1.0
     if branch.joint is not None:
@@ -180,13 +192,8 @@ def _compiled(building: Building, root: Element) -> Any:
     return model
 
 
-_ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_DEFAULTS = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
-_TOLERANCE = 1e-9
-
-
 @dataclass(frozen=True, eq=False)
-class Inertia:
+class _Inertia:
     """Of a link, in its own frame.
 
     Attributes:
@@ -200,18 +207,18 @@ class Inertia:
     matrix: Vector
 
 
-def is_computed(link: Element) -> bool:
+def _is_computed(link: Element) -> bool:
     """Whether the mass is to be computed from shapes and densities (SDF 1.11)."""
     inertial = link.child("inertial")
     return inertial is not None and inertial.attributes.get("auto", "false") in ("true", "1")
 
 
-def read_inertia(link: Element, report: Report) -> Inertia:
+def _read_inertia(link: Element, report: Report) -> _Inertia:
     """Read ``<inertial>``; SDF's defaults are 1 kg and 1 kg m²."""
     inertial = link.child("inertial")
     if inertial is None:
         report.remark(link, "no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")
-        return Inertia(1.0, np.zeros(3), np.eye(3))
+        return _Inertia(1.0, np.zeros(3), np.eye(3))
     pose = read_pose(inertial, report)
     mass = number(inertial, "mass", report, 1.0, positive=True)
     values = dict(zip(_ENTRIES, _DEFAULTS, strict=True))
@@ -221,10 +228,10 @@ def read_inertia(link: Element, report: Report) -> Inertia:
     ixx, iyy, izz, ixy, ixz, iyz = values.values()
     matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     matrix = _possible(matrix, element or inertial, report)
-    return Inertia(mass, pose.position, pose.rotation @ matrix @ pose.rotation.T)
+    return _Inertia(mass, pose.position, pose.rotation @ matrix @ pose.rotation.T)
 
 
-def set_inertia(body: Any, inertia: Inertia) -> None:
+def _set_inertia(body: Any, inertia: _Inertia) -> None:
     """Give it to a body of the spec."""
     matrix = inertia.matrix
     body.explicitinertial = True
@@ -256,17 +263,7 @@ def _possible(matrix: Vector, element: Element, report: Report) -> Vector:
     return matrix
 
 
-_GRAVITY = (0.0, 0.0, -9.8)
-_MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
-_TYPES = mujoco.mjtLightType
-_LIGHTS = {
-    "directional": _TYPES.mjLIGHT_DIRECTIONAL,
-    "point": _TYPES.mjLIGHT_POINT,
-    "spot": _TYPES.mjLIGHT_SPOT,
-}
-
-
-def read_world(building: Building, scope: Scope) -> None:
+def _read_world(building: Building, scope: Scope) -> None:
     """Options of the whole model, from a ``<world>``, with SDF's defaults."""
     world, report, option = scope.element, building.report, building.spec.option
     option.gravity = vector(world, "gravity", report, _GRAVITY)
@@ -280,7 +277,7 @@ def read_world(building: Building, scope: Scope) -> None:
         option.timestep = 0.001
 
 
-def add_lights(building: Building, scope: Scope) -> None:
+def _add_lights(building: Building, scope: Scope) -> None:
     """Lights of a world, of models and of links."""
     for inner in scope.and_models():
         for element in inner.element.each("light"):

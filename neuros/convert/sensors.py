@@ -17,13 +17,29 @@ from neuros.convert.elements import Element
 from neuros.convert.joints import anchor
 from neuros.convert.scopes import Link, Scope
 from neuros.convert.tree import Branch
-from neuros.convert.values import Pose, number, vector, word
+from neuros.convert.values import Pose, number, text_of, vector
 
 _KINDS = mujoco.mjtSensor
 _SIMPLE = {
     "altimeter": (("position", _KINDS.mjSENS_FRAMEPOS), ("velocity", _KINDS.mjSENS_FRAMELINVEL)),
     "magnetometer": (("field", _KINDS.mjSENS_MAGNETOMETER),),
 }
+# SDF's cameras look along x, with z up; MuJoCo's along -z, with y up.
+_TO_CAMERA = Pose(rotation=np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
+_CAMERAS = {
+    "camera": "",
+    "wideanglecamera": "a pinhole camera in MuJoCo, without the wide angle lens",
+    "wide_angle_camera": "a pinhole camera in MuJoCo, without the wide angle lens",
+    "depth": "colours only, no depth",
+    "depth_camera": "colours only, no depth",
+    "rgbd": "colours only, no depth",
+    "rgbd_camera": "colours only, no depth",
+}
+# A rangefinder of MuJoCo's looks along z.
+_TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
+_MOST_RAYS = 1000
+_SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # where nothing says how many
+_SITE = mujoco.mjtObj.mjOBJ_SITE
 
 
 def add_link_sensors(building: Building, link: Link) -> None:
@@ -33,17 +49,17 @@ def add_link_sensors(building: Building, link: Link) -> None:
         pose = link.scope.read_pose(element, link.pose)
         if kind == "imu":
             _add_imu(building, link, element, pose)
-        elif kind in CAMERAS:
-            add_camera(building, link, element, pose)
+        elif kind in _CAMERAS:
+            _add_camera(building, link, element, pose)
         elif kind in ("ray", "lidar", "gpu_ray", "gpu_lidar"):
-            add_rays(building, link, element, pose)
+            _add_rays(building, link, element, pose)
         elif kind == "contact":
             how = '`"sensor": "contacts"`, `"element": "link/collision"`'
             building.report.note(element, f"declare it in the node file: {how}")
         elif kind in _SIMPLE:
-            site = add_site(building, link, element, pose)
+            site = _add_site(building, link, element, pose)
             for what, sort in _SIMPLE[kind]:
-                add_sensor(building, f"{site}/{what}", sort, site, element)
+                _add_sensor(building, f"{site}/{what}", sort, site, element)
             if kind == "altimeter":
                 building.report.remark(element, "the whole position and velocity in MuJoCo")
             element.child(kind)  # now read; what is inside it is listed
@@ -64,14 +80,14 @@ def add_joint_sensors(building: Building, branch: Branch) -> None:
 
 
 def _add_imu(building: Building, link: Link, element: Element, pose: Pose) -> None:
-    site = add_site(building, link, element, pose)
+    site = _add_site(building, link, element, pose)
     imu = element.child("imu")
     for what, sort, group in (
         ("gyro", _KINDS.mjSENS_GYRO, "angular_velocity"),
         ("accelerometer", _KINDS.mjSENS_ACCELEROMETER, "linear_acceleration"),
         ("orientation", _KINDS.mjSENS_FRAMEQUAT, ""),
     ):
-        sensor = add_sensor(building, f"{site}/{what}", sort, site, element)
+        sensor = _add_sensor(building, f"{site}/{what}", sort, site, element)
         axes = imu.child(group) if imu is not None and group else None
         if axes is not None:
             sensor.noise = _deviation(building, axes)
@@ -94,8 +110,8 @@ def _add_force_torque(building: Building, branch: Branch, element: Element) -> N
     joint, link, report = branch.joint, branch.link, building.report
     assert joint is not None
     settings = element.child("force_torque")
-    frame = "child" if settings is None else word(settings, "frame") or "child"
-    direction = "" if settings is None else word(settings, "measure_direction")
+    frame = "child" if settings is None else text_of(settings, "frame") or "child"
+    direction = "" if settings is None else text_of(settings, "measure_direction")
     place = joint.scope.read_pose(element, anchor(joint))
     ends = {"child": joint.child, "parent": joint.parent}
     if frame in ends:
@@ -108,26 +124,12 @@ def _add_force_torque(building: Building, branch: Branch, element: Element) -> N
     if (direction == "parent_to_child") == branch.is_turned:
         report.remark(element, "with the opposite sign in MuJoCo")
     wanted = f"{joint.name}/{element.name}"
-    site = add_site(building, link, element, place, wanted=wanted)
-    add_sensor(building, f"{site}/force", _KINDS.mjSENS_FORCE, site, element)
-    add_sensor(building, f"{site}/torque", _KINDS.mjSENS_TORQUE, site, element)
+    site = _add_site(building, link, element, place, wanted=wanted)
+    _add_sensor(building, f"{site}/force", _KINDS.mjSENS_FORCE, site, element)
+    _add_sensor(building, f"{site}/torque", _KINDS.mjSENS_TORQUE, site, element)
 
 
-# SDF's cameras look along x, with z up; MuJoCo's along -z, with y up.
-_TO_CAMERA = Pose(rotation=np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
-
-CAMERAS = {
-    "camera": "",
-    "wideanglecamera": "a pinhole camera in MuJoCo, without the wide angle lens",
-    "wide_angle_camera": "a pinhole camera in MuJoCo, without the wide angle lens",
-    "depth": "colours only, no depth",
-    "depth_camera": "colours only, no depth",
-    "rgbd": "colours only, no depth",
-    "rgbd_camera": "colours only, no depth",
-}
-
-
-def add_camera(building: Building, link: Link, element: Element, pose: Pose) -> None:
+def _add_camera(building: Building, link: Link, element: Element, pose: Pose) -> None:
     """Add the camera of a sensor, whose own pose in the world is ``pose``."""
     report = building.report
     kind = element.attributes.get("type", "")
@@ -147,18 +149,11 @@ def add_camera(building: Building, link: Link, element: Element, pose: Pose) -> 
     camera.name = building.name("camera", f"{link.name}/{element.name}", element)
     camera.fovy = math.degrees(2 * math.atan(math.tan(across / 2) * height / width))
     put(camera, pose @ _TO_CAMERA, link.pose)
-    if CAMERAS[kind]:
-        report.remark(element, CAMERAS[kind])
+    if _CAMERAS[kind]:
+        report.remark(element, _CAMERAS[kind])
 
 
-# A rangefinder of MuJoCo's looks along z.
-_TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
-
-_MOST_RAYS = 1000
-_SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # where nothing says how many
-
-
-def add_rays(building: Building, link: Link, element: Element, pose: Pose) -> None:
+def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> None:
     """Add a site and a rangefinder for every ray of a sensor, row by row from below."""
     report = building.report
     settings = next((s for s in map(element.child, ("ray", "lidar")) if s is not None), element)
@@ -179,8 +174,8 @@ def add_rays(building: Building, link: Link, element: Element, pose: Pose) -> No
         for column, yaw in enumerate(yaws):
             ray = pose @ _turned(yaw, pitch) @ _TO_RAY
             suffix = f"/{row * columns + column}" if count > 1 else ""
-            site = add_site(building, link, element, ray, suffix)
-            sensor = add_sensor(building, site, mujoco.mjtSensor.mjSENS_RANGEFINDER, site, element)
+            site = _add_site(building, link, element, ray, suffix)
+            sensor = _add_sensor(building, site, mujoco.mjtSensor.mjSENS_RANGEFINDER, site, element)
             sensor.cutoff = most if math.isfinite(most) else 0
             if hasattr(mujoco, "mjtRayDataField"):  # since then it says what it measures
                 sensor.intprm[0] = 1 << mujoco.mjtRayDataField.mjRAYDATA_DIST.value
@@ -209,9 +204,6 @@ def _turned(yaw: float, pitch: float) -> Pose:
     return Pose(rotation=about_z @ about_y)
 
 
-_SITE = mujoco.mjtObj.mjOBJ_SITE
-
-
 def add_frames(building: Building, scope: Scope) -> None:
     """A site for every ``<frame>``: a place with a name, as the tip of a tool."""
     for inner, element in scope.each("frame"):
@@ -224,7 +216,7 @@ def add_frames(building: Building, scope: Scope) -> None:
             put(site, inner.pose @ inner.place(element.name, element), link.pose)
 
 
-def add_site(
+def _add_site(
     building: Building,
     link: Link,
     element: Element,
@@ -240,7 +232,7 @@ def add_site(
     return name
 
 
-def add_sensor(building: Building, name: str, kind: Any, site: str, element: Element) -> Any:
+def _add_sensor(building: Building, name: str, kind: Any, site: str, element: Element) -> Any:
     """Add a sensor of MuJoCo's that measures at a site."""
     unique = building.name("sensor", name, element)
     return building.spec.add_sensor(name=unique, type=kind, objtype=_SITE, objname=site)

@@ -18,6 +18,25 @@ from neuros.convert.values import Pose, from_quaternion, is_true, number, turnin
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _TYPES = mujoco.mjtGeom
 _ALL_MASKS = 0xFFFF  # what Gazebo gives a collision that names none
+_GREY = (0.7, 0.7, 0.7, 1.0)
+# The diffuse colours of Gazebo's own materials, as far as a colour is all that they are.
+_SCRIPTS: Mapping[str, tuple[float, float, float]] = {
+    "Gazebo/Black": (0, 0, 0),
+    "Gazebo/Blue": (0, 0, 1),
+    "Gazebo/DarkGray": (0.175, 0.175, 0.175),
+    "Gazebo/DarkGrey": (0.175, 0.175, 0.175),
+    "Gazebo/FlatBlack": (0.1, 0.1, 0.1),
+    "Gazebo/Gray": (0.7, 0.7, 0.7),
+    "Gazebo/Green": (0, 1, 0),
+    "Gazebo/Grey": (0.7, 0.7, 0.7),
+    "Gazebo/Indigo": (0.33, 0, 0.5),
+    "Gazebo/Orange": (1, 0.5088, 0.0468),
+    "Gazebo/Purple": (1, 0, 1),
+    "Gazebo/Red": (1, 0, 0),
+    "Gazebo/Turquoise": (0, 1, 1),
+    "Gazebo/White": (1, 1, 1),
+    "Gazebo/Yellow": (1, 1, 0),
+}
 
 
 @dataclass
@@ -44,7 +63,7 @@ def add_shapes(building: Building, link: Link, *, is_solid: bool) -> None:
         geom = _add(building, link, element, is_solid=False)
         if geom is not None:
             geom.group, geom.contype, geom.conaffinity, geom.mass = _VISUAL_GROUP, 0, 0, 0
-            geom.rgba = colour(element, building.report)
+            geom.rgba = _colour(element, building.report)
 
 
 def share_masks(building: Building) -> None:
@@ -171,29 +190,7 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
             report.problem(mask, f"'{mask.text}' is not a whole number")
 
 
-_GREY = (0.7, 0.7, 0.7, 1.0)
-
-# The diffuse colours of Gazebo's own materials, as far as a colour is all that they are.
-_SCRIPTS: Mapping[str, tuple[float, float, float]] = {
-    "Gazebo/Black": (0, 0, 0),
-    "Gazebo/Blue": (0, 0, 1),
-    "Gazebo/DarkGray": (0.175, 0.175, 0.175),
-    "Gazebo/DarkGrey": (0.175, 0.175, 0.175),
-    "Gazebo/FlatBlack": (0.1, 0.1, 0.1),
-    "Gazebo/Gray": (0.7, 0.7, 0.7),
-    "Gazebo/Green": (0, 1, 0),
-    "Gazebo/Grey": (0.7, 0.7, 0.7),
-    "Gazebo/Indigo": (0.33, 0, 0.5),
-    "Gazebo/Orange": (1, 0.5088, 0.0468),
-    "Gazebo/Purple": (1, 0, 1),
-    "Gazebo/Red": (1, 0, 0),
-    "Gazebo/Turquoise": (0, 1, 1),
-    "Gazebo/White": (1, 1, 1),
-    "Gazebo/Yellow": (1, 1, 0),
-}
-
-
-def colour(visual: Element, report: Report) -> tuple[float, ...]:
+def _colour(visual: Element, report: Report) -> tuple[float, ...]:
     """Red, green, blue and opacity of a visual, each from 0 to 1."""
     opacity = 1.0 - number(visual, "transparency", report, 0.0)
     material = visual.child("material")

@@ -13,6 +13,8 @@ import numpy.typing as npt
 from neuros.convert.elements import Element
 from neuros.convert.report import Report
 
+Vector = npt.NDArray[np.float64]
+
 
 def numbers(
     element: Element, count: int, report: Report, default: Sequence[float]
@@ -75,13 +77,10 @@ def is_true(owner: Element, tag: str, report: Report, *, default: bool) -> bool:
     return word in ("true", "1")
 
 
-def word(owner: Element, tag: str) -> str:
+def text_of(owner: Element, tag: str) -> str:
     """The text of the child ``tag``; empty without it."""
     element = owner.child(tag)
     return "" if element is None else element.text
-
-
-Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,17 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.machine import install_opengl, offscreen_opengl
 
 _BACKENDS = ("egl", "osmesa", "glfw")
+_MAX_GEOMS = 20_000
+_SMALL_WORLD = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="eye" pos="0 0 3"/>
+    <geom size="1"/>
+  </worldbody>
+</mujoco>
+"""
+_NAMES = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "GLFW"}
 
 
 def choose_opengl() -> str:
@@ -42,7 +53,7 @@ def import_opengl() -> Any:
     Raises ``EnvironmentFault`` where there is no OpenGL to render with.
     """
     choice = choose_opengl()
-    with opengl_faults():
+    with _opengl_faults():
         # Asked for directly: mujoco.GLContext was fixed when mujoco was imported.
         if choice == "egl":
             from mujoco.egl import GLContext
@@ -56,7 +67,7 @@ def import_opengl() -> Any:
 
 
 @contextmanager
-def opengl_faults() -> Iterator[None]:
+def _opengl_faults() -> Iterator[None]:
     """Turn what PyOpenGL and MuJoCo raise where a library is missing into ``EnvironmentFault``."""
     try:
         yield
@@ -68,20 +79,6 @@ def opengl_faults() -> Iterator[None]:
         raise EnvironmentFault(
             f"a camera cannot render: no usable OpenGL{choice} ({text}): {install_opengl()}"
         ) from error
-
-
-_MAX_GEOMS = 20_000
-
-_SMALL_WORLD = """
-<mujoco>
-  <worldbody>
-    <light pos="0 0 3"/>
-    <camera name="eye" pos="0 0 3"/>
-    <geom size="1"/>
-  </worldbody>
-</mujoco>
-"""
-_NAMES = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "GLFW"}
 
 
 @dataclass
@@ -145,7 +142,7 @@ class Cameras:
     def _open(self) -> _Resources:
         buffer = self._model.vis.global_
         make_context = import_opengl()
-        with opengl_faults():
+        with _opengl_faults():
             gl = make_context(buffer.offwidth, buffer.offheight)
             gl.make_current()
             context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from neuros.ports import NodeContext, Packet
 
 _MAX_LAG_S = 0.5
+_JOIN_S = 5.0
+_LOOK_S = 0.1
 
 
 class Pacer:
@@ -126,10 +128,6 @@ class StepLock:
         with self._changed:
             self._is_stepping = False
             self._changed.notify_all()
-
-
-_JOIN_S = 5.0
-_LOOK_S = 0.1
 
 
 class FreeRun:

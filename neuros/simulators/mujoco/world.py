@@ -38,6 +38,11 @@ _KEPT_BY_HAND = (
     "mocap_quat",
     "eq_active",
 )
+_DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
+    ".urdf": read_urdf,
+    ".sdf": convert_sdf,
+    ".world": convert_sdf,
+}
 
 
 @dataclass(frozen=True)
@@ -68,11 +73,11 @@ class World:
         self._sensors = read_sensors(node.description, problems)
         self._commands = read_commands(node.description, problems)
         try:
-            self._spec, self.where = load_spec(node, model)
-            prepare_rendering(self._spec, self._sensors, fine=fine)
-            joints = joints_of(self._spec)
+            self._spec, self.where = _load_spec(node, model)
+            _prepare_rendering(self._spec, self._sensors, fine=fine)
+            joints = _joints_of(self._spec)
             add_drives(self._spec, joints, self._commands, problems)
-            self.model = compile_spec(self._spec, self.where)
+            self.model = _compile_spec(self._spec, self.where)
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
@@ -140,11 +145,11 @@ class World:
             raise ModelError(f"entity '{name}': a position is x, y, z in metres, not {position!r}")
         if not name or _is_taken(name, names_of(self.model, "body")):
             raise ModelError(f"an entity needs a name of its own: '{name}' is taken")
-        child, where = load_spec(self._node, path)
+        child, where = _load_spec(self._node, path)
         # First on a copy: a spec cannot go back once something that does not fit is attached.
         trial, problems = self._spec.copy(), Problems(self._node.description.file)
         self._attach(trial, child.copy(), position, name, problems)
-        self._bind(compile_spec(trial, where), problems)
+        self._bind(_compile_spec(trial, where), problems)
         problems.raise_any()
         self._attach(self._spec, child, position, name, problems)
         before = self.data
@@ -171,10 +176,10 @@ class World:
         self, spec: Any, child: Any, position: Sequence[float], name: str, problems: Problems
     ) -> None:
         """Attach an entity as ``name/...``, and add the actuators declared for its joints."""
-        before = joints_of(spec)
+        before = _joints_of(spec)
         frame = spec.worldbody.add_frame(pos=[float(value) for value in position])
         spec.attach(child, prefix=f"{name}/", frame=frame)
-        add_drives(spec, joints_of(spec) - before, self._commands, problems)
+        add_drives(spec, _joints_of(spec) - before, self._commands, problems)
 
     def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
         bodies = names_of(model, "body")
@@ -223,14 +228,7 @@ def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
     return any(body.startswith(f"{entity}/") for body in bodies)
 
 
-_DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
-    ".urdf": read_urdf,
-    ".sdf": convert_sdf,
-    ".world": convert_sdf,
-}
-
-
-def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
+def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
     """An ``MjSpec`` of our own, and what to call it in messages.
 
     ``model`` is the path of an MJCF, URDF or SDF file, MJCF as text, or an ``MjSpec``, which is
@@ -303,17 +301,17 @@ def _from_file(node: NodeContext, path: Path) -> Any:
     return described.spec
 
 
-def joints_of(spec: Any) -> set[str]:
+def _joints_of(spec: Any) -> set[str]:
     """The names of all joints."""
     return {joint.name for joint in spec.joints}
 
 
-def compile_spec(spec: Any, where: str) -> Any:
+def _compile_spec(spec: Any, where: str) -> Any:
     """The ``MjModel``; raises ``ModelError`` that starts with ``where``."""
     return _parsed(spec.compile, where)
 
 
-def prepare_rendering(spec: Any, sensors: Iterable[SensorDeclaration], *, fine: bool) -> None:
+def _prepare_rendering(spec: Any, sensors: Iterable[SensorDeclaration], *, fine: bool) -> None:
     """Make the off-screen buffer large enough for every camera, and cheap unless ``fine``."""
     cameras = [sensor for sensor in sensors if sensor.kind == "camera"]
     buffer = spec.visual.global_
