@@ -26,25 +26,25 @@ _STILL: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 class TransformError(LookupError):
-    """Where one frame is seen from another is not known; the text says why."""
+    """The transform between two frames is unknown; the text says why."""
 
 
 @dataclass(frozen=True, order=True)
 class _Pose:
-    """Where a frame is in its parent at a time."""
+    """Transform of a frame in its parent at a time."""
 
     at_ns: int
     translation: Vector = field(compare=False, default=(0.0, 0.0, 0.0))
     rotation: Quaternion = field(compare=False, default=_STILL)
 
     def within(self, parent: _Pose) -> _Pose:
-        """The same frame in the parent's parent."""
+        """This frame in the parent's parent."""
         moved = _rotate(parent.rotation, self.translation)
         x, y, z = (a + b for a, b in zip(parent.translation, moved, strict=True))
         return _Pose(self.at_ns, (x, y, z), _times(parent.rotation, self.rotation))
 
     def inverted(self) -> _Pose:
-        """Where the parent is in this frame."""
+        """The transform of the parent in this frame."""
         x, y, z, w = self.rotation
         back = (-x, -y, -z, w)
         px, py, pz = _rotate(back, self.translation)
@@ -74,7 +74,7 @@ class TransformBuffer:
             self._add(stamped, is_static)
 
     def lookup(self, target: str, source: str, at: Any = None) -> Any:
-        """Where ``source`` is, seen from ``target``: a ``geometry_msgs/msg/TransformStamped``.
+        """Look up ``source`` seen from ``target``: a ``geometry_msgs/msg/TransformStamped``.
 
         Its rotation and translation take a point from ``source`` to ``target``.
 
@@ -137,7 +137,7 @@ class TransformBuffer:
             at = self._parents.get(at)
 
     def _chain(self, frames: Sequence[str], at_ns: int) -> _Pose:
-        """Where the first frame is in the parent of the last one."""
+        """The transform of the first frame in the parent of the last one."""
         pose = _Pose(at_ns)
         for frame in frames:
             pose = pose.within(self._pose(frame, at_ns))

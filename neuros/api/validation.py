@@ -99,8 +99,8 @@ def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
     model = _model(models[0], node, project)
     if model is None:
         return
-    from neuros.simulators.mujoco.build import timestep_of
     from neuros.simulators.mujoco.timebase import Timebase
+    from neuros.simulators.mujoco.world import timestep_of
 
     try:
         time = Timebase(timestep_of(model))

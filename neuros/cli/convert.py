@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
 
 if TYPE_CHECKING:
-    from neuros.convert.converted import Converted
+    from neuros.convert.output import Converted
     from neuros.convert.report import NotTaken
 
 _EPILOG = """\

@@ -1,4 +1,4 @@
-"""What all parts of a conversion share while they build an ``MjSpec``."""
+"""State of a conversion while it builds an ``MjSpec``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from neuros.convert.elements import Element
 from neuros.convert.meshes import Meshes
-from neuros.convert.poses import Pose
 from neuros.convert.report import Report
 from neuros.convert.scopes import Link
+from neuros.convert.values import Pose
 
 
 @dataclass

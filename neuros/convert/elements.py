@@ -1,4 +1,4 @@
-"""XML that remembers where everything stands, and what of it has been read."""
+"""XML elements with their file and line, and a mark once they have been read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Element:
 
     Attributes:
         text: what stands in it, without the white space around.
-        taken: whether somebody has read it; what nobody has read is listed as not taken over.
+        taken: whether it has been read; elements never read are listed as not taken over.
     """
 
     tag: str

@@ -63,7 +63,7 @@ class Finder:
         raise NotFound(f"'{uri}' cannot be found", "" if scheme == "file" else hint)
 
     def find_file(self, uri: str, here: Path) -> Path:
-        """The same where only a file will do."""
+        """The file behind ``uri``; a folder is not found."""
         found = self.find(uri, here)
         if not found.is_file():
             raise NotFound(f"'{uri}' is no file")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.numbers import word
 from neuros.convert.report import Report
+from neuros.convert.values import text_of
 from neuros.errors import Problem
 
 _OVERRIDDEN = ("pose", "static", "placement_frame")
@@ -51,7 +51,7 @@ class Includer:
         model = self._model(include, chain)
         if model is None:
             return []
-        named = word(include, "name")
+        named = text_of(include, "name")
         if named:
             model.attributes["name"] = named
         for tag in _OVERRIDDEN:

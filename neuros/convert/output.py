@@ -1,17 +1,38 @@
-"""A converted description as an MJCF file, with meshes beside it where they had to be made."""
+"""Result of a conversion, and its MJCF file, with the meshes that had to be made beside it."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
-from neuros.convert.converted import Converted
 from neuros.convert.meshes import Triangles
+from neuros.convert.report import NotTaken
 
 MARK = "made by `neuros convert`"
 """Stands in the first line of every file that is written here, and may be overwritten."""
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A description as MuJoCo has it.
+
+    Attributes:
+        spec: the ``MjSpec``; its meshes have absolute paths.
+        not_taken: what of the description it does not have.
+        made_meshes: triangles of those meshes that MuJoCo cannot read itself, by their names.
+        bodies, joints: how many there are.
+    """
+
+    spec: Any
+    not_taken: Sequence[NotTaken]
+    made_meshes: dict[str, Triangles]
+    bodies: int
+    joints: int
 
 
 def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:

@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from neuros.convert.building import Building, put
-from neuros.convert.controllers import add_actuators
-from neuros.convert.converted import Converted
-from neuros.convert.couplings import add_mimics
 from neuros.convert.elements import Element
 from neuros.convert.find import Finder
-from neuros.convert.flat import box_flat_meshes, has_flat_meshes
 from neuros.convert.includes import Includer
-from neuros.convert.inertia import is_computed, read_inertia, set_inertia
-from neuros.convert.joints import add_joints, is_known
-from neuros.convert.loops import close_loop
-from neuros.convert.meshes import Meshes
-from neuros.convert.numbers import is_true, word
-from neuros.convert.poses import Pose
+from neuros.convert.joints import add_actuators, add_joints, add_mimics, close_loop, is_known
+from neuros.convert.meshes import Meshes, box_flat_meshes, has_flat_meshes
+from neuros.convert.output import Converted
 from neuros.convert.report import Report
-from neuros.convert.scope_reading import place_all, read_scope
-from neuros.convert.scopes import Link, Scope
-from neuros.convert.sensors import add_joint_sensors, add_link_sensors
-from neuros.convert.shapes import add_shapes, share_masks
-from neuros.convert.sites import add_frames
+from neuros.convert.scopes import Link, Scope, place_all, read_scope
+from neuros.convert.sensors import add_frames, add_joint_sensors, add_link_sensors
+from neuros.convert.shapes import add_shapes, light_colour, share_masks
 from neuros.convert.tree import Branch, Joint, Tree, grow
-from neuros.convert.world import add_lights, read_world
+from neuros.convert.values import Pose, Vector, is_true, number, read_pose, text_of, vector
+
+_ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_DEFAULTS = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+_TOLERANCE = 1e-9
+_GRAVITY = (0.0, 0.0, -9.8)
+_MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
+_TYPES = mujoco.mjtLightType
+_LIGHTS = {
+    "directional": _TYPES.mjLIGHT_DIRECTIONAL,
+    "point": _TYPES.mjLIGHT_POINT,
+    "spot": _TYPES.mjLIGHT_SPOT,
+}
 
 
 def convert_sdf(file: Path, finder: Finder) -> Converted:
@@ -91,7 +97,7 @@ def _grow(scope: Scope, report: Report) -> Tree:
 
 
 def _end(scope: Scope, joint: Element, side: str, report: Report) -> Link | None:
-    name = word(joint, side)
+    name = text_of(joint, side)
     if not name:
         report.problem(joint, f"<{side}> is missing: which link is the {side}?")
         return None
@@ -100,7 +106,7 @@ def _end(scope: Scope, joint: Element, side: str, report: Report) -> Link | None
 
 def _build(building: Building, scope: Scope, tree: Tree) -> None:
     if scope.element.tag == "world":
-        read_world(building, scope)
+        _read_world(building, scope)
     for branch in tree.branches:
         _add_body(building, branch)
     share_masks(building)
@@ -111,7 +117,7 @@ def _build(building: Building, scope: Scope, tree: Tree) -> None:
     add_mimics(building, scope)
     add_actuators(building, scope)
     add_frames(building, scope)
-    add_lights(building, scope)
+    _add_lights(building, scope)
     _exclude_contacts(building, scope)
 
 
@@ -121,13 +127,13 @@ def _add_body(building: Building, branch: Branch) -> None:
     building.bodies[id(link)] = body
     body.name = building.name("body", link.name, link.element)
     put(body, link.pose, Pose() if branch.parent is None else branch.parent.pose)
-    is_solid = is_computed(link.element) and not link.is_static
+    is_solid = _is_computed(link.element) and not link.is_static
     if link.is_static:
         inertial = link.element.child("inertial")
         if inertial is not None:
             inertial.take_all()  # what never moves needs none
     elif not is_solid:
-        set_inertia(body, read_inertia(link.element, report))
+        _set_inertia(body, _read_inertia(link.element, report))
     if not is_true(link.element, "gravity", report, default=True):
         body.gravcomp = 1.0
     if branch.joint is not None:
@@ -184,3 +190,132 @@ def _compiled(building: Building, root: Element) -> Any:
     for warning in heard:
         building.report.remark(root, f"MuJoCo: {' '.join(str(warning.message).split())}")
     return model
+
+
+@dataclass(frozen=True, eq=False)
+class _Inertia:
+    """Of a link, in its own frame.
+
+    Attributes:
+        mass: kg.
+        centre: of mass, shape (3,), metres.
+        matrix: about the centre of mass and along the link's axes, shape (3, 3), kg m².
+    """
+
+    mass: float
+    centre: Vector
+    matrix: Vector
+
+
+def _is_computed(link: Element) -> bool:
+    """Whether the mass is to be computed from shapes and densities (SDF 1.11)."""
+    inertial = link.child("inertial")
+    return inertial is not None and inertial.attributes.get("auto", "false") in ("true", "1")
+
+
+def _read_inertia(link: Element, report: Report) -> _Inertia:
+    """Read ``<inertial>``; SDF's defaults are 1 kg and 1 kg m²."""
+    inertial = link.child("inertial")
+    if inertial is None:
+        report.remark(link, "no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")
+        return _Inertia(1.0, np.zeros(3), np.eye(3))
+    pose = read_pose(inertial, report)
+    mass = number(inertial, "mass", report, 1.0, positive=True)
+    values = dict(zip(_ENTRIES, _DEFAULTS, strict=True))
+    element = inertial.child("inertia")
+    if element is not None:
+        values = {key: number(element, key, report, values[key]) for key in _ENTRIES}
+    ixx, iyy, izz, ixy, ixz, iyz = values.values()
+    matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    matrix = _possible(matrix, element or inertial, report)
+    return _Inertia(mass, pose.position, pose.rotation @ matrix @ pose.rotation.T)
+
+
+def _set_inertia(body: Any, inertia: _Inertia) -> None:
+    """Give it to a body of the spec."""
+    matrix = inertia.matrix
+    body.explicitinertial = True
+    body.mass, body.ipos = inertia.mass, inertia.centre
+    body.fullinertia = [*np.diag(matrix), matrix[0, 1], matrix[0, 2], matrix[1, 2]]
+
+
+def _possible(matrix: Vector, element: Element, report: Report) -> Vector:
+    """The matrix, or one that a rigid body can have."""
+    if not np.isfinite(matrix).all():
+        report.problem(element, "every moment of inertia must be finite")
+        return np.eye(3)
+    least, middle, most = np.linalg.eigvalsh(matrix)
+    if least <= 0:
+        report.problem(
+            element,
+            f"no body has this inertia: its principal moments are {least:.3g}, {middle:.3g} and"
+            f" {most:.3g} kg m², and each must be positive",
+        )
+        return np.eye(3)
+    if least + middle < most * (1 - _TOLERANCE):
+        mean = float(np.trace(matrix)) / 3
+        report.remark(
+            element,
+            f"no body has this inertia (its largest principal moment, {most:.3g} kg m², exceeds the"
+            f" sum of the others): MuJoCo gets {mean:.3g} kg m² about every axis",
+        )
+        return np.eye(3) * mean
+    return matrix
+
+
+def _read_world(building: Building, scope: Scope) -> None:
+    """Options of the whole model, from a ``<world>``, with SDF's defaults."""
+    world, report, option = scope.element, building.report, building.spec.option
+    option.gravity = vector(world, "gravity", report, _GRAVITY)
+    option.magnetic = vector(world, "magnetic_field", report, _MAGNETIC_FIELD_T)
+    engines = world.each("physics")
+    for unused in engines[1:]:
+        report.note(unused, "the first <physics> counts")
+    if engines:
+        option.timestep = number(engines[0], "max_step_size", report, 0.001, positive=True)
+    else:
+        option.timestep = 0.001
+
+
+def _add_lights(building: Building, scope: Scope) -> None:
+    """Lights of a world, of models and of links."""
+    for inner in scope.and_models():
+        for element in inner.element.each("light"):
+            _add_light(building, element, inner.read_pose(element, inner.pose), None)
+        for link in inner.links.values():
+            for element in link.element.each("light"):
+                _add_light(building, element, inner.read_pose(element, link.pose), link)
+
+
+def _add_light(building: Building, element: Element, pose: Pose, link: Link | None) -> None:
+    report, kind = building.report, element.attributes.get("type", "point")
+    if kind not in _LIGHTS:
+        report.problem(element, f"'{kind}' is not a light", f"there are: {', '.join(_LIGHTS)}")
+        return
+    seen_from = Pose() if link is None else link.pose
+    local = seen_from.inverse() @ pose
+    light: Any = building.body(link).add_light(pos=local.position, type=_LIGHTS[kind])
+    light.name = building.name("light", element.name, element)
+    direction = np.array(vector(element, "direction", report, (0.0, 0.0, -1.0)))
+    if direction.any():
+        light.dir = local.rotation @ (direction / np.linalg.norm(direction))
+    light.diffuse = light_colour(element, "diffuse", report, 1.0)
+    light.specular = light_colour(element, "specular", report, 0.1)
+    light.castshadow = is_true(element, "cast_shadows", report, default=False)
+    _read_attenuation(building, element, light)
+    spot = element.child("spot")
+    if spot is not None and kind == "spot":
+        light.cutoff = math.degrees(number(spot, "outer_angle", report, 0.0)) or 45.0
+        light.exponent = number(spot, "falloff", report, 0.0)
+
+
+def _read_attenuation(building: Building, element: Element, light: Any) -> None:
+    attenuation = element.child("attenuation")
+    if attenuation is None:
+        return
+    names = ("constant", "linear", "quadratic")
+    light.attenuation = [
+        number(attenuation, name, building.report, default)
+        for name, default in zip(names, (1.0, 0.0, 0.0), strict=True)
+    ]
+    light.range = number(attenuation, "range", building.report, 10.0, positive=True)

@@ -1,7 +1,8 @@
-"""Collisions and visuals: from SDF's geometries to MuJoCo's geoms."""
+"""Collisions and visuals of SDF as geoms of MuJoCo, with their colours."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,14 +11,32 @@ import numpy as np
 
 from neuros.convert.building import Building, put
 from neuros.convert.elements import Element
-from neuros.convert.materials import colour
-from neuros.convert.numbers import is_true, number, vector
-from neuros.convert.poses import Pose, from_quaternion, turning_z_to
+from neuros.convert.report import Report
 from neuros.convert.scopes import Link
+from neuros.convert.values import Pose, from_quaternion, is_true, number, turning_z_to, vector
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _TYPES = mujoco.mjtGeom
 _ALL_MASKS = 0xFFFF  # what Gazebo gives a collision that names none
+_GREY = (0.7, 0.7, 0.7, 1.0)
+# The diffuse colours of Gazebo's own materials, as far as a colour is all that they are.
+_SCRIPTS: Mapping[str, tuple[float, float, float]] = {
+    "Gazebo/Black": (0, 0, 0),
+    "Gazebo/Blue": (0, 0, 1),
+    "Gazebo/DarkGray": (0.175, 0.175, 0.175),
+    "Gazebo/DarkGrey": (0.175, 0.175, 0.175),
+    "Gazebo/FlatBlack": (0.1, 0.1, 0.1),
+    "Gazebo/Gray": (0.7, 0.7, 0.7),
+    "Gazebo/Green": (0, 1, 0),
+    "Gazebo/Grey": (0.7, 0.7, 0.7),
+    "Gazebo/Indigo": (0.33, 0, 0.5),
+    "Gazebo/Orange": (1, 0.5088, 0.0468),
+    "Gazebo/Purple": (1, 0, 1),
+    "Gazebo/Red": (1, 0, 0),
+    "Gazebo/Turquoise": (0, 1, 1),
+    "Gazebo/White": (1, 1, 1),
+    "Gazebo/Yellow": (1, 1, 0),
+}
 
 
 @dataclass
@@ -44,7 +63,7 @@ def add_shapes(building: Building, link: Link, *, is_solid: bool) -> None:
         geom = _add(building, link, element, is_solid=False)
         if geom is not None:
             geom.group, geom.contype, geom.conaffinity, geom.mass = _VISUAL_GROUP, 0, 0, 0
-            geom.rgba = colour(element, building.report)
+            geom.rgba = _colour(element, building.report)
 
 
 def share_masks(building: Building) -> None:
@@ -67,7 +86,7 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
         geom.meshname = shape.mesh
     pose = link.scope.read_pose(element, link.pose)
     put(geom, pose @ shape.pose, link.pose)
-    noting = element if element.tag == "collision" else None  # nobody asks for a visual by name
+    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
     geom.name = building.name("geom", f"{link.name}/{element.name}", noting)
     mesh = element.child("geometry", "mesh")
     if shape.mesh and mesh is not None and element.tag == "collision":
@@ -169,3 +188,49 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
             building.masks[id(collision)] = int(mask.text, 0) & 0x7FFFFFFF
         except ValueError:
             report.problem(mask, f"'{mask.text}' is not a whole number")
+
+
+def _colour(visual: Element, report: Report) -> tuple[float, ...]:
+    """Red, green, blue and opacity of a visual, each from 0 to 1."""
+    opacity = 1.0 - number(visual, "transparency", report, 0.0)
+    material = visual.child("material")
+    red, green, blue, alpha = _GREY if material is None else _diffuse(material, report)
+    return (red, green, blue, alpha * opacity)
+
+
+def _diffuse(material: Element, report: Report) -> tuple[float, ...]:
+    script = material.child("script")
+    name = None if script is None else script.child("name")
+    base = _GREY
+    if script is not None:
+        if name is not None and name.text in _SCRIPTS:
+            script.take_all()
+            base = (*_SCRIPTS[name.text], 1.0)
+        else:
+            report.note(script, "a material script of Gazebo's")
+    element = material.child("diffuse")
+    if element is None:
+        return base
+    values = [float(word) for word in element.text.split() if _is_number(word)]
+    if len(values) not in (3, 4) or len(values) != len(element.text.split()):
+        report.problem(element, "a colour is red, green, blue and opacity, each from 0 to 1")
+        return base
+    return (*values, 1.0)[:4]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def light_colour(owner: Element, tag: str, report: Report, default: float) -> tuple[float, ...]:
+    """Red, green and blue of a light."""
+    element = owner.child(tag)
+    if element is None:
+        return (default,) * 3
+    if len(element.text.split()) == 3:
+        return vector(owner, tag, report, (default,) * 3)
+    return vector(owner, tag, report, (default,) * 3 + (1.0,))[:3]

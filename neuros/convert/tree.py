@@ -1,4 +1,4 @@
-"""From SDF's graph of links and joints to MuJoCo's tree of bodies.
+"""Tree of bodies for MuJoCo, from SDF's graph of links and joints.
 
 MuJoCo hangs every body on one other; SDF joins any two links. The tree begins with what hangs on
 the world, then with links that are no joint's child; a joint that it reaches from its child is
@@ -91,5 +91,5 @@ def grow(links: Sequence[Link], joints: Sequence[Joint]) -> Tree:
 
 
 def _key(link: Link | None) -> int | None:
-    """What stands for a link; one that never moves is the world."""
+    """The key of a link; one that never moves counts as the world."""
     return None if link is None or link.is_static else id(link)

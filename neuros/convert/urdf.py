@@ -1,4 +1,4 @@
-"""URDF for MuJoCo, which reads it itself; its meshes are found, and what it passes over is listed.
+"""URDF to an ``MjSpec``: MuJoCo reads it; meshes are found, unsupported elements listed.
 
 MuJoCo joins links that cannot move against each other, and leaves visuals out; both are switched
 off, so that the names of all links are there, unless the ``<mujoco>`` element says otherwise.
@@ -13,16 +13,23 @@ from typing import Any
 
 import mujoco
 
-from neuros.convert.converted import Converted
-from neuros.convert.couplings import follow_joint
 from neuros.convert.elements import Element, parse
 from neuros.convert.find import Finder, NotFound
-from neuros.convert.flat import box_flat_meshes, has_flat_meshes
-from neuros.convert.meshes import Triangles, fill, needs_conversion, triangles_of, why_unread
+from neuros.convert.joints import follow_joint
+from neuros.convert.meshes import (
+    Triangles,
+    box_flat_meshes,
+    fill,
+    has_flat_meshes,
+    needs_conversion,
+    triangles_of,
+    why_unread,
+)
+from neuros.convert.output import Converted
 from neuros.convert.report import Report
 from neuros.errors import Problem
 
-_PASSED_OVER = {
+_UNSUPPORTED_ELEMENTS = {
     "gazebo": "an extension for Gazebo",
     "transmission": "declare drives in the node file: `joint` and `drive`",
     "ros2_control": "declare drives in the node file: `joint` and `drive`",
@@ -52,8 +59,8 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     _keep_names(tree)
     spec, made = _spec(tree, root, converted, report)
     for element in _all(root):
-        if element.tag in _PASSED_OVER:
-            report.note(element, _PASSED_OVER[element.tag])
+        if element.tag in _UNSUPPORTED_ELEMENTS:
+            report.note(element, _UNSUPPORTED_ELEMENTS[element.tag])
         elif element.tag == "mimic" and element.parent is not None:
             _mimic(spec, element, report)
     model = spec.copy().compile()
@@ -155,7 +162,7 @@ def _mimic(spec: Any, mimic: Element, report: Report) -> None:
 
 
 def _copy(element: Element) -> ElementTree.Element:
-    """What writes it as XML again, in the same order; prefixes of names may stand for nothing."""
+    """A copy that can be written as XML, in this order; prefixes of names may be undeclared."""
     copy = ElementTree.Element(element.tag, element.attributes)
     copy.text = element.text
     copy.extend(map(_copy, element.children))

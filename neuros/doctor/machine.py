@@ -95,7 +95,8 @@ def prove_rendering(environ: Mapping[str, str]) -> Finding:
     subject = "cameras"
     if find_spec("mujoco") is None:
         return absent(subject, "not tried without MuJoCo")
-    command = [sys.executable, "-m", "neuros.simulators.mujoco.frame"]
+    program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
+    command = [sys.executable, "-c", program]
     try:
         done = subprocess.run(
             command,

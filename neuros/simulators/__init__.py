@@ -1,1 +1,1 @@
-"""Simulators that live in a node: what :class:`neuros.ports.Simulator` asks for, per engine."""
+"""Simulators that run in a node: one :class:`neuros.ports.Simulator` per physics engine."""

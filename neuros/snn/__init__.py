@@ -14,8 +14,7 @@ from neuros.snn.devices import RateInput, SpikeInput, SpikeReader
 from neuros.snn.encoding import RegularEncoder, poisson_spikes
 from neuros.snn.kernel import derive_seed, import_nest, reset_kernel, threads_of_node
 from neuros.snn.spikes import Spikes
-from neuros.snn.stepper import Stepper
-from neuros.snn.steps import PartialDelayWarning
+from neuros.snn.stepper import PartialDelayWarning, Stepper
 from neuros.snn.tuning import (
     CosineTuning,
     Direction,

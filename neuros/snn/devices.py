@@ -12,8 +12,7 @@ import numpy as np
 
 from neuros.snn.kernel import import_nest
 from neuros.snn.spikes import Floats, Indices, Spikes, checked_indices, checked_rates
-from neuros.snn.stepper import Stepper
-from neuros.snn.steps import NS_PER_MS, NS_PER_S
+from neuros.snn.stepper import NS_PER_MS, NS_PER_S, Stepper
 
 
 class RateInput:
@@ -104,7 +103,7 @@ class SpikeInput:
 
 
 class SpikeReader:
-    """What a population has fired since the last look.
+    """The spikes of a population since the last look.
 
     A ``spike_recorder`` that is cleared by each :meth:`read`: a read costs as much as there are new
     spikes, and memory does not grow as long as one reads. (NEST itself gives all spikes since the

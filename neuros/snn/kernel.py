@@ -1,4 +1,4 @@
-"""NEST's kernel: one per process, set up so that the same run gives the same spikes.
+"""NEST's kernel: one per process, set up so that runs with one seed give equal spikes.
 
 NEST is licensed under the GPL and is no part of NeuROS: it is imported with the first call.
 """
@@ -18,7 +18,7 @@ LARGEST_SEED = 2**32 - 1
 
 
 class _Owner:
-    """Whose kernel it is: NEST has one per process, so this is one per process, too."""
+    """Count of resets: NEST has one kernel per process, so this is one per process, too."""
 
     resets = 0
 
@@ -119,7 +119,7 @@ def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> 
 
 
 class KernelInUse:
-    """Notices when somebody else resets the kernel, which two nodes of a process cannot share."""
+    """Notices when another node resets the kernel, which two nodes of a process cannot share."""
 
     def __init__(self) -> None:
         self._resets = _Owner.resets
@@ -133,6 +133,6 @@ class KernelInUse:
         """Raise ``NodeError`` once it has been."""
         if not self.is_ours:
             raise NodeError(
-                "somebody has reset NEST's kernel, and there is one per process: two nodes with "
+                "NEST's kernel has been reset, and there is one per process: two nodes with "
                 "NEST need a process each (--backend process), and a node has one network at a time"
             )

@@ -1,4 +1,4 @@
-"""Spikes of a population: which neuron, and when."""
+"""Spikes of a population, by neuron and time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Spikes:
-    """What a population has fired, one entry per spike.
+    """Spikes of a population, one entry per spike.
 
     Attributes:
         neuron: index within the population, from 0, ``(k,)``.

@@ -1,4 +1,4 @@
-"""Short SDF files for tests, and what becomes of them."""
+"""Short SDF files for tests, and their conversions."""
 
 from __future__ import annotations
 

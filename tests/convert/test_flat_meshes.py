@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.convert.find import Finder
-from neuros.convert.flat import _convex_hull
+from neuros.convert.meshes import _convex_hull
 from neuros.convert.output import write_mjcf
-from neuros.convert.poses import from_rpy
 from neuros.convert.urdf import read_urdf
+from neuros.convert.values import from_rpy
 
 CORNERS = np.array([(-2, -1, 0), (2, -1, 0), (2, 1, 0), (-2, 1, 0)], float)
 FACES = "f 1 2 3\nf 1 3 4\n"

@@ -1,4 +1,4 @@
-"""What is wrong with a file, and what of it is not taken over: with file, line and path."""
+"""Problems and unsupported elements are reported with file, line and path."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_mistake_has_its_sentence(folder: Folder, inside: str, problem: str) -
     assert any(problem in found for found in folder.problems(inside))
 
 
-def test_what_nobody_reads_is_listed_with_its_place(folder: Folder) -> None:
+def test_an_unsupported_element_is_listed_with_its_place(folder: Folder) -> None:
     notes = folder.notes(
         link(
             "a",

@@ -1,4 +1,4 @@
-"""Whatever is changed in a description: it becomes a model, or a list of what is wrong."""
+"""Any changed description becomes a model, or a list of problems."""
 
 from __future__ import annotations
 

@@ -9,15 +9,14 @@ from simulated_node import DEADLINE_S, WORLD, SimulatedNode, imu, stamp_ns
 
 from neuros.errors import ModelError
 from neuros.simulators.mujoco import MuJoCo
-from neuros.simulators.mujoco.gate import Gate
-from neuros.simulators.mujoco.pacing import Pacer
+from neuros.simulators.mujoco.free_run import Pacer, StepLock
 from neuros.simulators.mujoco.viewer import Viewer
 
 CLOCK = ("rosgraph_msgs/msg/Clock", {"sensor": "clock", "rate": 25})
 
 
 class WallClock:
-    """Time passes only while somebody waits; a stall is a jump."""
+    """Time passes only in waits; a stall is a jump."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -271,26 +270,26 @@ def test_as_fast_as_possible_never_waits():
 
 def test_visitors_go_before_the_next_bout():
     """A plain lock would let the stepping thread in again and again."""
-    gate, entered, left = Gate(), threading.Event(), threading.Event()
-    assert gate.enter(lambda: False)
+    lock, entered, left = StepLock(), threading.Event(), threading.Event()
+    assert lock.enter(lambda: False)
 
     def visit() -> None:
-        with gate.visit():
+        with lock.visit():
             entered.set()
             assert left.wait(DEADLINE_S)
 
     visitor = threading.Thread(target=visit)
     visitor.start()
     assert not entered.is_set()
-    while not gate._visitors:
+    while not lock._visitors:
         visitor.join(0.001)
-    gate.leave()
+    lock.leave()
     assert entered.wait(DEADLINE_S)
     is_over = threading.Event()
-    assert gate.enter(lambda: entered.is_set() and not left.is_set()) is False
+    assert lock.enter(lambda: entered.is_set() and not left.is_set()) is False
     left.set()
-    assert gate.enter(is_over.is_set)
-    gate.leave()
+    assert lock.enter(is_over.is_set)
+    lock.leave()
     visitor.join(DEADLINE_S)
 
 

@@ -1,4 +1,4 @@
-"""Whatever is wrong with a declaration is said before the first step, by file and key."""
+"""Problems of declarations are reported before the first step, by file and key."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from neuros.errors import ModelError
 from neuros.project.model import Node, Port
 from neuros.project.validate import schema
 from neuros.simulators.mujoco import MuJoCo
-from neuros.simulators.mujoco.declarations import SENSOR_KINDS, Problems, read_sensors
+from neuros.simulators.mujoco.declarations import Problems
+from neuros.simulators.mujoco.sensors import SENSOR_KINDS, read_sensors
 
 IMU, CLOCK = "sensor_msgs/msg/Imu", "rosgraph_msgs/msg/Clock"
 STRING, FLOAT = "std_msgs/msg/String", "std_msgs/msg/Float64"

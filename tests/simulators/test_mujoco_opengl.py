@@ -19,7 +19,7 @@ import pytest
 from neuros.doctor.findings import State
 from neuros.doctor.machine import prove_rendering
 from neuros.installation import machine
-from neuros.simulators.mujoco import opengl
+from neuros.simulators.mujoco import cameras
 
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 60.0
@@ -145,7 +145,7 @@ def test_osmesa_is_chosen_where_egl_is_not_or_cannot_draw(
 
 def test_a_choice_of_the_user_is_respected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    assert opengl.choose_opengl() == "glfw"
+    assert cameras.choose_opengl() == "glfw"
 
 
 @pytest.mark.parametrize("chosen", [{}, {"MUJOCO_GL": "egl"}])

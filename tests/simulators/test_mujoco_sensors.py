@@ -1,4 +1,4 @@
-"""What the sensors measure, checked against physics and against MuJoCo's own sensors."""
+"""Readings of the sensors, checked against physics and against MuJoCo's own sensors."""
 
 from __future__ import annotations
 

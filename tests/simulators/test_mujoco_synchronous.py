@@ -105,7 +105,7 @@ def test_steps_are_counted_from_one(count):
         simulation()[1].step_synchronous(count)
 
 
-def test_a_paused_simulation_that_nobody_can_resume_refuses_to_step():
+def test_a_paused_simulation_that_cannot_be_resumed_refuses_to_step():
     _, sim = simulation()
     sim.pause()
     with pytest.raises(ModelError, match="paused"):

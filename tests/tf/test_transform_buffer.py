@@ -1,4 +1,4 @@
-"""Where one frame is seen from another."""
+"""A buffer of transforms looks up one frame seen from another."""
 
 from __future__ import annotations
 

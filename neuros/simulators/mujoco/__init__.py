@@ -20,8 +20,8 @@ An output has a sensor behind it::
 
 ``rate`` is in firings per simulated second; its period must be a whole number of timesteps.
 An input drives actuators: ``{"actuator": NAME}`` or ``{"actuators": [NAME, ...]}``; see
-:mod:`neuros.simulators.mujoco.commands` for the message types. For a joint without an actuator it
-declares one: see :mod:`neuros.simulators.mujoco.drives`.
+:mod:`neuros.simulators.mujoco.commands` for the message types, and for drives: actuators that it
+declares for joints without any.
 """
 
 import neuros.convert  # noqa: F401 (imports MuJoCo without OpenGL where that does not work)

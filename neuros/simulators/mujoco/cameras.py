@@ -1,7 +1,15 @@
-"""Images of the model's cameras, rendered without a display."""
+"""Images of the model's cameras, rendered without a display by EGL, else by OSMesa.
+
+OpenGL is imported for the first camera: a simulation without any needs none. A user's own choice in
+``MUJOCO_GL`` is respected.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,14 +17,73 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros.simulators.mujoco.opengl import import_opengl, opengl_faults
+from neuros.errors import EnvironmentFault
+from neuros.installation.machine import install_opengl, offscreen_opengl
 
+_BACKENDS = ("egl", "osmesa", "glfw")
 _MAX_GEOMS = 20_000
+_SMALL_WORLD = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="eye" pos="0 0 3"/>
+    <geom size="1"/>
+  </worldbody>
+</mujoco>
+"""
+_NAMES = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "GLFW"}
+
+
+def choose_opengl() -> str:
+    """``"egl"``, ``"osmesa"`` or ``"glfw"``: what ``MUJOCO_GL`` names, else what there is here.
+
+    ``""`` where there is nothing; systems other than Linux have one OpenGL, which GLFW finds.
+    """
+    if not sys.platform.startswith("linux"):
+        return "glfw"
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if wanted in _BACKENDS:
+        return wanted
+    return offscreen_opengl() or ("glfw" if os.environ.get("DISPLAY") else "")
+
+
+def import_opengl() -> Any:
+    """The class of OpenGL contexts: its objects have ``make_current`` and ``free``.
+
+    Raises ``EnvironmentFault`` where there is no OpenGL to render with.
+    """
+    choice = choose_opengl()
+    with _opengl_faults():
+        # Asked for directly: mujoco.GLContext was fixed when mujoco was imported.
+        if choice == "egl":
+            from mujoco.egl import GLContext
+        elif choice == "osmesa":
+            from mujoco.osmesa import GLContext
+        elif choice == "glfw":
+            from mujoco import GLContext
+        else:
+            raise ImportError("there is neither EGL with libGL or libGLESv2, nor OSMesa")
+    return GLContext
+
+
+@contextmanager
+def _opengl_faults() -> Iterator[None]:
+    """Turn what PyOpenGL and MuJoCo raise where a library is missing into ``EnvironmentFault``."""
+    try:
+        yield
+    except Exception as error:
+        # PyOpenGL takes what it has not found for None, and fails later, anyhow.
+        text = " ".join(str(error).split())
+        chosen = os.environ.get("MUJOCO_GL")
+        choice = f", with MUJOCO_GL={chosen}" if chosen else ""
+        raise EnvironmentFault(
+            f"a camera cannot render: no usable OpenGL{choice} ({text}): {install_opengl()}"
+        ) from error
 
 
 @dataclass
 class _Resources:
-    """What OpenGL holds for one model: belongs to the thread that made it."""
+    """OpenGL's objects for one model; they belong to the thread that made them."""
 
     model: Any
     gl: Any
@@ -75,7 +142,7 @@ class Cameras:
     def _open(self) -> _Resources:
         buffer = self._model.vis.global_
         make_context = import_opengl()
-        with opengl_faults():
+        with _opengl_faults():
             gl = make_context(buffer.offwidth, buffer.offheight)
             gl.make_current()
             context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -84,3 +151,28 @@ class Cameras:
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._fine
         scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._fine
         return _Resources(self._model, gl, context, scene)
+
+
+def render_one_picture() -> int:
+    """Render a small picture, and print with which OpenGL; for a process of its own.
+
+    Returns the exit code: 4 if it cannot, and standard error says why.
+    """
+    model = mujoco.MjModel.from_xml_string(_SMALL_WORLD)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    image = np.zeros((30, 40, 3), np.uint8)
+    cameras = Cameras(model)
+    try:
+        cameras.render(data, 0, image)
+        if not image.any():
+            raise EnvironmentFault("a camera cannot render: its picture is black")
+        from OpenGL import GL  # the one that has just been chosen
+
+        print(f"{_NAMES[choose_opengl()]} ({GL.glGetString(GL.GL_RENDERER).decode()})")
+    except EnvironmentFault as fault:
+        print(fault, file=sys.stderr)
+        return 4
+    finally:
+        cameras.close()
+    return 0

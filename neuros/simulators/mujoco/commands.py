@@ -1,4 +1,4 @@
-"""From ROS messages to MuJoCo's controls.
+"""Commands: actuators that inputs drive, declared in the node file, and their ROS messages.
 
 ===============================  ===========================================================
 message type                     what it drives
@@ -14,20 +14,42 @@ message type                     what it drives
 ===============================  ===========================================================
 
 MuJoCo clamps a control to the ``ctrlrange`` of its actuator.
+
+For a joint without an actuator, as those of URDF, the node file declares one, a drive:
+``{"joint": "elbow", "drive": "position", "kp": 50, "kv": 5, "force_limit": 10}``
+
+============  =====================  ==================================================
+``drive``     gains                  what a command is
+============  =====================  ==================================================
+``position``  ``kp``, and ``kv``     where to go: radians or metres
+``velocity``  ``kv``                 how fast: per second
+``motor``     none                   force or torque: N or N m
+============  =====================  ==================================================
+
+``force_limit`` bounds what any of them applies (N or N m).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import mujoco
 
 from neuros.errors import ModelError
 from neuros.ports import Packet
-from neuros.simulators.mujoco.declarations import CommandDeclaration, Problems, did_you_mean
-from neuros.simulators.mujoco.elements import find, names_of
+from neuros.project.model import Node, Port
+from neuros.simulators.mujoco.declarations import (
+    Faults,
+    Problems,
+    did_you_mean,
+    either,
+    find,
+    is_list_of_names,
+    names_of,
+)
 
 Controls: TypeAlias = "list[tuple[int, float]]"
 """Pairs of actuator id and new control."""
@@ -39,6 +61,131 @@ _TWIST_FIELDS = {
     3: (("linear", "x"), ("linear", "y"), ("angular", "z")),
     6: tuple((part, axis) for part in ("linear", "angular") for axis in "xyz"),
 }
+_NAMING = ("actuator", "actuators", "joint", "joints")
+_GAINS: Mapping[str, tuple[str, ...]] = {
+    "position": ("kp", "kv"),
+    "velocity": ("kv",),
+    "motor": (),
+}
+_NEEDED: Mapping[str, tuple[str, ...]] = {"position": ("kp",), "velocity": ("kv",), "motor": ()}
+_DRIVE_KEYS = ("drive", "kp", "kv", "force_limit")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """An actuator for a joint; gains in N/m and N s/m, or N m/rad and N m s/rad."""
+
+    kind: str
+    kp: float = 0.0
+    kv: float = 0.0
+    force_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class CommandDeclaration:
+    """The actuators behind an input, in their order. ``pointer`` is the place of their names.
+
+    With a ``drive`` the names are those of joints, and each gets an actuator of its name.
+    """
+
+    input: str
+    type: str
+    actuators: tuple[str, ...]
+    pointer: str
+    drive: Drive | None = None
+
+
+def read_commands(node: Node, problems: Problems) -> tuple[CommandDeclaration, ...]:
+    """The commands that the inputs of ``node`` declare; faulty ones are left out and reported."""
+    found = (
+        _command(port, f"{node.pointer}/inputs/{index}/mujoco", problems)
+        for index, port in enumerate(node.inputs)
+        if port.mujoco
+    )
+    return tuple(command for command in found if command)
+
+
+def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration | None:
+    faults = Faults(pointer, problems)
+    given = [key for key in _NAMING if key in port.mujoco]
+    if len(given) != 1:
+        faults.add("", f"give either {either([repr(key) for key in _NAMING])}")
+        return None
+    (key,) = given
+    drives = key in ("joint", "joints")
+    faults.unknown_keys(port.mujoco, (*_NAMING, *(_DRIVE_KEYS if drives else ())))
+    value = port.mujoco[key]
+    is_one = key in ("actuator", "joint")
+    names = (value,) if is_one else value
+    if not is_list_of_names(names):
+        faults.add(key, f"{value!r} is not a {'name' if is_one else 'list of names'}")
+        return None
+    drive = _read_drive(port.mujoco, faults.add) if drives else None
+    _, sizes = _MESSAGE_TYPES.get(port.type, (None, ()))
+    if port.type not in _MESSAGE_TYPES:
+        text = f"input '{port.name}' is a {port.type}; a command is {either(tuple(_MESSAGE_TYPES))}"
+        faults.add(key, text)
+    elif sizes and len(names) not in sizes:
+        some = either([str(size) for size in sizes])
+        faults.add(key, f"a {port.type} drives {some} actuators, not {len(names)}")
+    if faults.found:
+        return None
+    return CommandDeclaration(port.name, port.type, tuple(names), f"{pointer}/{key}", drive)
+
+
+def _read_drive(declared: Mapping[str, Any], complain: Callable[[str, str], None]) -> Drive | None:
+    """The drive that a node file declares; ``complain`` gets keys and what is wrong with them."""
+    kind = declared.get("drive")
+    if not isinstance(kind, str) or kind not in _GAINS:
+        complain("drive", f"{kind!r} is not one of {', '.join(_GAINS)}")
+        return None
+    allowed = ("drive", "force_limit", *_GAINS[kind])
+    values = {}
+    for key in _DRIVE_KEYS[1:]:
+        if key not in declared:
+            if key in _NEEDED[kind]:
+                complain(key, f"missing: a {kind} drive needs it")
+            continue
+        value = declared[key]
+        if key not in allowed:
+            complain(key, f"a {kind} drive has no {key}")
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            complain(key, f"{value!r} is not a positive number")
+        else:
+            values[key] = float(value)
+    return Drive(kind, **values)
+
+
+def add_drives(
+    spec: Any, joints: Collection[str], commands: Iterable[CommandDeclaration], problems: Problems
+) -> None:
+    """Add the actuators that the node file declares for some of ``joints``; problems are reported.
+
+    Joints that are missing are found when the commands are bound.
+    """
+    for command in commands:
+        if command.drive is None:
+            continue
+        for name in command.actuators:
+            if name in joints and (fault := _add_drive(spec, name, command.drive)):
+                problems.add(command.pointer, fault)
+
+
+def _add_drive(spec: Any, joint: str, drive: Drive) -> str:
+    """Add an actuator called as its joint to an ``MjSpec``; returns what is wrong, or nothing."""
+    if spec.actuator(joint) is not None:
+        return f"the model has an actuator '{joint}': name that with 'actuator'"
+    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    if drive.kind == "position":
+        actuator.set_to_position(kp=drive.kp, kv=drive.kv)
+    elif drive.kind == "velocity":
+        actuator.set_to_velocity(kv=drive.kv)
+    else:
+        actuator.set_to_motor()
+    if drive.force_limit is not None:
+        actuator.forcelimited = True
+        actuator.forcerange = [-drive.force_limit, drive.force_limit]
+    return ""
 
 
 def bind_commands(
@@ -49,9 +196,9 @@ def bind_commands(
     for declaration in declarations:
         found = [_find(model, declaration, name, problems) for name in declaration.actuators]
         actuators = [element[1] for element in found if element]
-        commands[declaration.input] = _checked(
-            declaration.input, _MAKERS[declaration.type](model, actuators, declaration.input)
-        )
+        read, _ = _MESSAGE_TYPES[declaration.type]
+        command = read(model, actuators, declaration.input)
+        commands[declaration.input] = _checked(declaration.input, command)
     return commands
 
 
@@ -150,7 +297,7 @@ def _targets_by_name(model: Any, actuators: list[int]) -> Mapping[str, list[tupl
 
 
 def _field(model: Any, actuator: int) -> str:
-    """What an actuator's control is: a servo subtracts the measured quantity from it."""
+    """The field of a JointState that drives an actuator; a servo subtracts what it measures."""
     if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE.value:
         return "effort"
     _, of_position, of_velocity = model.actuator_biasprm[actuator, :3]
@@ -159,9 +306,10 @@ def _field(model: Any, actuator: int) -> str:
     return "velocity" if of_velocity < 0 else "effort"
 
 
-_MAKERS: Mapping[str, Callable[[Any, list[int], str], Command]] = {
-    "std_msgs/msg/Float64": _float,
-    "std_msgs/msg/Float64MultiArray": _floats,
-    "sensor_msgs/msg/JointState": _joint_state,
-    "geometry_msgs/msg/Twist": _twist,
+_MESSAGE_TYPES: Mapping[str, tuple[Callable[[Any, list[int], str], Command], tuple[int, ...]]] = {
+    "std_msgs/msg/Float64": (_float, (1,)),
+    "std_msgs/msg/Float64MultiArray": (_floats, ()),
+    "sensor_msgs/msg/JointState": (_joint_state, ()),
+    "geometry_msgs/msg/Twist": (_twist, (2, 3, 6)),
 }
+"""For each the reader of its packets, and how many actuators it can drive (empty: any number)."""

@@ -1,23 +1,140 @@
-"""Stepping in a thread of its own."""
+"""Thread that steps the simulation, in step with the wall clock, and its lock for visitors."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from neuros.ports import NodeContext, Packet
-from neuros.simulators.mujoco.gate import Gate
-from neuros.simulators.mujoco.pacing import Pacer
 
+_MAX_LAG_S = 0.5
 _JOIN_S = 5.0
 _LOOK_S = 0.1
+
+
+class Pacer:
+    """Holds a simulation back to ``factor`` simulated seconds per wall second.
+
+    It measures against a fixed origin, so errors of single waits do not add up: after a late wait
+    the simulation catches up. What it is behind by more than ``max_lag_s`` it gives up for good,
+    so that it does not race after a long stall. ``factor`` ``None`` never waits.
+    """
+
+    def __init__(
+        self,
+        factor: float | None,
+        clock: Callable[[], float],
+        wait: Callable[[float], object],
+        max_lag_s: float = _MAX_LAG_S,
+    ) -> None:
+        self._factor, self._clock, self._wait, self._max_lag_s = factor, clock, wait, max_lag_s
+        self._origin: float | None = None
+
+    def restart(self) -> None:
+        """Forget the past: the next call sets a new origin. For pauses and resets; any thread."""
+        self._origin = None
+
+    def start(self, sim_time_s: float) -> None:
+        """Now is when ``sim_time_s`` should be."""
+        if self._factor is not None:
+            self._origin = self._clock() - sim_time_s / self._factor
+
+    def hold(self, sim_time_s: float) -> None:
+        """Wait until ``sim_time_s`` may be."""
+        if self._factor is None:
+            return
+        origin = self._origin  # read once: another thread may call restart
+        if origin is None:
+            self.start(sim_time_s)
+            return
+        early_s = origin + sim_time_s / self._factor - self._clock()
+        if early_s > 0:
+            self._wait(early_s)
+        elif -early_s > self._max_lag_s:
+            self._origin = origin - early_s - self._max_lag_s
+
+
+class StepLock:
+    """Lock of model and data: the stepping thread takes it bout by bout; visitors go first.
+
+    It also holds the pause, in which no step begins.
+
+    A plain lock would starve visitors: the stepping thread would take it again at once.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._one_visitor = threading.RLock()
+        self._visitors = 0
+        self._is_stepping = False
+        self._is_paused = False
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether stepping is paused."""
+        return self._is_paused
+
+    @contextmanager
+    def visit(self) -> Iterator[None]:
+        """No step runs inside; nests; visitors of other threads wait."""
+        with self._one_visitor:
+            with self._changed:
+                self._visitors += 1
+                self._changed.wait_for(lambda: not self._is_stepping)
+            try:
+                yield
+            finally:
+                with self._changed:
+                    self._visitors -= 1
+                    self._changed.notify_all()
+
+    def pause(self) -> None:
+        """Let no step begin until :meth:`resume`; returns at once."""
+        self._is_paused = True
+
+    def resume(self) -> None:
+        with self._changed:
+            self._is_paused = False
+            self._changed.notify_all()
+
+    def wake(self) -> None:
+        """Let every waiting thread check its condition again."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def wait_resumed(self, seconds: float) -> None:
+        """Wait until stepping is resumed, at most ``seconds``, or until :meth:`wake`."""
+        with self._changed:
+            if self._is_paused:
+                self._changed.wait(seconds)
+
+    def enter(self, cancelled: Callable[[], bool], seconds: float | None = None) -> bool:
+        """Begin a bout of steps as soon as no visitor is in and stepping is not paused.
+
+        Returns False, without having begun, once ``cancelled()``, or after ``seconds`` of waiting.
+        """
+        with self._changed:
+            may_try = self._changed.wait_for(
+                lambda: cancelled() or not (self._is_paused or self._visitors), seconds
+            )
+            if cancelled() or not may_try:
+                return False
+            self._is_stepping = True
+            return True
+
+    def leave(self) -> None:
+        """End a bout of steps."""
+        with self._changed:
+            self._is_stepping = False
+            self._changed.notify_all()
 
 
 class FreeRun:
     """Repeats: a bout of steps, wait for the wall clock, hand over the packets that are due.
 
     Handing over waits while a reliable connection is blocked, and stepping with it; model and data
-    are free for visitors of the gate meanwhile. An error ends the node.
+    are free for visitors of the lock meanwhile. An error ends the node.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -30,7 +147,7 @@ class FreeRun:
     def __init__(
         self,
         node: NodeContext,
-        gate: Gate,
+        lock: StepLock,
         advance: Callable[[], Mapping[str, Packet]],
         sim_time: Callable[[], float],
         finish: Callable[[], None],
@@ -39,7 +156,7 @@ class FreeRun:
         clock: Callable[[], float],
         wait: Callable[[float], object] | None = None,
     ) -> None:
-        self._node, self._gate = node, gate
+        self._node, self._lock = node, lock
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
         self._look = look
         self._stopped = threading.Event()
@@ -58,7 +175,7 @@ class FreeRun:
     def stop(self) -> None:
         """End the thread; returns when it has ended. Harmless when it has, or from inside it."""
         self._stopped.set()
-        self._gate.wake()
+        self._lock.wake()
         if self._thread is not threading.current_thread():
             self._thread.join(_JOIN_S)
 
@@ -76,7 +193,7 @@ class FreeRun:
 
     def _bout(self) -> bool:
         cancelled = self._stopped.is_set
-        while not self._gate.enter(cancelled, None if self._look is None else _LOOK_S):
+        while not self._lock.enter(cancelled, None if self._look is None else _LOOK_S):
             if cancelled():
                 return False
             if self._look is not None:
@@ -84,6 +201,6 @@ class FreeRun:
         try:
             packets = self._advance()
         finally:
-            self._gate.leave()
+            self._lock.leave()
         self.pacer.hold(self._sim_time())
         return not packets or self._node.submit(packets, cancelled)

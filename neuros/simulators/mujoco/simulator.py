@@ -1,4 +1,4 @@
-"""The simulator that plugins hold: who steps the world, and when its packets leave."""
+"""Simulator object of a plugin: it steps the world, and sends the packets of its sensors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
 from neuros.simulators.mujoco.commands import Controls, control
 from neuros.simulators.mujoco.declarations import did_you_mean
-from neuros.simulators.mujoco.free_run import FreeRun
-from neuros.simulators.mujoco.gate import Gate
+from neuros.simulators.mujoco.free_run import FreeRun, StepLock
 from neuros.simulators.mujoco.viewer import open_viewer
 from neuros.simulators.mujoco.world import World
 
@@ -53,7 +52,7 @@ class MuJoCo:
     ) -> None:
         self._node, self._clock, self._wait = node, clock, wait
         self._world = World(node, model, fine=fine_rendering)
-        self._gate = Gate()
+        self._lock = StepLock()
         self._unread: dict[str, Packet] = {}
         self._run: FreeRun | None = None
         self._viewer = open_viewer(
@@ -140,7 +139,7 @@ class MuJoCo:
             steps = max(1, round(_BOUT_S * real_time_factor / self.timestep))
         self._run = FreeRun(
             self._node,
-            self._gate,
+            self._lock,
             lambda: self._bout(steps),
             lambda: self.sim_time,
             lambda: self._world.cameras.close(),
@@ -159,18 +158,18 @@ class MuJoCo:
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Inside, no step runs: the place to touch ``model`` and ``data``. Nests."""
-        with self._gate.visit():
+        with self._lock.visit():
             yield
 
     def pause(self) -> None:
         """Let no further step begin until :meth:`resume`."""
-        self._gate.close()
+        self._lock.pause()
 
     def resume(self) -> None:
         """Go on; the time spent in the pause is not caught up."""
         if self._run is not None:
             self._run.pacer.restart()
-        self._gate.open()
+        self._lock.resume()
 
     # ---- acting on it -----------------------------------------------------------------------
 
@@ -211,7 +210,7 @@ class MuJoCo:
         """Stop stepping, close windows, free OpenGL. The node calls it at its end."""
         self._is_over = True
         self.stop()
-        self._gate.wake()
+        self._lock.wake()
         self._world.cameras.close()
         if self._viewer is not None:
             self._viewer.close()
@@ -262,21 +261,21 @@ class MuJoCo:
             raise ModelError(f"{what} is for a simulation that the plugin steps: stop() it first")
 
     def _wait_while_paused(self) -> None:
-        """The user resumes in the viewer; nobody else could while the plugin waits here."""
-        if self._gate.is_closed and (self._viewer is None or not self._viewer.is_open):
+        """Wait until the user resumes in the viewer, the only way while the plugin waits here."""
+        if self._lock.is_paused and (self._viewer is None or not self._viewer.is_open):
             raise ModelError("the simulation is paused: resume() it before it is stepped")
-        while not self._is_over and self._gate.is_closed:
+        while not self._is_over and self._lock.is_paused:
             self._look_at_viewer()
-            self._gate.wait_open(_PAUSE_LOOK_S)
+            self._lock.wait_resumed(_PAUSE_LOOK_S)
 
     def _look_at_viewer(self) -> None:
-        """During a pause nothing else notices that the user has closed the window."""
+        """Notice, during a pause, that the user has closed the window."""
         with self.paused():
             if self._viewer is not None:
                 self._viewer.sync()
 
     def _toggle_pause(self) -> None:
-        if self._gate.is_closed:
+        if self._lock.is_paused:
             self.resume()
         else:
             self.pause()

@@ -51,7 +51,7 @@ class Viewer:
         self._threads = {thread for thread in threading.enumerate() if _draws(thread)} - others
 
     def sync(self) -> None:
-        """Show the data as they are, at most 60 times per wall second; not during a step."""
+        """Show the present data, at most 60 times per wall second; not during a step."""
         if self._handle is None or self._clock() < self._next:
             return
         self._next = self._clock() + _PERIOD_S
@@ -103,7 +103,7 @@ def is_wanted(node: NodeContext) -> bool:
 
 
 def find_launcher(node: NodeContext) -> Callable[..., Any] | None:
-    """What opens the window, or ``None`` after one warning where there can be none."""
+    """The function that opens the window; ``None``, after one warning, where none can open."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # glfw warns of what is reported below

@@ -1,22 +1,30 @@
-"""A compiled model, its state, and the sensors and commands that are bound to it."""
+"""Compiled model, from MJCF, URDF or SDF, its state, and the sensors and commands bound to it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
 
-from neuros.errors import ModelError
+from neuros.convert.find import Finder, NotFound, finder
+from neuros.convert.sdf import convert_sdf
+from neuros.convert.urdf import read_urdf
+from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext, Packet
-from neuros.simulators.mujoco import build
-from neuros.simulators.mujoco.cameras import Cameras
-from neuros.simulators.mujoco.commands import Command, bind_commands
-from neuros.simulators.mujoco.declarations import Problems, read_commands, read_sensors
-from neuros.simulators.mujoco.elements import has_any, names_of
-from neuros.simulators.mujoco.opengl import import_opengl
-from neuros.simulators.mujoco.sensors import Binding, Fill, bind
+from neuros.simulators.mujoco.cameras import Cameras, import_opengl
+from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
+from neuros.simulators.mujoco.declarations import Problems, has_any, names_of
+from neuros.simulators.mujoco.sensors import (
+    SENSOR_KINDS,
+    Binding,
+    Fill,
+    SensorDeclaration,
+    read_sensors,
+)
 from neuros.simulators.mujoco.timebase import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
@@ -30,6 +38,11 @@ _KEPT_BY_HAND = (
     "mocap_quat",
     "eq_active",
 )
+_DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
+    ".urdf": read_urdf,
+    ".sdf": convert_sdf,
+    ".world": convert_sdf,
+}
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,7 @@ class World:
 
     A sensor is read by ``mj_forward`` at the state of its firing time, so that what it measures
     and its stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old).
-    That leaves the physics as it is: with and without sensors it is the same, bit for bit.
+    The physics is unchanged, bit for bit, with and without sensors.
 
     A declaration that names an element called ``name/...``, which :meth:`spawn` may still bring, is
     bound when it is there; :meth:`require_bound` says that nothing more comes.
@@ -60,11 +73,11 @@ class World:
         self._sensors = read_sensors(node.description, problems)
         self._commands = read_commands(node.description, problems)
         try:
-            self._spec, self.where = build.load_spec(node, model)
-            build.prepare_rendering(self._spec, self._sensors, fine=fine)
-            joints = build.joints_of(self._spec)
-            build.add_drives(self._spec, joints, self._commands, problems)
-            self.model = build.compile_spec(self._spec, self.where)
+            self._spec, self.where = _load_spec(node, model)
+            _prepare_rendering(self._spec, self._sensors, fine=fine)
+            joints = _joints_of(self._spec)
+            add_drives(self._spec, joints, self._commands, problems)
+            self.model = _compile_spec(self._spec, self.where)
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
@@ -132,11 +145,11 @@ class World:
             raise ModelError(f"entity '{name}': a position is x, y, z in metres, not {position!r}")
         if not name or _is_taken(name, names_of(self.model, "body")):
             raise ModelError(f"an entity needs a name of its own: '{name}' is taken")
-        child, where = build.load_spec(self._node, path)
+        child, where = _load_spec(self._node, path)
         # First on a copy: a spec cannot go back once something that does not fit is attached.
         trial, problems = self._spec.copy(), Problems(self._node.description.file)
         self._attach(trial, child.copy(), position, name, problems)
-        self._bind(build.compile_spec(trial, where), problems)
+        self._bind(_compile_spec(trial, where), problems)
         problems.raise_any()
         self._attach(self._spec, child, position, name, problems)
         before = self.data
@@ -162,10 +175,11 @@ class World:
     def _attach(
         self, spec: Any, child: Any, position: Sequence[float], name: str, problems: Problems
     ) -> None:
-        """Attach an entity, and add the actuators that the node file declares for its joints."""
-        before = build.joints_of(spec)
-        build.attach(spec, child, position, name)
-        build.add_drives(spec, build.joints_of(spec) - before, self._commands, problems)
+        """Attach an entity as ``name/...``, and add the actuators declared for its joints."""
+        before = _joints_of(spec)
+        frame = spec.worldbody.add_frame(pos=[float(value) for value in position])
+        spec.attach(child, prefix=f"{name}/", frame=frame)
+        add_drives(spec, _joints_of(spec) - before, self._commands, problems)
 
     def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
         bodies = names_of(model, "body")
@@ -179,7 +193,9 @@ class World:
         commands = [command for command in self._commands if can_be_bound(command.actuators)]
         fills = {}
         for sensor in sensors:
-            if fill := bind(Binding(sensor, model, self.cameras, problems)):
+            if fill := SENSOR_KINDS[sensor.kind].bind(
+                Binding(sensor, model, self.cameras, problems)
+            ):
                 fills[sensor.output] = fill
         is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
         return _Bound(fills, bind_commands(model, commands, problems), is_complete)
@@ -210,3 +226,105 @@ def _may_come(element: str, bodies: Sequence[str]) -> bool:
 
 def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
     return any(body.startswith(f"{entity}/") for body in bodies)
+
+
+def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
+    """An ``MjSpec`` of our own, and what to call it in messages.
+
+    ``model`` is the path of an MJCF, URDF or SDF file, MJCF as text, or an ``MjSpec``, which is
+    copied. What of a URDF or SDF file has no counterpart in MuJoCo is logged as a warning.
+    """
+    if isinstance(model, mujoco.MjSpec):
+        return model.copy(), f"MjSpec '{model.modelname}'"
+    if isinstance(model, str) and model.lstrip().startswith("<"):
+        where = f"XML text in {node.description.plugin}"
+        return _parsed(lambda: mujoco.MjSpec.from_string(model), where), where
+    if isinstance(model, str | Path):
+        path = _resolve(node, str(model))
+        return _from_file(node, path), str(path)
+    raise ModelError(
+        f"a model is the path of a file, MJCF as text, or a mujoco.MjSpec, "
+        f"not a {type(model).__name__}"
+    )
+
+
+def timestep_of(model: Path | str) -> float:
+    """The timestep of a model in MJCF, a file or its text, in seconds.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    spec = mujoco.MjSpec.from_file if isinstance(model, Path) else mujoco.MjSpec.from_string
+    return float(spec(str(model)).option.timestep)
+
+
+def _resolve(node: NodeContext, model: str) -> Path:
+    """The file, also if it lies in a folder that Gazebo's variables name."""
+    try:
+        return node.resolve_path(model)
+    except ModelError:
+        if Path(model).suffix.lower() not in _DESCRIPTIONS:
+            raise
+        try:
+            return _finder(node).find(model, node.description.plugin.parent)
+        except NotFound:
+            pass
+        raise
+
+
+def _finder(node: NodeContext) -> Finder:
+    return finder((), {**os.environ, **node.description.environment})
+
+
+def _from_file(node: NodeContext, path: Path) -> Any:
+    kind = path.suffix.lower()
+    if kind == ".xml":
+        return _parsed(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
+    if kind == ".mjcf":  # MuJoCo goes by the name: it knows .xml only
+        spec = _parsed(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
+        spec.modelfiledir = str(path.parent)
+        return spec
+    if kind not in _DESCRIPTIONS:
+        known = ", ".join((".xml", ".mjcf", *_DESCRIPTIONS))
+        raise ModelError(f"{path}: a model is a file in MJCF, URDF or SDF ({known})")
+    try:
+        described = _DESCRIPTIONS[kind](path, _finder(node))
+    except DescriptionError as error:
+        raise ModelError(str(error)) from error
+    if described.not_taken:
+        count = sum(note.count for note in described.not_taken)
+        rows = "".join(f"\n  {note}" for note in described.not_taken)
+        things = "1 thing is" if count == 1 else f"{count} things are"
+        node.get_logger().warning(
+            f"{path.name}: {things} not taken over, or not as in the file:{rows}"
+        )
+    return described.spec
+
+
+def _joints_of(spec: Any) -> set[str]:
+    """The names of all joints."""
+    return {joint.name for joint in spec.joints}
+
+
+def _compile_spec(spec: Any, where: str) -> Any:
+    """The ``MjModel``; raises ``ModelError`` that starts with ``where``."""
+    return _parsed(spec.compile, where)
+
+
+def _prepare_rendering(spec: Any, sensors: Iterable[SensorDeclaration], *, fine: bool) -> None:
+    """Make the off-screen buffer large enough for every camera, and cheap unless ``fine``."""
+    cameras = [sensor for sensor in sensors if sensor.kind == "camera"]
+    buffer = spec.visual.global_
+    for camera in cameras:
+        buffer.offwidth = max(buffer.offwidth, camera.width)
+        buffer.offheight = max(buffer.offheight, camera.height)
+    if cameras and not fine:
+        spec.visual.quality.offsamples = 0
+
+
+def _parsed(parse: Any, where: str) -> Any:
+    try:
+        return parse()
+    except (ValueError, RuntimeError, TypeError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        raise ModelError(f"{where}: the model does not compile: {text}") from error

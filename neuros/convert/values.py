@@ -1,4 +1,4 @@
-"""Places and orientations: what SDF writes as x, y, z, roll, pitch, yaw."""
+"""Values in XML: numbers, vectors, truth values and poses (x, y, z, roll, pitch, yaw)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,81 @@ import numpy as np
 import numpy.typing as npt
 
 from neuros.convert.elements import Element
-from neuros.convert.numbers import numbers
 from neuros.convert.report import Report
 
 Vector = npt.NDArray[np.float64]
 
 
-def _no_turn() -> Vector:
-    return np.eye(3)
+def numbers(
+    element: Element, count: int, report: Report, default: Sequence[float]
+) -> tuple[float, ...]:
+    """``count`` finite numbers; after a problem ``default``."""
+    values: list[float] = []
+    for word in element.text.split():
+        try:
+            values.append(float(word))
+        except ValueError:
+            report.problem(element, f"'{word}' is not a number")
+            return tuple(default)
+    if len(values) != count:
+        what = "a number" if count == 1 else f"{count} numbers"
+        report.problem(element, f"{what} must stand here, not {len(values)}")
+        return tuple(default)
+    if any(math.isnan(value) for value in values):
+        report.problem(element, "every number must be one, not nan")
+        return tuple(default)
+    return tuple(values)
+
+
+def vector(
+    owner: Element, tag: str, report: Report, default: tuple[float, ...]
+) -> tuple[float, ...]:
+    """The numbers in the child ``tag``, as many as ``default`` has, which holds without it."""
+    element = owner.child(tag)
+    if element is None or not element.text:
+        return default
+    values = numbers(element, len(default), report, default)
+    if all(map(math.isfinite, values)):
+        return values
+    report.problem(element, "every number must be finite")
+    return default
+
+
+def number(
+    owner: Element, tag: str, report: Report, default: float, *, positive: bool = False
+) -> float:
+    """The number in the child ``tag``; it may be infinite, unless it must be ``positive``."""
+    element = owner.child(tag)
+    if element is None or not element.text:
+        return default
+    (value,) = numbers(element, 1, report, (default,))
+    if positive and not 0 < value < math.inf:
+        report.problem(element, f"must be a positive number, not {value:g}")
+        return default
+    return value
+
+
+def is_true(owner: Element, tag: str, report: Report, *, default: bool) -> bool:
+    """The truth value in the child ``tag``."""
+    element = owner.child(tag)
+    if element is None:
+        return default
+    word = element.text.lower()
+    if word not in ("true", "1", "false", "0"):
+        report.problem(element, f"'{element.text}' is neither true nor false")
+        return default
+    return word in ("true", "1")
+
+
+def text_of(owner: Element, tag: str) -> str:
+    """The text of the child ``tag``; empty without it."""
+    element = owner.child(tag)
+    return "" if element is None else element.text
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where something is, and how it is turned, seen from something else.
+    """Position and rotation of one frame, seen from another.
 
     Attributes:
         position: of its origin, shape (3,), metres.
@@ -31,14 +93,14 @@ class Pose:
     """
 
     position: Vector = field(default_factory=lambda: np.zeros(3))
-    rotation: Vector = field(default_factory=_no_turn)
+    rotation: Vector = field(default_factory=lambda: np.eye(3))
 
     def __matmul__(self, other: Pose) -> Pose:
-        """``other``, which is seen from here, seen from where this one is seen from."""
+        """Chain two poses: ``other`` is seen from this one's frame."""
         return Pose(self.rotation @ other.position + self.position, self.rotation @ other.rotation)
 
     def inverse(self) -> Pose:
-        """What this one is seen from, seen from here."""
+        """The pose in the opposite direction: of the other frame, seen from this one."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
     @property
@@ -74,7 +136,7 @@ def turning_z_to(direction: Vector) -> Vector:
 
 
 def read_pose(owner: Element, report: Report) -> Pose:
-    """The pose that ``owner`` writes in its ``<pose>``, whatever that is relative to."""
+    """The pose in the ``<pose>`` of ``owner``, relative to what that names."""
     element = owner.child("pose")
     if element is None or not element.text:
         return Pose()
