@@ -18,9 +18,8 @@ from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap
 from neuros.project.model import NodeFile
-from neuros.runtime.callbacks import callback_error
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
-from neuros.runtime.failures import as_node_error
+from neuros.runtime.failures import as_node_error, callback_error
 from neuros.runtime.node import NodeRuntime
 from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
