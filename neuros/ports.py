@@ -101,7 +101,7 @@ class Way(str, Enum):
     RECEIVED = "received"  # on a connection whose sender is not part of this run
 
 
-class Tap(Protocol):
+class PacketRecorder(Protocol):
     """Where a node puts the packets that are recorded."""
 
     def stream(self, way: Way, name: str) -> int | None:

@@ -60,7 +60,7 @@ class ReplayedNode:
             Stage(),
             tell=lambda *_, **__: None,
             fail=self._fail,
-            tap=self.comparison,
+            recorder=self.comparison,
             log_file=None,
             duration_sim_s=None,
             make_engine=partial(ReplayedEngine, self._script),

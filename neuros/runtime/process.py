@@ -16,7 +16,7 @@ from neuros.core.engine import Engine
 from neuros.core.journal import JournalledEngine
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
-from neuros.ports import Middleware, Tap
+from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.failures import as_node_error, callback_error
@@ -35,7 +35,7 @@ class NodeProcess:
     Args:
         files: the nodes that live here.
         make_middleware: joins them to the world; it may take its time to import ROS.
-        open_tap: where a node puts what is recorded; ``None``: nothing is.
+        open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
@@ -46,13 +46,13 @@ class NodeProcess:
         files: Sequence[NodeFile],
         make_middleware: MiddlewareFactory,
         *,
-        open_tap: Callable[[NodeFile], Tap] | None = None,
+        open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
         own_logs: bool = False,
     ) -> None:
         self._files = files
         self._make_middleware = make_middleware
-        self._open_tap = open_tap
+        self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._own_logs = own_logs
         self._stage = Stage()
@@ -222,8 +222,8 @@ class NodeProcess:
                 self._stage,
                 tell=self._tell,
                 fail=self._fail,
-                tap=None if self._open_tap is None else self._open_tap(file),
-                make_engine=Engine if self._open_tap is None else JournalledEngine,
+                recorder=None if self._open_recorder is None else self._open_recorder(file),
+                make_engine=Engine if self._open_recorder is None else JournalledEngine,
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
                 on_initialised=_keep_for_good,
