@@ -22,7 +22,7 @@ class NodeEffects:
     """The :class:`~neuros.core.effects.Effects` of one running node.
 
     Args:
-        enter: puts the surroundings of the node in place.
+        enter: puts the context of the node in place.
         recorder: where packets go that are recorded, ``None``: none are.
         sampler: looks at packets for onlookers.
         on_first_hook: called before the first hook.
@@ -64,7 +64,7 @@ class NodeEffects:
         self.has_run = False
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
-        """Run a hook in the surroundings of its node."""
+        """Run a hook in the context of its node."""
         self._enter()
         if not self.has_run:
             self.has_run = True

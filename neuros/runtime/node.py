@@ -15,13 +15,13 @@ from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, PacketRecorder, Way
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.runtime.context import ContextSwitch
 from neuros.runtime.effects import NodeEffects, NodeRecorder
 from neuros.runtime.failures import Failures
 from neuros.runtime.handle import NodeHandle, PluginServices
 from neuros.runtime.plugin import load_plugin
 from neuros.runtime.reports import NodeReports
 from neuros.runtime.sampling import Sampler
-from neuros.runtime.scope import Stage
 from neuros.runtime.simulated_time import SimulatedTime
 
 
@@ -52,7 +52,7 @@ class NodeRuntime:
         self,
         file: NodeFile,
         middleware: Middleware,
-        stage: Stage,
+        contexts: ContextSwitch,
         *,
         tell: Callable[..., object],
         fail: Callable[[str, NeurosError], None],
@@ -71,10 +71,12 @@ class NodeRuntime:
         self._clock = clock
         self._make_engine = make_engine
         self._tell = tell
-        self._stage = stage
+        self._contexts = contexts
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
-        self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
-        self._enter = partial(stage.enter, self._scope)
+        self._context = contexts.make_context(
+            environment, file.node.plugin, file.folders.project, log_file
+        )
+        self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
         ros_node = middleware.ros_node(file)
@@ -118,9 +120,9 @@ class NodeRuntime:
         return self.file.folders.run / self.name
 
     @property
-    def is_on_stage(self) -> bool:
-        """Whether the process has the surroundings of this node now."""
-        return self._stage.has(self._scope)
+    def has_context(self) -> bool:
+        """Whether the context of this node is in place now."""
+        return self._contexts.has(self._context)
 
     @property
     def sim_time(self) -> float | None:

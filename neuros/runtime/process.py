@@ -18,10 +18,10 @@ from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
+from neuros.runtime.context import ContextSwitch
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.failures import as_node_error, callback_error
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
 from neuros.stacks import StackFile
 
@@ -55,7 +55,7 @@ class NodeProcess:
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._own_logs = own_logs
-        self._stage = Stage()
+        self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
         self._middleware: Middleware | None = None
         self._early_events: list[Event] = []
@@ -135,7 +135,7 @@ class NodeProcess:
     def look(self, wanted: Mapping[str, Any], asker: int) -> None:
         """Show an onlooker what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
         for node in tuple(self._nodes):
-            self._tell("glimpse", **node.reports.look(wanted.get(node.name, {}), asker))
+            self._tell("node_status", **node.reports.look(wanted.get(node.name, {}), asker))
 
     def probe(self, number: int) -> None:
         """Report the state of all nodes at one moment. Loop thread only."""
@@ -153,7 +153,7 @@ class NodeProcess:
         if self._stack_file is not None:
             self._stack_file.renew()
         for node in tuple(self._nodes):
-            node.reports.write_books()
+            node.reports.write_packet_log()
             self._tell("report", **node.reports.state(), is_final=is_final)
 
     def explain(self) -> None:
@@ -219,7 +219,7 @@ class NodeProcess:
             NodeRuntime(
                 file,
                 self._middleware,
-                self._stage,
+                self._contexts,
                 tell=self._tell,
                 fail=self._fail,
                 recorder=None if self._open_recorder is None else self._open_recorder(file),
@@ -268,7 +268,7 @@ class NodeProcess:
             return
         names = set(_filenames(error))
         suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
-        node = next((node for node in suspects if node.is_on_stage), (suspects or self._nodes)[0])
+        node = next((node for node in suspects if node.has_context), (suspects or self._nodes)[0])
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)

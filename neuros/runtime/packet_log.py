@@ -1,4 +1,4 @@
-"""When every packet was sent and taken, and its digest: written beside the node's log.
+"""The packet log of a node: when each packet was sent and taken, and its digest.
 
 ``<node>/packets/<index of the connection>.<what>`` are files of 8-byte numbers, in the byte order
 of the machine, one per packet:
@@ -41,8 +41,8 @@ MOST_ENTRIES = 8_000_000
 """Of a file, 64 MB; what comes later is counted and not listed."""
 
 
-class PacketBooks:
-    """Writes the books of one node.
+class PacketLog:
+    """Writes the packet log of one node.
 
     Args:
         folder: the node's own.
