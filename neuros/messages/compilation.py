@@ -14,7 +14,7 @@ from pathlib import Path
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import system_install
 from neuros.messages.generation import generated
-from neuros.messages.installed import Ros
+from neuros.messages.package import Ros
 
 _ABI = Path(__file__).with_name("stable_abi.h")
 _C = ("-std=gnu11", "-O2", "-fPIC", "-DNDEBUG", "-w")

@@ -13,8 +13,7 @@ from pathlib import Path
 from neuros.caching import KEY_LENGTH
 from neuros.errors import Problem
 from neuros.messages.cache import Built, message_cache
-from neuros.messages.installed import Ros
-from neuros.messages.package import MANIFEST, Package, find_packages, problem_at
+from neuros.messages.package import MANIFEST, Package, Ros, find_packages, problem_at
 
 _FORMAT = b"1"  # of what is built; another one builds everything anew
 _ABI = Path(__file__).with_name("stable_abi.h")
