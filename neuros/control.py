@@ -94,7 +94,7 @@ class Lines:
         return True
 
     def receive(self) -> list[Mapping[str, Any]] | None:
-        """What has arrived, after one read; ``None`` once the other end is gone."""
+        """Messages that have arrived, after one read; ``None`` once the other end is gone."""
         try:
             return self.receive_now()
         except BlockingIOError:

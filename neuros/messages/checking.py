@@ -41,7 +41,7 @@ _A_TYPE = (
 _A_PACKAGE = "a letter, then letters, digits and single '_', all lower case, as 'rover_msgs'"
 _A_FIELD = "a letter, then letters, digits and single '_', all lower case, as 'joint_positions'"
 _A_CONSTANT = "upper case letters, digits and single '_', as 'MAX_SPEED'"
-# Names of fields become names in C, as they are.
+# Names of fields become names in C.
 _C = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|"
     "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
@@ -122,14 +122,14 @@ class Use:
 
 @dataclass
 class Definition:
-    """What was found in an interface file."""
+    """The content and mistakes of an interface file."""
 
     uses: list[Use] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
 
 
 def package_name_mistake(name: str) -> str:
-    """What is wrong with the name of a package, empty if nothing is."""
+    """The mistake in the name of a package, empty if there is none."""
     if not is_valid_package_name(name):
         return f"found the name '{name}', expected {_A_PACKAGE}"
     if keyword.iskeyword(name):
@@ -217,7 +217,7 @@ def _parsed(package: str, code: str) -> Field | Constant:
     except InvalidValue as error:
         rule = str(error).rpartition(": ")[2].removeprefix("must be ")
         raise _Wrong(f"the value '{value.strip()}' of a {type_text}", rule, column) from None
-    except Exception:  # whatever rosidl's parser runs into
+    except Exception:  # rosidl's parser raises many
         what = "a constant of a primitive type" if is_constant else "no value behind the name"
         raise _Wrong(f"'{code}'", what, column) from None
 

@@ -78,7 +78,7 @@ class Messages:
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
-        """What nodes need: all packages of the project, and the shared ones that ports name."""
+        """The packages that nodes need: all of the project, and the shared ones that ports name."""
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         used = {port.type.partition("/")[0] for port in ports}
         # Shared ones are not looked for where everything comes with ROS, as it mostly does.
@@ -87,12 +87,12 @@ class Messages:
 
     @property
     def built(self) -> list[Built]:
-        """Where each package is, or will be."""
+        """Each package, built or not."""
         return [step.built for step in self._steps]
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """What has to be on Python's path."""
+        """The folders for Python's path."""
         return tuple(built.python for built in self.built)
 
     @property
@@ -101,7 +101,7 @@ class Messages:
         return all(built.is_there for built in self.built)
 
     def problems(self) -> list[Problem]:
-        """What is wrong in the files of packages; what is built had nothing wrong with it."""
+        """Mistakes in the files of packages; a built package had none."""
         missing = [step.package for step in self._steps if not step.built.is_there]
         if not missing:
             return self._problems
@@ -182,9 +182,9 @@ def _build_locked(
 def _build(
     step: Step, ros: Ros, compilers: Compilers, progress: Progress, environment: Mapping[str, str]
 ) -> None:
-    """The same, under the lock."""
+    """Build one package; its lock is held."""
     package, built = step.package, step.built
-    if built.is_there:  # somebody else was faster
+    if built.is_there:  # by another program, meanwhile
         return
     progress.step(f"building {package.name}: {package.summary} ({package.folder})")
     draft, source = built.draft, built.draft / "source"

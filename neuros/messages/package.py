@@ -175,6 +175,6 @@ class Ros:
         return {folder.parent.name for folder in (self.prefix / "share").glob("*/msg")}
 
     def manifest(self, package: str) -> bytes:
-        """What tells one version of a package from another; empty if it is not installed."""
+        """The manifest, which tells versions of a package apart; empty if it is not installed."""
         file = self.share(package) / MANIFEST
         return file.read_bytes() if file.is_file() else b""

@@ -113,7 +113,7 @@ class ContextSwitch:
             modules.pop(name, None)
         self._current = context
         self._set_variables(current, context)
-        # Within os.environ itself, so that whoever holds a reference to it sees these, too.
+        # Within os.environ itself, so that other references to it show these, too.
         os.environ._data = context.environ  # type: ignore[attr-defined]
         current.path, sys.path = sys.path, context.path
         if context.modules:

@@ -1,4 +1,4 @@
-"""What the engine of a node does to the world: hooks run, packets leave."""
+"""Effects of the engine of a node: it runs hooks, sends packets and records them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class NodeEffects:
         """Run the function of a hook.
 
         Raises:
-            HookError: if it fails, whatever it raises.
+            HookError: if it raises any exception.
         """
         try:
             return spec.function(self._handle, *arguments)
@@ -123,7 +123,7 @@ class NodeEffects:
         self._loop.post_loop_back(partial(self._guard, event))
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
-        """What the node gets on a connection to itself: it shares nothing with this packet."""
+        """A copy for a connection of the node to itself; it shares nothing with this packet."""
         if self._sampler.requests:
             self._sampler.note(connection.source_output, packet)
         if self._recorder is not None:

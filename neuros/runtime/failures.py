@@ -42,7 +42,7 @@ class Failures:
         self.report(error if isinstance(error, NeurosError) else callback_error(error, callback))
 
     def guard(self, event: Callable[[], None]) -> None:
-        """Handle an event; what NeuROS says of it ends the project."""
+        """Handle an event; a ``NeurosError`` ends the project."""
         try:
             event()
         except NeurosError as error:
@@ -67,7 +67,7 @@ def as_node_error(error: BaseException, what: str = "") -> NodeError:
 
 
 def callback_error(error: BaseException, callback: Any = None) -> NodeError:
-    """What has failed; where the callback is not at hand, it is looked for in the traceback."""
+    """The error of a callback; without ``callback``, it is looked for in the traceback."""
     wrapped: NodeError
     code = _code_of(callback) or _outermost_code(error)
     if code is None:

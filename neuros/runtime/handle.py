@@ -29,9 +29,11 @@ class PluginServices:
         ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
 
     Attributes:
+        closers: called once when the node ends, last added first.
         engine: the node's, ``None`` until its plugin is loaded.
         is_ending: whether no further hook starts.
         make_packet: a new message with default values, for a type in ROS notation.
+        time: that of the node, if it has one.
         waiting_threads: those that wait until packets that they have offered are sent.
     """
 
@@ -48,10 +50,10 @@ class PluginServices:
         self.waiting_threads: set[threading.Thread] = set()
         self.make_packet = transport.make_packet
         self._loop = loop
-        self._time = time
+        self.time = time
         self._failures = failures
         self._ask_for_end = ask_for_end
-        self._closers: list[Callable[[], None]] = []
+        self.closers: list[Callable[[], None]] = []
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -65,24 +67,12 @@ class PluginServices:
             self.engine.stop_hooks()
         self._ask_for_end(reason=reason, drain_s=drain_s)
 
-    def expect_end(self, sim_s: float) -> None:
-        """It will end at this simulated time."""
-        self._time.expected_end_s = sim_s
-
-    def own_simulated_time(self, read_s: Callable[[], float]) -> None:
-        """Take simulated time from a simulator, rather than from a clock that it publishes."""
-        self._time.own(read_s)
-
-    def on_close(self, callback: Callable[[], None]) -> None:
-        """Call back when the node ends."""
-        self._closers.append(callback)
-
     def close(self) -> None:
         """Give up what the plugin holds, last opened first."""
-        for close in reversed(self._closers):
+        for close in reversed(self.closers):
             try:
                 close()
-            except BaseException as error:  # the others must be closed all the same
+            except BaseException as error:  # the others must still be closed
                 self._failures.report(as_node_error(error, "failed while it was closed: "))
 
     def fail_from_thread(self, error: BaseException) -> None:
@@ -104,8 +94,8 @@ class PluginServices:
             assert self.engine is not None
             self.waiting_threads.add(thread)
             withdrawals.append(self.engine.offer(packets, accept))
-            if self._time.is_watched:
-                self._time.look()
+            if self.time.is_watched:
+                self.time.look()
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:
@@ -205,7 +195,7 @@ class NodeHandle:
         self._user_data = data
 
     def get_user_data(self) -> Any:
-        """What was kept last, ``None`` before."""
+        """The data of the last :meth:`set_user_data`, ``None`` before."""
         return self._user_data
 
     def set_result(self, name: str, value: Any) -> None:
@@ -263,7 +253,7 @@ class NodeHandle:
 
         It is for those who watch the run; the end itself is :meth:`shutdown`.
         """
-        self._services.expect_end(float(sim_s))
+        self._services.time.expected_end_s = float(sim_s)
 
     def _only_type(self) -> str:
         types = {*self._types.values()}
@@ -283,11 +273,11 @@ class NodeHandle:
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
-        self._services.own_simulated_time(read_s)
+        self._services.time.own(read_s)
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
-        self._services.on_close(callback)
+        self._services.closers.append(callback)
 
     def fail(self, error: BaseException) -> None:
         """End the node as failed, from any thread: for errors that no hook can raise."""
@@ -328,7 +318,7 @@ class Results:
         text = json.dumps(values, indent=2, default=_plain, allow_nan=False)
         new = self._file.with_suffix(".new")
         new.write_text(text + "\n", "utf-8")
-        os.replace(new, self._file)  # whoever reads it never finds half of it
+        os.replace(new, self._file)  # a reader never finds half of it
         self._values = values
 
 

@@ -131,7 +131,7 @@ class NodeRuntime:
 
     @property
     def waiting_threads(self) -> set[threading.Thread]:
-        """Those that wait until packets that they have offered are sent."""
+        """Threads that wait until the packets that they have offered are sent."""
         return self._services.waiting_threads
 
     # ------------------------------------------------------------------ life
@@ -207,7 +207,7 @@ class NodeRuntime:
             self._recorder.keep(Way.RECEIVED, str(connection), packet)
         engine = self.engine
         assert engine is not None
-        # What a hook sends on of a packet (its stamp, say) is shared while anybody holds that.
+        # What a hook sends on of a packet (its stamp, say) is shared while that is held.
         arrived = [packet]
         del packet
         try:

@@ -82,7 +82,7 @@ class PacketLog:
         for connection, outlet in self._engine.outlets.items():
             yield f"{connection.index}.sent_ns", outlet.sent_ns
         for key, inlet in self._engine.inlets.items():
-            # Nobody knows when a packet of an external topic was sent: only room is made.
+            # The sending time of a packet of an external topic is unknown: only room is made.
             name = f"{key.index}." if isinstance(key, Connection) else ""
             yield name and f"{name}taken", inlet.taken
             yield name and f"{name}taken_ns", inlet.taken_ns

@@ -1,4 +1,4 @@
-"""Loading a plugin: a Python file with marked functions; and its exceptions in words.
+"""Loads a plugin, a Python file with marked functions, and words its exceptions for the user.
 
 Names of NEST 2 are explained where an error follows from them. Source: NEST's own "Reference guide:
 NEST 2.x vs NEST 3.0", and what 3.10 has removed.
@@ -197,7 +197,7 @@ _TODAY: Mapping[str, str] = {
 
 
 def nest2_hint(error: BaseException, text: str) -> str:
-    """What helps where the text of an error names something of NEST 2; ``""`` where it does not."""
+    """A hint for an error whose text names something of NEST 2; ``""`` for another."""
     if names := [name for name in _names(error, text) if name in _TODAY]:
         return "; ".join(f"{name} is of NEST 2: {_TODAY[name]}" for name in dict.fromkeys(names))
     takes_collections = isinstance(error, AttributeError) and error.name in ("get", "set")

@@ -275,7 +275,7 @@ class NodeProcess:
 
 
 def declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
-    """What the supervisor has to know of the hooks of a node."""
+    """The hooks of a node, as the supervisor needs them."""
     return {
         "hooks": [
             {

@@ -83,7 +83,7 @@ class NodeReports:
         }
 
     def _stack(self, ledger: Mapping[str, Any] | None) -> Stack | None:
-        """Where the plugin stands, if its hook runs for long, or the node is to end."""
+        """The stack of the plugin, if its hook runs for long, or the node is to end."""
         engine = self._engine
         if engine is None or ledger is None or threading.current_thread() is _MAIN:
             return None

@@ -2,8 +2,8 @@
 
 Each onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
-So a node that nobody asks pays for one look at an empty table per packet, and one that is asked for
-so many packets per question at most, however fast it sends.
+Without a question a node looks at an empty table for each packet; with one, at so many packets per
+question at most, however fast it sends.
 
 Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small,
 and made without any library: every k-th pixel of every k-th row.
@@ -24,7 +24,7 @@ MOST_VALUES = 20
 
 
 class _Request:
-    """What is still wanted of the packets of one port, and what was found."""
+    """A request for packets of one port, and its answer so far."""
 
     def __init__(self, wanted: Mapping[str, Any]) -> None:
         self._names: list[str] = list(wanted.get("fields", ()))
@@ -55,11 +55,11 @@ class _Request:
             if self._wants_image:
                 self._wants_image = False
                 self._image = preview(packet)
-        except Exception as error:  # whatever a plugin has put in there
+        except Exception as error:  # a plugin may have put anything in there
             self._fault = f"{type(error).__name__}: {error}"
 
     def answer(self) -> dict[str, Any]:
-        """What was found, ready for JSON; empty if no packet has passed."""
+        """The answer, ready for JSON; empty if no packet has passed."""
         found: dict[str, Any] = {}
         if self._values:
             found |= {"fields": self._names, "values": self._values}
@@ -77,7 +77,7 @@ class Sampler:
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
-            each onlooker; empty as long as nobody looks.
+            each onlooker; empty without requests.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Simulated time of a node: where it comes from, how it goes on, and when it is over."""
+"""Simulated time of a node: its source, its points in wall time, and the end of its duration."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SimulatedTime:
 
     @property
     def now_s(self) -> float | None:
-        """Simulated seconds, ``None`` where nobody tells them."""
+        """Simulated seconds, ``None`` where they are unknown."""
         return None if self._read_s is None else self._read_s()
 
     def own(self, read_s: Callable[[], float]) -> None:
@@ -81,9 +81,9 @@ class SimulatedTime:
 
 
 class Timeline:
-    """Collects points until somebody takes them. Any thread.
+    """Collects points of simulated and wall time until they are taken. Any thread.
 
-    Two threads that note the same second at the same moment may leave it there twice.
+    Two threads that note one second at one moment may leave it there twice.
     """
 
     def __init__(self) -> None:
