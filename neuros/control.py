@@ -16,7 +16,7 @@ shutdown    when a plugin calls ``node.shutdown``                     node, reas
 failed      when a node fails                                         node, text, hook, where
 explanation in answer to ``explain``                                  node, lines
 heard       from a node of another launcher; null: it is gone         node, text
-glimpse     in answer to ``look``                                     node, asker, ...
+node_status in answer to ``look``                                     node, asker, ...
 =========== ========================================================= =====================
 
 ======= ================================================ =================
@@ -49,14 +49,14 @@ end     end the run, drained, with exit code 0           reason
 signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 
-======= ================================================ =================
-kind    sent to onlookers                                fields
-======= ================================================ =================
-glimpse what a node does, for the one that asked         node, ...
-phase   where the run is in its life                     phase, is_paused
-log     what the launcher itself tells the user          severity, text
-ended   all nodes have ended; their last reports         exit_code, reason, ...
-======= ================================================ =================
+=========== ================================================ =================
+kind        sent to onlookers                                fields
+=========== ================================================ =================
+node_status what a node does, for the one that asked         node, ...
+phase       where the run is in its life                     phase, is_paused
+log         what the launcher itself tells the user          severity, text
+ended       all nodes have ended; their last reports         exit_code, reason, ...
+=========== ================================================ =================
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Lines:
         return True
 
     def receive(self) -> list[Mapping[str, Any]] | None:
-        """What has arrived, after one read; ``None`` once the other end is gone."""
+        """Messages that have arrived, after one read; ``None`` once the other end is gone."""
         try:
             return self.receive_now()
         except BlockingIOError:

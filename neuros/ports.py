@@ -1,8 +1,8 @@
 """All seams of NeuROS on one page.
 
-The engine (:mod:`neuros.core`) knows nothing of ROS, processes or physics. Whatever touches the
-world stands behind one of these protocols: an adapter implements it (floor 4), the runtime and the
-supervisor use it (floor 5), the command line picks it (floor 6).
+The engine (:mod:`neuros.core`) knows nothing of ROS, processes or physics. The rest of
+the world stands behind these protocols: an adapter implements one (layer 4), the runtime and the
+supervisor use it (layer 5), the command line picks it (layer 6).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Packet: TypeAlias = Any
 
 
 class Logger(Protocol):
-    """Where a node writes to: rclpy's logger, or one that looks the same."""
+    """The log of a node: rclpy's logger, or one with these methods."""
 
     def debug(self, message: str) -> object: ...
     def info(self, message: str) -> object: ...
@@ -29,7 +29,7 @@ class Logger(Protocol):
 
 
 class Inbox(Protocol):
-    """What a transport tells a node. Called in the node's own thread, between hooks."""
+    """A node, as its transport calls it: in the node's own thread, between hooks."""
 
     def on_packet(self, connection: Connection, packet: Packet) -> None:
         """A packet has arrived on a connection to this node."""
@@ -60,7 +60,7 @@ class Transport(Protocol):
     def send(self, connections: Sequence[Connection], packet: Packet) -> bytes | None:
         """Send one packet on all these connections of one output.
 
-        Returns the serialised packet if that had to be made, so that nobody makes it again.
+        Returns the serialised packet if that had to be made, so that it is made once.
         """
 
     def send_external(self, port: Port, packet: Packet) -> None:
@@ -73,7 +73,7 @@ class Transport(Protocol):
     def digests(self) -> Mapping[Connection, array[int]]:
         """By connection, a digest of every packet sent or received on it, in that order.
 
-        Whoever reads them takes them away. Connections of which none are kept are left out.
+        Reading takes them away. Connections of which none are kept are left out.
         """
 
     def note_execution(self) -> None:
@@ -101,8 +101,8 @@ class Way(str, Enum):
     RECEIVED = "received"  # on a connection whose sender is not part of this run
 
 
-class Tap(Protocol):
-    """Where a node puts the packets that are recorded."""
+class PacketRecorder(Protocol):
+    """Takes the packets of a node that are recorded."""
 
     def stream(self, way: Way, name: str) -> int | None:
         """The number by which such packets are kept; ``None``: they are not recorded.
@@ -164,7 +164,7 @@ class Voice(Protocol):
 
 
 class Middleware(Protocol):
-    """What joins the nodes of this process to each other and to the rest of the world."""
+    """Joins the nodes of this process to each other and to the rest of the world."""
 
     @property
     def loop(self) -> EventLoop: ...
@@ -211,7 +211,7 @@ class Middleware(Protocol):
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
 
     def checker(self, kind: type) -> Callable[[Packet], Packet]:
-        """What checks packets of a class before they are sent.
+        """A check for packets of a class before they are sent.
 
         It returns the packet, with the values that its receivers see; raises ``WrongValue``.
         """
@@ -242,7 +242,7 @@ class NodeContext(Protocol):
         """A new message of the type of an output."""
 
     def get_logger(self) -> Logger:
-        """What it says ends up in the node's log."""
+        """A logger that writes to the node's log."""
 
     def resolve_path(self, path: str) -> Path:
         """An existing file, looked up as paths in node files are. Raises ``ModelError``."""

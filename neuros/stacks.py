@@ -1,10 +1,10 @@
-"""Where a node stands in its plugin: told of hooks that run for long, and of nodes that are killed.
+"""Stacks of plugins: reported for hooks that run for long, and for nodes that are killed.
 
 A node tells it in its reports (:func:`stack_in`). While a library holds Python's global lock it
 cannot report, and after its last report it does not: then a thread in C, faulthandler's, writes the
 stack to a file of the node (:class:`StackFile`), which the supervisor reads (:func:`held_stack`,
-:func:`held_threads`). No signal is needed for that,
-so no system call of a plugin is interrupted, and it is the same in containers.
+:func:`held_threads`). No signal is needed for that, so no system call of a plugin is interrupted,
+and it also works in containers.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ class StackFile:
 
 
 def stack_in(node: str, plugin: Path) -> Stack | None:
-    """Where the main thread stands in a plugin, ``None`` if it does not. Any other thread."""
+    """The stack of the main thread in a plugin, ``None`` outside of it. Any other thread."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     return _from_plugin({node: str(plugin)}, traceback.extract_stack(frame)) if frame else None
 
 
 def held_stack(folder: Path) -> Stack | None:
-    """Where the process with this file stands, ``None`` if it is able to report that itself."""
+    """The stack of the process with this file, ``None`` if it is able to report that itself."""
     try:
         head, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
         known = json.loads(head)
@@ -94,7 +94,7 @@ def held_stack(folder: Path) -> Stack | None:
 
 
 def held_threads(folder: Path) -> str:
-    """Where all threads of the process with this file stood when it could not report any more.
+    """The stacks of all threads of the process with this file when it could not report any more.
 
     As faulthandler shows them, the most recent call first; empty if there is nothing of the kind.
     """

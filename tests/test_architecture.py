@@ -108,7 +108,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "api.frames": {"pandas"},
     "api.sweep_table": {"tabulate"},
     "messages.package": {"catkin_pkg"},
-    "messages.definition": {"rosidl_adapter"},
+    "messages.checking": {"rosidl_adapter"},
     "messages.generation": GENERATORS,
     "messages.compilation": {"numpy"},
     "cli.sessions": {"tabulate"},

@@ -7,9 +7,9 @@ few cycles; a cycle is 20 ms simulated time. In random order, a slice is driven
     as always;
 ``by hand``
     by calls of the very hooks of the nodes, one after the other, with the messages that they
-    return: no engine, no transport, no change of surroundings;
+    return: no engine, no transport, no change of context;
 ``by hand, apart``
-    the same, but each hook in the surroundings of its node (environment, modules, output);
+    the same, but each hook in the context of its node (environment, modules, output);
 ``one loop``
     by ``floor.py`` of the example, with the network and the figure of the run, and a copy of the
     state of its physics: no messages either.
@@ -35,7 +35,7 @@ from typing import Any
 
 from neuros.hooks import HookKind, HookSpec
 from neuros.runtime import node
-from neuros.runtime.scope import Scope, Stage
+from neuros.runtime.context import Context, ContextSwitch
 
 CYCLES = 12
 SETTLING_CYCLES = 100
@@ -56,8 +56,8 @@ class Cycles:
         self._left = SETTLING_CYCLES
         self._begun_ns = self._redraws = 0
 
-    def add_scope(self, node: str, enter: Callable[[], None]) -> None:
-        """Take note of how to enter the surroundings of a node."""
+    def add_context(self, node: str, enter: Callable[[], None]) -> None:
+        """Take note of how to enter the context of a node."""
         self._enter[node] = enter
 
     def add(self, node: str, specs: Sequence[HookSpec]) -> list[HookSpec]:
@@ -159,21 +159,21 @@ def random_order(numbers: random.Random) -> list[str]:
 
 
 def install() -> None:
-    """Have the surroundings and hooks of every node of this process noted."""
+    """Have the contexts and hooks of every node of this process noted."""
     cycles = Cycles(Path(os.environ["NEUROS_CYCLES"]))
-    load, make_scope = node.load_plugin, Stage.scope
+    load, make_context = node.load_plugin, ContextSwitch.make_context
 
     def noting_hooks(plugin: Path, name: str) -> Sequence[HookSpec]:
         return cycles.add(name, load(plugin, name))
 
-    def noting_scope(self: Stage, environment: Mapping[str, str], *rest: Any) -> Scope:
-        scope = make_scope(self, environment, *rest)
+    def noting_context(self: ContextSwitch, environment: Mapping[str, str], *rest: Any) -> Context:
+        context = make_context(self, environment, *rest)
         name = Path(environment["NEUROS_RUN_DIR"]).name
-        cycles.add_scope(name, partial(self.enter, scope))
-        return scope
+        cycles.add_context(name, partial(self.enter, context))
+        return context
 
     node.load_plugin = noting_hooks
-    Stage.scope = noting_scope  # type: ignore[method-assign]
+    ContextSwitch.make_context = noting_context  # type: ignore[method-assign]
 
 
 if "NEUROS_CYCLES" in os.environ and "neuros.cli.main" not in sys.modules:

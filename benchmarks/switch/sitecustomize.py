@@ -76,12 +76,12 @@ def without_recording() -> dict[Place, Any]:
     """The journal of the engine, and the packets that are kept."""
     from neuros.core.engine import Engine
     from neuros.core.journal import JournalledEngine
-    from neuros.runtime.keeper import Keeper
+    from neuros.runtime.effects import NodeRecorder
 
     events = [name for name in vars(JournalledEngine) if name in vars(Engine)]
     kept = {"__init__", "__doc__", "__module__", "stop_hooks"}
     plain = {(JournalledEngine, name): getattr(Engine, name) for name in events if name not in kept}
-    return {**plain, (Keeper, "keep"): nothing}
+    return {**plain, (NodeRecorder, "keep"): nothing}
 
 
 PARTS: dict[str, Callable[[], dict[Place, Any]]] = {

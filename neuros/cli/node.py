@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.observe.provenance import note_versions
-from neuros.ports import Middleware, Tap
+from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.runtime.process import NodeProcess
@@ -55,20 +55,20 @@ def run_node(options: argparse.Namespace) -> int:
     leave.exit_code = NodeProcess(
         files,
         make_middleware,
-        open_tap=_taps(files[0].folders.run) if options.record else None,
+        open_recorder=_recorders(files[0].folders.run) if options.record else None,
         duration_sim_s=options.duration_sim,
         own_logs=options.in_memory,
     ).run()
     return leave.exit_code
 
 
-def _taps(run: Path) -> Callable[[NodeFile], Tap]:
-    """What makes the taps of nodes, as the run's recording has it."""
+def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:
+    """Makes the packet recorders of nodes by the recording plan of the run."""
     from neuros.observe.recording.plan import load_plan
-    from neuros.observe.recording.spool import open_tap
+    from neuros.observe.recording.spool import open_recorder
 
     plan = load_plan(run)
-    return lambda file: open_tap(plan, run, file.node.name)
+    return lambda file: open_recorder(plan, run, file.node.name)
 
 
 class _Leave:

@@ -141,17 +141,17 @@ class Figures:
         speed = self._speeds.get(("sim", ""))
         return None if speed is None else speed.per_s
 
-    def take(self, glimpse: Mapping[str, Any]) -> None:
+    def take(self, status: Mapping[str, Any]) -> None:
         """A node has shown itself."""
-        books = glimpse["books"]
+        books = status["books"]
         if books is None:
-            self.nodes[glimpse["node"]] = {"state": "loading", "cause": ""}
+            self.nodes[status["node"]] = {"state": "loading", "cause": ""}
             return
         now_s = books["now_s"]
-        if glimpse["sim_time"] is not None:
-            self.sim_time = glimpse["sim_time"]
-            self._speed("sim", "", now_s, glimpse["sim_time"])
-        self._take_node(glimpse["node"], books, now_s)
+        if status["sim_time"] is not None:
+            self.sim_time = status["sim_time"]
+            self._speed("sim", "", now_s, status["sim_time"])
+        self._take_node(status["node"], books, now_s)
         for name, counters in books["outgoing"].items():
             shown = self.connections.setdefault(name, {})
             shown |= {key: counters[key] for key in ("sent", "outstanding", "is_blocked")}

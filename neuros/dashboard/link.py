@@ -81,7 +81,7 @@ class Link:
 
     def _take(self, message: Mapping[str, Any]) -> None:
         kind = message["kind"]
-        if kind == "glimpse":
+        if kind == "node_status":
             self._figures.take(message)
             self._show_samples(message["node"], message["samples"])
             self._answered.add(message["node"])

@@ -1,4 +1,4 @@
-"""Small pictures of images (see :mod:`neuros.runtime.preview`) as what browsers show."""
+"""Small pictures of images (see :mod:`neuros.runtime.sampling`) as what browsers show."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class Onlookers:
         self.handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "watch": self._on_watch,
             "look": self._on_look,
-            "glimpse": self._on_glimpse,
+            "node_status": self._on_node_status,
             "pause": lambda *_: pause.begin(),
             "resume": lambda *_: pause.end(),
             "step": self._on_step,
@@ -137,7 +137,7 @@ class Onlookers:
             if lines is asking:
                 self._channels.send("look", wanted=message["wanted"], asker=number)
 
-    def _on_glimpse(self, _: Lines, message: Mapping[str, Any]) -> None:
+    def _on_node_status(self, _: Lines, message: Mapping[str, Any]) -> None:
         lines = self._lines.get(message["asker"])
         if lines is not None:
             self._channels.send_to(lines, **message)

@@ -4,12 +4,11 @@ A ROS package in a ``workspace`` folder (``package.xml``, ``msg/*.msg``, ``srv/*
 ``action/*.action``) becomes a Python package with its C libraries. What colcon and CMake do in a
 ROS distribution is done here with rosidl's generators, which come with the wheels, and gcc:
 
-- :mod:`~neuros.messages.package` finds packages and reads their manifests;
-- :mod:`~neuros.messages.definition` checks message files, line by line;
-- :mod:`~neuros.messages.workspace` knows all packages that a project sees: order, keys, mistakes;
-- :mod:`~neuros.messages.installed` knows those that come with ROS;
-- :mod:`~neuros.messages.cache` knows what is built, and who builds what;
-- :mod:`~neuros.messages.building` builds, with the generators in
+- :mod:`~neuros.messages.package` finds packages, in workspaces and in ROS, and reads manifests;
+- :mod:`~neuros.messages.workspace` knows all packages that a project sees: order and keys;
+- :mod:`~neuros.messages.checking` finds mistakes in them, line by line;
+- :mod:`~neuros.messages.cache` knows what is built, and by which process a package is built now;
+- :mod:`~neuros.messages.needed` builds what a run needs, with the generators in
   :mod:`~neuros.messages.generation` and the compiler in :mod:`~neuros.messages.compilation`.
 
 **One build for every Python.** Of what the generators write only the conversion from and to Python

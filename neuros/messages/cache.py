@@ -8,7 +8,7 @@
             lib/                      its C libraries
             share/<package>/          definitions, and type descriptions with their hashes
             include/<package>/        headers, for packages that depend on it
-        <package>-<key>.lock          only while somebody builds it
+        <package>-<key>.lock          only while it is being built
         <package>-<key>.log           what the generators and the compiler wrote, after a failure
 
 A package is built in a folder beside, which gets its name when it is whole. The libraries of one
@@ -29,7 +29,7 @@ from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 
 
 def message_cache(environ: Mapping[str, str]) -> Path:
-    """Where built packages are kept."""
+    """The folder of built packages."""
     return cache_root(environ) / "messages"
 
 
@@ -44,7 +44,7 @@ class Built(Kept):
 
     @property
     def python(self) -> Path:
-        """What has to be on Python's path."""
+        """The folder for Python's path."""
         return self.folder / "python"
 
     @property
@@ -53,7 +53,7 @@ class Built(Kept):
 
     @property
     def draft(self) -> Path:
-        """Where it is built."""
+        """The folder in which it is built."""
         return self.beside(".draft")
 
     @property

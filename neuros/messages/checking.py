@@ -1,16 +1,52 @@
-"""What is wrong in packages: in their message files, and in how they fit together."""
+"""Mistakes in message packages: in their message files, and in how packages fit together.
+
+The grammar is that of rosidl (https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html),
+and its own parser judges each line. That stops at the first mistake and knows no line numbers: so
+each line is parsed by itself, and what is wrong is said in other words.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import keyword
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+from rosidl_adapter.parser import (
+    PRIMITIVE_TYPES,
+    Constant,
+    Field,
+    InvalidValue,
+    Type,
+    is_valid_message_name,
+    is_valid_package_name,
+)
+
 from neuros.errors import Problem
-from neuros.messages.definition import Use, package_name_mistake, read_definition
 from neuros.messages.package import MANIFEST, Package, problem_at
 from neuros.messages.workspace import Workspaces
 from neuros.project.suggest import did_you_mean
+
+_PARTS = {".msg": 1, ".srv": 2, ".action": 3}
+_SEPARATOR = "---"
+_ROS_1 = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Duration"}
+_A_LINE = "a type and a name, as 'float64 angle'"
+_A_TYPE = (
+    "bool, byte, char, int8 to int64, uint8 to uint64, float32, float64, string, wstring or"
+    " package/Message, and behind it nothing, [], [3] or [<=3]"
+)
+_A_PACKAGE = "a letter, then letters, digits and single '_', all lower case, as 'rover_msgs'"
+_A_FIELD = "a letter, then letters, digits and single '_', all lower case, as 'joint_positions'"
+_A_CONSTANT = "upper case letters, digits and single '_', as 'MAX_SPEED'"
+# Names of fields become names in C.
+_C = re.compile(
+    "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|"
+    "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
+    "union|unsigned|void|volatile|while"
+)
 
 
 def check(packages: Sequence[Package], workspaces: Workspaces) -> list[Problem]:
@@ -73,3 +109,162 @@ def _circles(package: Package, contained: dict[str, set[str]]) -> list[Problem]:
         text = f"found a message that contains itself: {' -> '.join(circle)}"
         return [problem_at(package.folder / "msg" / f"{circle[0]}.msg", text)]
     return []
+
+
+@dataclass(frozen=True)
+class Use:
+    """A message type that a field has: ``package/Name``, where it is written."""
+
+    type: str
+    line: int
+    column: int
+
+
+@dataclass
+class Definition:
+    """The content and mistakes of an interface file."""
+
+    uses: list[Use] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+
+def package_name_mistake(name: str) -> str:
+    """The mistake in the name of a package, empty if there is none."""
+    if not is_valid_package_name(name):
+        return f"found the name '{name}', expected {_A_PACKAGE}"
+    if keyword.iskeyword(name):
+        return f"found the name '{name}', expected one that is no keyword of Python"
+    if name in sys.stdlib_module_names:
+        return f"found the name '{name}' of a module of Python, expected another"
+    return ""
+
+
+def read_definition(package: str, file: Path) -> Definition:
+    """Read a file of a package; its path has to be absolute."""
+    found = Definition()
+    if not is_valid_message_name(file.stem) or "_" in file.stem:
+        text = (
+            f"found the name '{file.name}', expected letters and digits in CamelCase, as 'Joints'"
+        )
+        found.problems.append(problem_at(file, text))
+    try:
+        text = file.read_text("utf-8")
+    except (OSError, UnicodeError) as error:
+        found.problems.append(problem_at(file, f"cannot be read: {error}"))
+        return found
+    lines = text.splitlines()
+    found.problems += _unwritable(file, lines)
+    parts = list(_parts(lines))
+    if len(parts) != _PARTS[file.suffix]:
+        found.problems.append(_wrong_parts(file, parts, lines))
+    for part in parts:
+        _read_part(package, file, part, found)
+    return found
+
+
+def _read_part(package: str, file: Path, part: dict[int, str], found: Definition) -> None:
+    names: dict[str, int] = {}
+    for number, line in part.items():
+        code = line.replace("\t", " ").partition("#")[0].rstrip()
+        if not code:
+            continue
+        try:
+            parsed = _parsed(package, code)
+        except _Wrong as wrong:
+            problem = problem_at(file, wrong.text, number, wrong.column, wrong.hint)
+            found.problems.append(problem)
+            continue
+        column = code.rindex(" " + parsed.name) + 2 if " " + parsed.name in code else 1
+        if parsed.name in names:
+            text = f"found the name '{parsed.name}' again (see line {names[parsed.name]})"
+            found.problems.append(problem_at(file, f"{text}, expected another", number, column))
+        names.setdefault(parsed.name, number)
+        if isinstance(parsed, Field) and not parsed.type.is_primitive_type():
+            type_name = f"{parsed.type.pkg_name}/{parsed.type.type}"
+            found.uses.append(Use(type_name, number, 1))
+
+
+class _Wrong(Exception):
+    def __init__(self, found: str, expected: str, column: int = 1, hint: str = "") -> None:
+        self.text, self.column, self.hint = f"found {found}, expected {expected}", column, hint
+        super().__init__(self.text)
+
+
+def _parsed(package: str, code: str) -> Field | Constant:
+    """The field or constant that a line declares. Raises ``_Wrong``."""
+    if code[0] == " ":
+        raise _Wrong("a space in front", "the type in the first column")
+    type_text, _, rest = code.partition(" ")
+    rest = rest.lstrip()
+    if not rest:
+        raise _Wrong(f"'{code}'", _A_LINE)
+    type_ = _type(package, type_text)
+    column = code.index(rest, len(type_text)) + 1
+    is_constant = "=" in rest
+    if is_constant:
+        name, _, value = (text.strip() for text in rest.partition("="))
+    else:
+        name, _, value = rest.partition(" ")
+    if not is_constant:
+        _check_words(name, column)
+    try:
+        if is_constant:
+            return Constant(type_text, name, value)
+        return Field(type_, name, value.lstrip() or None)
+    except NameError:
+        rule = _A_CONSTANT if is_constant else _A_FIELD
+        raise _Wrong(f"the name '{name}'", rule, column) from None
+    except InvalidValue as error:
+        rule = str(error).rpartition(": ")[2].removeprefix("must be ")
+        raise _Wrong(f"the value '{value.strip()}' of a {type_text}", rule, column) from None
+    except Exception:  # rosidl's parser raises many
+        what = "a constant of a primitive type" if is_constant else "no value behind the name"
+        raise _Wrong(f"'{code}'", what, column) from None
+
+
+def _type(package: str, text: str) -> Type:
+    if text.partition("[")[0] in _ROS_1:
+        raise _Wrong(f"the type '{text}' of ROS 1", f"'{_ROS_1[text.partition('[')[0]]}'")
+    try:
+        return Type(text, context_package_name=package)
+    except Exception:  # of four kinds, and one of them is a mistake in rosidl's parser
+        raise _Wrong(
+            f"the type '{text}'", _A_TYPE, 1, did_you_mean(text, set(PRIMITIVE_TYPES) - {*_ROS_1})
+        ) from None
+
+
+def _check_words(name: str, column: int) -> None:
+    language = "Python" if keyword.iskeyword(name) else "C" if _C.fullmatch(name) else None
+    if language:
+        raise _Wrong(f"the name '{name}'", f"one that is no keyword of {language}", column)
+
+
+def _parts(lines: list[str]) -> Iterator[dict[int, str]]:
+    """The lines between separators, by their numbers."""
+    part: dict[int, str] = {}
+    for number, line in enumerate(lines, 1):
+        if line == _SEPARATOR:
+            yield part
+            part = {}
+        else:
+            part[number] = line
+    yield part
+
+
+def _wrong_parts(file: Path, parts: list[dict[int, str]], lines: list[str]) -> Problem:
+    needed = _PARTS[file.suffix] - 1
+    places = [number for number, line in enumerate(lines, 1) if line == _SEPARATOR]
+    almost = [n for n, line in enumerate(lines, 1) if re.fullmatch(r"\s*-{2,}\s*", line)]
+    what = {0: "none", 1: f"one line '{_SEPARATOR}'", 2: f"two lines '{_SEPARATOR}'"}[needed]
+    line = next((n for n in almost if n not in places), places[-1] if places else len(lines) or 1)
+    return problem_at(file, f"found {len(places)} lines '{_SEPARATOR}', expected {what}", line)
+
+
+def _unwritable(file: Path, lines: list[str]) -> Iterator[Problem]:
+    """Characters that rosidl stumbles over: it writes Latin-1, and reads that as UTF-8."""
+    for number, line in enumerate(lines, 1):
+        for column, character in enumerate(line, 1):
+            if not character.isascii():
+                text = f"found '{character}', expected ASCII, in comments, too"
+                yield problem_at(file, text, number, column)
+                break

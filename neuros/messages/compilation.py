@@ -1,4 +1,4 @@
-"""From generated C to libraries: gcc, called as CMake calls it for a release."""
+"""Compiles generated C to libraries with gcc, called as CMake calls it for a release."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import system_install
 from neuros.messages.generation import generated
-from neuros.messages.installed import Ros
+from neuros.messages.package import Ros
 
 _ABI = Path(__file__).with_name("stable_abi.h")
 _C = ("-std=gnu11", "-O2", "-fPIC", "-DNDEBUG", "-w")
@@ -28,7 +28,7 @@ HEADERS = (
 """The generators that write headers."""
 
 _TO_C, _TO_PYTHON = "rosidl_generator_c", "rosidl_generator_py"
-# Each library with what it needs of ROS; generators of the same name make its code.
+# Each library with what it needs of ROS; generators of its name make its code.
 _LIBRARIES: Mapping[str, Sequence[str]] = {
     "rosidl_generator_c": ("rosidl_runtime_c", "rosidl_typesupport_c", "rcutils"),
     "rosidl_typesupport_introspection_c": (
@@ -45,7 +45,7 @@ _LIBRARIES: Mapping[str, Sequence[str]] = {
 
 
 class CompilationError(Exception):
-    """What the compiler said."""
+    """An error of the compiler, with its output."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Compilers:
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be compiled.
+    """A package to compile.
 
     Attributes:
         source: the output of the generators.
@@ -164,7 +164,7 @@ def _link_library(job: Job, kind: str, objects: Sequence[Path], needs: Iterable[
 
 
 def _link_module(job: Job, objects: Sequence[Path]) -> None:
-    """What Python imports; it brings all libraries along.
+    """Link the module that Python imports; it brings all libraries along.
 
     ROS opens some of them by their names, and finds those that are open already.
     """

@@ -1,4 +1,4 @@
-"""From definitions to C and Python: rosidl's generators, called as CMake calls them.
+"""Generates C and Python from definitions with rosidl's generators, called as CMake calls them.
 
 They print to standard output, replace it, and keep state in modules: they run in a process of
 their own, ``python -m neuros.messages.generation``, which reads what to do from standard input.
@@ -22,7 +22,7 @@ TYPE_SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspect
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be generated.
+    """A package to generate code for.
 
     Attributes:
         package: the name.
@@ -46,7 +46,7 @@ class Order:
 
 
 def generated(output: Path, generator: str, package: str) -> Path:
-    """Where a generator puts its files of a package."""
+    """The folder of the files that a generator makes of a package."""
     return output / generator / package
 
 

@@ -1,19 +1,51 @@
-"""The message packages of a run: which ones it needs, and whether they are built."""
+"""The message packages of a run: which it needs, and their building, each whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from graphlib import CycleError
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.errors import Problem
+from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.progress import Progress
-from neuros.messages.building import Step, build
-from neuros.messages.cache import Built
+from neuros.messages import generation
+from neuros.messages.cache import Built, sweep
+from neuros.messages.compilation import HEADERS, CompilationError, Compilers, Job, compile_package
+from neuros.messages.package import MANIFEST, Package, Ros
 from neuros.messages.workspace import Workspaces, cycle_problem
 from neuros.project.model import Node
+
+# What services and actions are made of, besides what their files name.
+_IMPLIED: Mapping[str, set[str]] = {
+    ".msg": set(),
+    ".srv": {"service_msgs", "builtin_interfaces"},
+    ".action": {
+        *("action_msgs", "builtin_interfaces", "service_msgs", "unique_identifier_msgs"),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """A package that is to be built.
+
+    Attributes:
+        needs: the packages of workspaces that it needs, directly or not, all built before it.
+        is_current: whether its files are still those that ``built`` is named after.
+    """
+
+    package: Package
+    built: Built
+    needs: Sequence[Built]
+    is_current: Callable[[], bool]
 
 
 class Messages:
@@ -46,7 +78,7 @@ class Messages:
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
-        """What nodes need: all packages of the project, and the shared ones that ports name."""
+        """The packages that nodes need: all of the project, and the shared ones that ports name."""
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         used = {port.type.partition("/")[0] for port in ports}
         # Shared ones are not looked for where everything comes with ROS, as it mostly does.
@@ -55,12 +87,12 @@ class Messages:
 
     @property
     def built(self) -> list[Built]:
-        """Where each package is, or will be."""
+        """Each package, built or not."""
         return [step.built for step in self._steps]
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """What has to be on Python's path."""
+        """The folders for Python's path."""
         return tuple(built.python for built in self.built)
 
     @property
@@ -69,7 +101,7 @@ class Messages:
         return all(built.is_there for built in self.built)
 
     def problems(self) -> list[Problem]:
-        """What is wrong in the files of packages; what is built had nothing wrong with it."""
+        """Mistakes in the files of packages; a built package had none."""
         missing = [step.package for step in self._steps if not step.built.is_there]
         if not missing:
             return self._problems
@@ -105,3 +137,147 @@ class Messages:
             f" {step.built.folder}"
             for step in self._steps
         ]
+
+
+def build(
+    steps: Iterable[Step], ros: Ros, progress: Progress, environment: Mapping[str, str]
+) -> None:
+    """Build what is missing, in this order; a line for each package.
+
+    Args:
+        environment: of the programs that this starts.
+
+    Raises:
+        EnvironmentFault: with a sentence for the user; then nothing of that package is left but
+            a log.
+    """
+    missing = [step for step in steps if not step.built.is_there]
+    if not missing:
+        return
+    compilers = Compilers.here()
+    for step in missing:
+        try:
+            _build_locked(step, ros, compilers, progress, environment)
+        except OSError as error:
+            raise EnvironmentFault(
+                f"message package '{step.package.name}' cannot be built in"
+                f" {step.built.folder.parent} ({error.strerror or error}): make room (df -h), or"
+                " set XDG_CACHE_HOME"
+            ) from error
+    sweep(missing[0].built.folder.parent)
+
+
+def _build_locked(
+    step: Step, ros: Ros, compilers: Compilers, progress: Progress, environment: Mapping[str, str]
+) -> None:
+    with step.built.locked(wait=False) as is_mine:
+        if is_mine:
+            _build(step, ros, compilers, progress, environment)
+            return
+    progress.step(f"waiting for another program that builds {step.package.name}")
+    with step.built.locked():
+        _build(step, ros, compilers, progress, environment)
+
+
+def _build(
+    step: Step, ros: Ros, compilers: Compilers, progress: Progress, environment: Mapping[str, str]
+) -> None:
+    """Build one package; its lock is held."""
+    package, built = step.package, step.built
+    if built.is_there:  # by another program, meanwhile
+        return
+    progress.step(f"building {package.name}: {package.summary} ({package.folder})")
+    draft, source = built.draft, built.draft / "source"
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        source.mkdir(parents=True)
+        _generate(step, ros, source, environment)
+        others = _others(package, source)
+        needs = {need.package: need.folder for need in step.needs}
+        compile_package(
+            Job(package.name, source, draft, others, needs, ros, compilers, environment)
+        )
+        _install(package, source, draft)
+        shutil.rmtree(source)
+        if not step.is_current():
+            raise EnvironmentFault(
+                f"message package '{package.name}' was changed while it was built: start again"
+            )
+        draft.rename(built.folder)
+        built.log.unlink(missing_ok=True)
+    except CompilationError as error:
+        built.log.write_text(str(error), "utf-8")
+        raise EnvironmentFault(
+            f"message package '{package.name}' cannot be built: {_cause(str(error))} (log:"
+            f" {built.log})"
+        ) from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _generate(step: Step, ros: Ros, source: Path, environment: Mapping[str, str]) -> None:
+    package = step.package
+    shares = {name: str(ros.share(name)) for name in ros.message_packages()}
+    shares |= {need.package: str(need.share) for need in step.needs}
+    order = generation.Order(
+        package.name,
+        str(package.folder),
+        [file.as_posix() for file in package.files],
+        str(source),
+        str(ros.prefix),
+        shares,
+    )
+    # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
+    done = subprocess.run(
+        [sys.executable, "-I", generation.__file__],
+        env=environment,
+        input=order.text(),
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    if done.returncode:
+        raise CompilationError(f"{done.stdout}{done.stderr}")
+
+
+def _others(package: Package, source: Path) -> set[str]:
+    """The packages that its messages refer to, with what these refer to."""
+    others = {name for file in package.files for name in _IMPLIED[file.suffix]}
+    descriptions = generation.generated(source, generation.DESCRIPTIONS, package.name)
+    for file in descriptions.rglob("*.json"):
+        hashes = json.loads(file.read_text("utf-8"))["type_hashes"]
+        others |= {each["type_name"].partition("/")[0] for each in hashes}
+    return others - {package.name}
+
+
+def _install(package: Package, source: Path, prefix: Path) -> None:
+    """Put what was generated where it is looked for, as in a ROS distribution."""
+    share, python = prefix / "share" / package.name, prefix / "python" / package.name
+    for generator in (generation.INTERFACES, generation.DESCRIPTIONS):
+        _copy(generation.generated(source, generator, package.name), share, {".idl", ".json"})
+    for file in (Path(MANIFEST), *package.files):
+        shutil.copyfile(package.folder / file, share / file)
+    for generator in HEADERS:
+        folder = generation.generated(source, generator, package.name)
+        _copy(folder, prefix / "include" / package.name / package.name, {".h"})
+    _copy(generation.generated(source, "rosidl_generator_py", package.name), python, {".py"})
+    (python / "__init__.py").touch()
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / package.name).touch()
+
+
+def _copy(source: Path, target: Path, suffixes: set[str]) -> None:
+    for file in source.rglob("*"):
+        if file.suffix in suffixes:
+            out = target / file.relative_to(source)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, out)
+
+
+def _cause(output: str) -> str:
+    """The line that says most: the first error of the compiler, or the last one of a generator."""
+    rows = [row.strip() for row in output.splitlines() if row.strip()]
+    errors = [row for row in rows if re.search(r"\berror: ", row)]
+    return (errors[:1] or rows[-1:] or ["for no known reason"])[0][:300]

@@ -1,9 +1,10 @@
-"""ROS packages with messages: found in a workspace as colcon finds them."""
+"""ROS packages with messages: in a workspace, found as colcon finds them, and those of ROS."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,3 +131,50 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
 def _line_of(error: BaseException) -> int:
     """The line that a mistake in XML is in; what is missing is in none."""
     return int(getattr(error.__context__, "lineno", 1))
+
+
+@dataclass(frozen=True)
+class Ros:
+    """An installation of ROS: where its headers, libraries and descriptions are.
+
+    Attributes:
+        prefix: holds ``include``, ``lib`` and ``share``; for the wheels it is that of their Python.
+    """
+
+    prefix: Path
+
+    @classmethod
+    def here(cls) -> Ros:
+        """The one of this Python."""
+        return cls(Path(sys.prefix))
+
+    @property
+    def include(self) -> Path:
+        return self.prefix / "include"
+
+    @property
+    def lib(self) -> Path:
+        return self.prefix / "lib"
+
+    def share(self, package: str) -> Path:
+        """The folder of a package with its descriptions, which need not be there."""
+        return self.prefix / "share" / package
+
+    def has(self, package: str) -> bool:
+        """Whether a package is installed."""
+        return (self.share(package) / MANIFEST).is_file()
+
+    def messages(self, package: str) -> Collection[str] | None:
+        """The names of the messages of a package, ``None`` if there is no such package."""
+        if not self.has(package):
+            return None
+        return {file.stem for file in self.share(package).glob("msg/*.idl")}
+
+    def message_packages(self) -> set[str]:
+        """The packages that have messages."""
+        return {folder.parent.name for folder in (self.prefix / "share").glob("*/msg")}
+
+    def manifest(self, package: str) -> bytes:
+        """The manifest, which tells versions of a package apart; empty if it is not installed."""
+        file = self.share(package) / MANIFEST
+        return file.read_bytes() if file.is_file() else b""

@@ -1,4 +1,4 @@
-"""All message packages that a project sees, in order, with their keys and what is wrong in them."""
+"""All message packages that a project sees: their order, keys and mistakes in manifests."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from pathlib import Path
 from neuros.caching import KEY_LENGTH
 from neuros.errors import Problem
 from neuros.messages.cache import Built, message_cache
-from neuros.messages.installed import Ros
-from neuros.messages.package import MANIFEST, Package, find_packages, problem_at
+from neuros.messages.package import MANIFEST, Package, Ros, find_packages, problem_at
 
 _FORMAT = b"1"  # of what is built; another one builds everything anew
 _ABI = Path(__file__).with_name("stable_abi.h")
@@ -27,7 +26,7 @@ GENERATORS = (
     "rosidl_typesupport_c",
     "rosidl_generator_py",
 )
-"""What turns definitions into code, in this order."""
+"""Programs that turn definitions into code, in this order."""
 
 
 class Workspaces:
@@ -37,7 +36,7 @@ class Workspaces:
 
     Args:
         own: the workspace of the project: all its packages are built.
-        shared: the workspace of NeuROS: those that somebody needs are built.
+        shared: the workspace of NeuROS: those that are needed are built.
         environ: says where built packages are kept.
     """
 
@@ -73,12 +72,12 @@ class Workspaces:
 
     @property
     def own_problems(self) -> list[Problem]:
-        """What is wrong with manifests in the project's workspace."""
+        """Mistakes in manifests of the project's workspace."""
         return self._own.problems
 
     @property
     def problems(self) -> list[Problem]:
-        """What is wrong with manifests."""
+        """Mistakes in manifests."""
         return [*self._own.problems, *self._shared.problems]
 
     def messages(self, package: str) -> Collection[str] | None:
@@ -119,7 +118,7 @@ class Workspaces:
         return sorted(self.packages[name].dependencies & set(self.packages) - {name})
 
     def _keys(self, packages: Sequence[Package]) -> dict[str, str]:
-        """What each package is recognised by.
+        """The key of each package.
 
         It changes with the content of the package, of those that it needs, and with the version
         of the generators and of ROS's own packages; not with that of Python.
@@ -160,7 +159,7 @@ def _find(folder: Path | None) -> _Found:
 
 
 def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
-    """What to say of packages that need each other."""
+    """The problem of packages that need each other."""
     names: list[str] = error.args[1]
     package = workspaces.packages[names[0]]
     text = f"found packages that need each other: {' -> '.join(names)}"

@@ -1,6 +1,6 @@
 """The packets of a run as its nodes have listed them: when, which, and how long they took.
 
-Reads what :mod:`neuros.runtime.packet_books` writes. Both ends' times are of the monotonic clock
+Reads what :mod:`neuros.runtime.packet_log` writes. Both ends' times are of the monotonic clock
 of one machine, which all its processes share; the two ends of a connection on different machines
 leave their lists in different run folders, and no latency is worked out for them.
 """

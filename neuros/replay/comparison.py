@@ -24,7 +24,7 @@ class _Stream:
 
 
 class Comparison:
-    """Compares packet by packet (:class:`neuros.ports.Tap`).
+    """Compares packet by packet (:class:`neuros.ports.PacketRecorder`).
 
     Args:
         message: makes a message from bytes and the name of its type.

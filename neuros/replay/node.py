@@ -19,8 +19,8 @@ from neuros.observe.replayed import RecordedNode
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.comparison import Comparison
 from neuros.replay.debugging import is_quit
+from neuros.runtime.context import ContextSwitch
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.scope import Stage
 from neuros.transport.alone import Alone, HeldLoop
 from neuros.transport.messages import decode, message_class
 
@@ -57,10 +57,10 @@ class ReplayedNode:
         self._runtime = NodeRuntime(
             file,
             self._middleware,
-            Stage(),
+            ContextSwitch(),
             tell=lambda *_, **__: None,
             fail=self._fail,
-            tap=self.comparison,
+            recorder=self.comparison,
             log_file=None,
             duration_sim_s=None,
             make_engine=partial(ReplayedEngine, self._script),

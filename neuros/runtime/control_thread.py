@@ -1,4 +1,4 @@
-"""The thread that talks to the supervisor while hooks run."""
+"""The thread that reports to the supervisor and obeys it while hooks run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REPORT_S = 1.0
 
 
 class Controlled(Protocol):
-    """What the supervisor may ask of a process of nodes."""
+    """A process of nodes, as the supervisor commands it."""
 
     def post(self, event: Callable[[], None]) -> None: ...
     def ask_to_stop(self) -> None: ...

@@ -1,19 +1,18 @@
-"""What the engine of a node does to the world: hooks run, packets leave."""
+"""Effects of the engine of a node: it runs hooks, sends packets and records them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 from neuros.core.hook import Hook
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
-from neuros.ports import Middleware, Transport, Way
+from neuros.ports import Logger, Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, Port
 from neuros.runtime.failures import Failures
 from neuros.runtime.handle import NodeHandle
-from neuros.runtime.keeper import Keeper
 from neuros.runtime.plugin import describe, last_line
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
@@ -23,8 +22,8 @@ class NodeEffects:
     """The :class:`~neuros.core.effects.Effects` of one running node.
 
     Args:
-        enter: puts the surroundings of the node in place.
-        keeper: where packets go that are recorded, ``None``: none are.
+        enter: puts the context of the node in place.
+        recorder: where packets go that are recorded, ``None``: none are.
         sampler: looks at packets for onlookers.
         on_first_hook: called before the first hook.
         on_initialised: called after each initialise hook.
@@ -40,7 +39,7 @@ class NodeEffects:
         handle: NodeHandle,
         failures: Failures,
         time: SimulatedTime,
-        keeper: Keeper | None,
+        recorder: NodeRecorder | None,
         sampler: Sampler,
         *,
         enter: Callable[[], None],
@@ -57,7 +56,7 @@ class NodeEffects:
         self.acknowledge = transport.acknowledge
         self.has_taken_in = transport.has_taken_in
         self._note_execution = transport.note_execution
-        self._keeper = keeper
+        self._recorder = recorder
         self._sampler = sampler
         self._enter = enter
         self._on_first_hook = on_first_hook
@@ -65,7 +64,7 @@ class NodeEffects:
         self.has_run = False
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
-        """Run a hook in the surroundings of its node."""
+        """Run a hook in the context of its node."""
         self._enter()
         if not self.has_run:
             self.has_run = True
@@ -85,7 +84,7 @@ class NodeEffects:
         """Run the function of a hook.
 
         Raises:
-            HookError: if it fails, whatever it raises.
+            HookError: if it raises any exception.
         """
         try:
             return spec.function(self._handle, *arguments)
@@ -102,8 +101,8 @@ class NodeEffects:
         if self._sampler.requests:
             self._sampler.note(connections[0].source_output, packet)
         data = self._transport.send(connections, packet)
-        if self._keeper is not None:
-            self._keeper.keep(Way.SENT, connections[0].source_output, packet, data)
+        if self._recorder is not None:
+            self._recorder.keep(Way.SENT, connections[0].source_output, packet, data)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on an external topic."""
@@ -112,8 +111,8 @@ class NodeEffects:
         if self._sampler.requests:
             self._sampler.note(port.name, packet)
         self._transport.send_external(port, packet)
-        if self._keeper is not None:
-            self._keeper.keep(Way.SENT, port.name, packet)
+        if self._recorder is not None:
+            self._recorder.keep(Way.SENT, port.name, packet)
 
     def post(self, event: Callable[[], None]) -> None:
         """Queue a delivery of the node to itself."""
@@ -124,9 +123,58 @@ class NodeEffects:
         self._loop.post_loop_back(partial(self._guard, event))
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
-        """What the node gets on a connection to itself: it shares nothing with this packet."""
+        """A copy for a connection of the node to itself; it shares nothing with this packet."""
         if self._sampler.requests:
             self._sampler.note(connection.source_output, packet)
-        if self._keeper is not None:
-            self._keeper.keep(Way.TO_ITSELF, str(connection), packet)
+        if self._recorder is not None:
+            self._recorder.keep(Way.TO_ITSELF, str(connection), packet)
         return self._copy(packet)
+
+
+class NodeRecorder:
+    """Gives packets of one node, serialised, to its packet recorder, until that fails.
+
+    Args:
+        encode: serialises a packet.
+        time: that of the node, if it has one.
+    """
+
+    def __init__(
+        self,
+        recorder: PacketRecorder,
+        encode: Callable[[Any], bytes],
+        time: SimulatedTime,
+        logger: Logger,
+    ) -> None:
+        self._recorder: PacketRecorder | None = recorder
+        self._encode = encode
+        self._time = time
+        self._logger = logger
+
+    def wanted_on_arrival(self, connections: Iterable[Connection]) -> frozenset[Connection]:
+        """Connections whose packets are kept where they arrive: their senders are elsewhere."""
+        recorder = self._recorder
+        if recorder is None:
+            return frozenset()
+        return frozenset(
+            c for c in connections if recorder.stream(Way.RECEIVED, str(c)) is not None
+        )
+
+    def keep(self, way: Way, name: str, packet: Any, data: bytes | None = None) -> None:
+        """Record a packet, where that is wanted; ``data`` is the packet, if serialised already."""
+        recorder = self._recorder
+        if recorder is None or (stream := recorder.stream(way, name)) is None:
+            return
+        try:
+            recorder.keep(stream, data or self._encode(packet), self._time.now_s)
+        except OSError as error:
+            self.close()
+            self._logger.error(
+                f"its packets are not recorded from now on: {error.strerror}; the run goes on"
+            )
+
+    def close(self) -> None:
+        """Record nothing any more."""
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None

@@ -1,15 +1,21 @@
-"""What goes wrong in a node: who is told, and what its log says."""
+"""Errors of a node: reported to the supervisor, and written to the node's log."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
-from neuros.errors import NeurosError, NodeError, PluginError, printable
+from neuros.errors import CallbackError, NeurosError, NodeError, PluginError, printable
 from neuros.ports import Logger
-from neuros.runtime.callbacks import callback_error
 from neuros.runtime.plugin import describe, plugin_traceback
+
+# What a plugin calls, and what calls it: a callback is neither.
+_NOT_OF_PLUGINS = (str(Path(__file__).resolve().parents[1]), sys.prefix, sys.base_prefix)
 
 
 class Failures:
@@ -36,7 +42,7 @@ class Failures:
         self.report(error if isinstance(error, NeurosError) else callback_error(error, callback))
 
     def guard(self, event: Callable[[], None]) -> None:
-        """Handle an event; what NeuROS says of it ends the project."""
+        """Handle an event; a ``NeurosError`` ends the project."""
         try:
             event()
         except NeurosError as error:
@@ -58,3 +64,40 @@ def as_node_error(error: BaseException, what: str = "") -> NodeError:
     wrapped = NodeError(f"{what}{describe(error)}")
     wrapped.__cause__ = error
     return wrapped
+
+
+def callback_error(error: BaseException, callback: Any = None) -> NodeError:
+    """The error of a callback; without ``callback``, it is looked for in the traceback."""
+    wrapped: NodeError
+    code = _code_of(callback) or _outermost_code(error)
+    if code is None:
+        wrapped = NodeError(f"failed outside its hooks: {describe(error)}")
+    else:
+        where = f"{code.co_filename}:{code.co_firstlineno}"
+        wrapped = CallbackError(describe(error), callback=code.co_name, where=where)
+    wrapped.__cause__ = error
+    return wrapped
+
+
+def _code_of(callback: Any) -> CodeType | None:
+    while isinstance(callback, functools.partial):
+        callback = callback.func
+    if not inspect.isroutine(callback):
+        callback = getattr(callback, "__call__", None)  # noqa: B004 (its code, not whether)
+    code = getattr(inspect.unwrap(callback), "__code__", None) if callback else None
+    return code if isinstance(code, CodeType) and not _is_library(code.co_filename) else None
+
+
+def _outermost_code(error: BaseException) -> CodeType | None:
+    """Of the first frame in the traceback that is of the project."""
+    trace = error.__traceback__
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if not _is_library(code.co_filename):
+            return code
+        trace = trace.tb_next
+    return None
+
+
+def _is_library(file: str) -> bool:
+    return file.startswith(("<", *_NOT_OF_PLUGINS)) or "site-packages" in file

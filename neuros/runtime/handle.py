@@ -1,45 +1,122 @@
-"""The ``node`` that every hook receives."""
+"""The ``node`` that every hook receives, the services behind it, and its results file."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+from neuros.core.engine import Engine
 from neuros.errors import ModelError, NodeError
-from neuros.ports import Logger
+from neuros.ports import EventLoop, Logger, Transport
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
-from neuros.runtime.results import Results
+from neuros.runtime.failures import Failures, as_node_error
+from neuros.runtime.simulated_time import SimulatedTime
 
 _POLL_S = 0.05
 _EMPTY = "std_msgs/msg/Empty"
 
 
-class Host(Protocol):
-    """What a handle needs of the runtime behind it."""
+class PluginServices:
+    """Requests of a plugin, from its hooks and from its own threads, made through ``node``.
 
-    @property
-    def is_ending(self) -> bool: ...
-    def make_packet(self, type_name: str) -> Any: ...
-    def shutdown(self, reason: str, drain_s: float) -> None: ...
-    def own_simulated_time(self, read_s: Callable[[], float]) -> None: ...
-    def expect_end(self, sim_s: float) -> None: ...
-    def on_close(self, callback: Callable[[], None]) -> None: ...
-    def fail_from_thread(self, error: BaseException) -> None: ...
+    Args:
+        ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
+
+    Attributes:
+        closers: called once when the node ends, last added first.
+        engine: the node's, ``None`` until its plugin is loaded.
+        is_ending: whether no further hook starts.
+        make_packet: a new message with default values, for a type in ROS notation.
+        time: that of the node, if it has one.
+        waiting_threads: those that wait until packets that they have offered are sent.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        loop: EventLoop,
+        time: SimulatedTime,
+        failures: Failures,
+        ask_for_end: Callable[..., object],
+    ) -> None:
+        self.engine: Engine | None = None
+        self.is_ending = False
+        self.waiting_threads: set[threading.Thread] = set()
+        self.make_packet = transport.make_packet
+        self._loop = loop
+        self.time = time
+        self._failures = failures
+        self._ask_for_end = ask_for_end
+        self.closers: list[Callable[[], None]] = []
+
+    def stop(self) -> None:
+        """Start no further hook. Any thread."""
+        self.is_ending = True
+        if self.engine is not None:
+            self.engine.stop_hooks()
+
+    def shutdown(self, reason: str, drain_s: float) -> None:
+        """Ask the supervisor for a drained end; this node starts no further hook."""
+        if self.engine is not None:
+            self.engine.stop_hooks()
+        self._ask_for_end(reason=reason, drain_s=drain_s)
+
+    def close(self) -> None:
+        """Give up what the plugin holds, last opened first."""
+        for close in reversed(self.closers):
+            try:
+                close()
+            except BaseException as error:  # the others must still be closed
+                self._failures.report(as_node_error(error, "failed while it was closed: "))
+
+    def fail_from_thread(self, error: BaseException) -> None:
+        """End the project with an error that happened outside the hooks."""
+        self._loop.post_from_thread(lambda: self._failures.report(error))
+
     def offer_from_thread(
         self, packets: Mapping[str, Any], accepted: Callable[[], None]
-    ) -> Callable[[Callable[[], None]], None]: ...
+    ) -> Callable[[Callable[[], None]], None]:
+        """Offer packets from another thread; returns a function that withdraws them."""
+        withdrawals: list[Callable[[], None]] = []
+        thread = threading.current_thread()
+
+        def accept() -> None:
+            self.waiting_threads.discard(thread)
+            accepted()
+
+        def offer() -> None:
+            assert self.engine is not None
+            self.waiting_threads.add(thread)
+            withdrawals.append(self.engine.offer(packets, accept))
+            if self.time.is_watched:
+                self.time.look()
+
+        def withdraw(done: Callable[[], None]) -> None:
+            def event() -> None:
+                self.waiting_threads.discard(thread)
+                for each in withdrawals:
+                    each()
+                done()
+
+            self._loop.post_from_thread(event)
+
+        self._loop.post_from_thread(lambda: self._failures.guard(offer))
+        return withdraw
 
 
 class NodeHandle:
     """A node as its plugin sees it."""
 
-    def __init__(self, file: NodeFile, ros_node: Any, host: Host) -> None:
+    def __init__(self, file: NodeFile, ros_node: Any, services: PluginServices) -> None:
         self._file = file
         self._ros_node = ros_node
-        self._host = host
+        self._services = services
         self._types = {port.name: port.type for port in file.node.outputs}
         self._user_data: Any = None
         self._results = Results(self.run_dir)
@@ -70,7 +147,7 @@ class NodeHandle:
             NodeError: if the node has no such output, or several could be meant.
         """
         if output is None:
-            return self._host.make_packet(self._only_type())
+            return self._services.make_packet(self._only_type())
         try:
             type_name = self._types[output]
         except KeyError:
@@ -78,7 +155,7 @@ class NodeHandle:
             raise NodeError(
                 f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
             ) from None
-        return self._host.make_packet(type_name)
+        return self._services.make_packet(type_name)
 
     def get_ros_node(self) -> Any:
         """The real ``rclpy.node.Node``; what is created on it is served between hooks."""
@@ -118,7 +195,7 @@ class NodeHandle:
         self._user_data = data
 
     def get_user_data(self) -> Any:
-        """What was kept last, ``None`` before."""
+        """The data of the last :meth:`set_user_data`, ``None`` before."""
         return self._user_data
 
     def set_result(self, name: str, value: Any) -> None:
@@ -141,7 +218,7 @@ class NodeHandle:
 
     def shutdown(self, reason: str = "", drain_s: float = 5.0) -> None:
         """End the project: drained within ``drain_s`` seconds, with exit code 0."""
-        self._host.shutdown(str(reason), float(drain_s))
+        self._services.shutdown(str(reason), float(drain_s))
 
     def resolve_path(self, path: str) -> Path:
         """An existing file: absolute, or relative to plugin, node file or project folder.
@@ -176,7 +253,7 @@ class NodeHandle:
 
         It is for those who watch the run; the end itself is :meth:`shutdown`.
         """
-        self._host.expect_end(float(sim_s))
+        self._services.time.expected_end_s = float(sim_s)
 
     def _only_type(self) -> str:
         types = {*self._types.values()}
@@ -196,15 +273,15 @@ class NodeHandle:
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
-        self._host.own_simulated_time(read_s)
+        self._services.time.own(read_s)
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
-        self._host.on_close(callback)
+        self._services.closers.append(callback)
 
     def fail(self, error: BaseException) -> None:
         """End the node as failed, from any thread: for errors that no hook can raise."""
-        self._host.fail_from_thread(error)
+        self._services.fail_from_thread(error)
 
     def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
         """Send from another thread, as if a hook with those outputs had returned them.
@@ -213,14 +290,40 @@ class NodeHandle:
         having sent, once ``cancelled()`` is true or the node ends.
         """
         sent = threading.Event()
-        withdraw = self._host.offer_from_thread(packets, sent.set)
+        withdraw = self._services.offer_from_thread(packets, sent.set)
         while not sent.wait(_POLL_S):
-            if self._host.is_ending:
+            if self._services.is_ending:
                 return sent.is_set()
             if cancelled():
                 withdrawn = threading.Event()
                 withdraw(withdrawn.set)
-                while not withdrawn.wait(_POLL_S) and not self._host.is_ending:
+                while not withdrawn.wait(_POLL_S) and not self._services.is_ending:
                     pass
                 return sent.is_set()
         return True
+
+
+class Results:
+    """Results by name, on the disk as soon as they are known: a killed node keeps them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "results.json"
+        self._values: dict[str, Any] = {}
+
+    def set(self, name: str, value: Any) -> None:
+        """Keep a value. Raises ``TypeError`` or ``ValueError`` for what JSON does not know."""
+        value = _plain(value) if hasattr(value, "tolist") else value
+        is_finite = not isinstance(value, float) or math.isfinite(value)
+        values = {**self._values, str(name): value if is_finite else None}
+        text = json.dumps(values, indent=2, default=_plain, allow_nan=False)
+        new = self._file.with_suffix(".new")
+        new.write_text(text + "\n", "utf-8")
+        os.replace(new, self._file)  # a reader never finds half of it
+        self._values = values
+
+
+def _plain(value: Any) -> Any:
+    """A number or an array of NumPy as Python's own."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is nothing that JSON knows")

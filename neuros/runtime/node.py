@@ -13,17 +13,15 @@ from neuros.core.engine import Engine
 from neuros.core.hook import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
-from neuros.ports import Middleware, Tap, Way
+from neuros.ports import Middleware, PacketRecorder, Way
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.runtime.effects import NodeEffects
+from neuros.runtime.context import ContextSwitch
+from neuros.runtime.effects import NodeEffects, NodeRecorder
 from neuros.runtime.failures import Failures
-from neuros.runtime.handle import NodeHandle
-from neuros.runtime.host import NodeHost
-from neuros.runtime.keeper import Keeper
+from neuros.runtime.handle import NodeHandle, PluginServices
 from neuros.runtime.plugin import load_plugin
 from neuros.runtime.reports import NodeReports
 from neuros.runtime.sampling import Sampler
-from neuros.runtime.scope import Stage
 from neuros.runtime.simulated_time import SimulatedTime
 
 
@@ -31,12 +29,12 @@ class NodeRuntime:
     """Joins plugin, engine and transport of one node, and takes it through its life.
 
     It is the inbox of the transport; :class:`NodeEffects` are those of the engine, and
-    :class:`NodeHost` stands behind ``node``.
+    :class:`PluginServices` those of ``node``.
 
     Args:
         tell: reports to the supervisor, ``tell(kind, **fields)``.
         fail: called with an error that ends the project.
-        tap: where packets go that are recorded, ``None``: none are.
+        recorder: where packets go that are recorded, ``None``: none are.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
@@ -54,11 +52,11 @@ class NodeRuntime:
         self,
         file: NodeFile,
         middleware: Middleware,
-        stage: Stage,
+        contexts: ContextSwitch,
         *,
         tell: Callable[..., object],
         fail: Callable[[str, NeurosError], None],
-        tap: Tap | None = None,
+        recorder: PacketRecorder | None = None,
         log_file: Path | None,
         duration_sim_s: float | None,
         on_initialised: Callable[[], None] = lambda: None,
@@ -73,10 +71,12 @@ class NodeRuntime:
         self._clock = clock
         self._make_engine = make_engine
         self._tell = tell
-        self._stage = stage
+        self._contexts = contexts
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
-        self._scope = stage.scope(environment, file.node.plugin, file.folders.project, log_file)
-        self._enter = partial(stage.enter, self._scope)
+        self._context = contexts.make_context(
+            environment, file.node.plugin, file.folders.project, log_file
+        )
+        self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
         ros_node = middleware.ros_node(file)
@@ -84,19 +84,19 @@ class NodeRuntime:
         self.failures = Failures(self.name, file.node.plugin, self._logger, fail)
         self._guard = self.failures.guard
         self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
-        self._host = NodeHost(
+        self._services = PluginServices(
             self._transport,
             middleware.loop,
             self._time,
             self.failures,
             partial(tell, "shutdown", node=self.name),
         )
-        self.handle = NodeHandle(file, ros_node, self._host)
-        self._keeper: Keeper | None = None
+        self.handle = NodeHandle(file, ros_node, self._services)
+        self._recorder: NodeRecorder | None = None
         self._kept_on_arrival: frozenset[Connection] = frozenset()
-        if tap is not None:
-            self._keeper = Keeper(tap, middleware.encode, self._time, self._logger)
-            self._kept_on_arrival = self._keeper.wanted_on_arrival(file.connections)
+        if recorder is not None:
+            self._recorder = NodeRecorder(recorder, middleware.encode, self._time, self._logger)
+            self._kept_on_arrival = self._recorder.wanted_on_arrival(file.connections)
         self._sampler = Sampler()
         self._effects = NodeEffects(
             middleware,
@@ -104,7 +104,7 @@ class NodeRuntime:
             self.handle,
             self.failures,
             self._time,
-            self._keeper,
+            self._recorder,
             self._sampler,
             enter=self._enter,
             on_first_hook=lambda: tell("first_hook", node=self.name),
@@ -120,9 +120,9 @@ class NodeRuntime:
         return self.file.folders.run / self.name
 
     @property
-    def is_on_stage(self) -> bool:
-        """Whether the process has the surroundings of this node now."""
-        return self._stage.has(self._scope)
+    def has_context(self) -> bool:
+        """Whether the context of this node is in place now."""
+        return self._contexts.has(self._context)
 
     @property
     def sim_time(self) -> float | None:
@@ -131,8 +131,8 @@ class NodeRuntime:
 
     @property
     def waiting_threads(self) -> set[threading.Thread]:
-        """Those that wait until packets that they have offered are sent."""
-        return self._host.waiting_threads
+        """Threads that wait until the packets that they have offered are sent."""
+        return self._services.waiting_threads
 
     # ------------------------------------------------------------------ life
 
@@ -148,7 +148,7 @@ class NodeRuntime:
         node = self.file.node
         self.specs = load_plugin(node.plugin, self.name)
         types = {port.name: self._packet_type(port) for port in node.outputs}
-        self.engine = self._host.engine = self._make_engine(
+        self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
         self.reports.open(self.engine, self._logger)
@@ -181,7 +181,7 @@ class NodeRuntime:
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
-        self._host.stop()
+        self._services.stop()
 
     def finalise(self) -> None:
         """Run the finalise hooks and give up what the plugin holds; each fault is reported."""
@@ -193,9 +193,9 @@ class NodeRuntime:
                     self._tell("finalising", node=self.name, hook=spec.name)
                     self._guard(partial(self._effects.run, spec))
         self._tell("finalising", node=self.name, hook="")
-        if self._keeper is not None:
-            self._keeper.close()
-        self._host.close()
+        if self._recorder is not None:
+            self._recorder.close()
+        self._services.close()
         self._tell("finalising", node=self.name, hook=None)
 
     # ------------------------------------------------------------------ inbox
@@ -203,11 +203,11 @@ class NodeRuntime:
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
         if self._kept_on_arrival and connection in self._kept_on_arrival:
-            assert self._keeper is not None
-            self._keeper.keep(Way.RECEIVED, str(connection), packet)
+            assert self._recorder is not None
+            self._recorder.keep(Way.RECEIVED, str(connection), packet)
         engine = self.engine
         assert engine is not None
-        # What a hook sends on of a packet (its stamp, say) is shared while anybody holds that.
+        # What a hook sends on of a packet (its stamp, say) is shared while that is held.
         arrived = [packet]
         del packet
         try:
@@ -217,8 +217,8 @@ class NodeRuntime:
 
     def on_external_packet(self, port: Port, packet: Any) -> None:
         """A packet has arrived on an external topic."""
-        if self._keeper is not None:
-            self._keeper.keep(Way.HEARD, port.name, packet)
+        if self._recorder is not None:
+            self._recorder.keep(Way.HEARD, port.name, packet)
         if self._sampler.requests:
             self._sampler.note(str(port.external_topic), packet)
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
@@ -252,4 +252,4 @@ class NodeRuntime:
         return self.engine
 
     def _end_by_duration(self, duration_s: float) -> None:
-        self._host.shutdown(f"{duration_s:g} s of simulated time", 5.0)
+        self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)

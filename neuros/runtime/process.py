@@ -16,13 +16,12 @@ from neuros.core.engine import Engine
 from neuros.core.journal import JournalledEngine
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
-from neuros.ports import Middleware, Tap
+from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
-from neuros.runtime.callbacks import callback_error
+from neuros.runtime.context import ContextSwitch
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
-from neuros.runtime.failures import as_node_error
+from neuros.runtime.failures import as_node_error, callback_error
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.scope import Stage
 from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
 from neuros.stacks import StackFile
 
@@ -36,7 +35,7 @@ class NodeProcess:
     Args:
         files: the nodes that live here.
         make_middleware: joins them to the world; it may take its time to import ROS.
-        open_tap: where a node puts what is recorded; ``None``: nothing is.
+        open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
@@ -47,16 +46,16 @@ class NodeProcess:
         files: Sequence[NodeFile],
         make_middleware: MiddlewareFactory,
         *,
-        open_tap: Callable[[NodeFile], Tap] | None = None,
+        open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
         own_logs: bool = False,
     ) -> None:
         self._files = files
         self._make_middleware = make_middleware
-        self._open_tap = open_tap
+        self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._own_logs = own_logs
-        self._stage = Stage()
+        self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
         self._middleware: Middleware | None = None
         self._early_events: list[Event] = []
@@ -136,7 +135,7 @@ class NodeProcess:
     def look(self, wanted: Mapping[str, Any], asker: int) -> None:
         """Show an onlooker what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
         for node in tuple(self._nodes):
-            self._tell("glimpse", **node.reports.look(wanted.get(node.name, {}), asker))
+            self._tell("node_status", **node.reports.look(wanted.get(node.name, {}), asker))
 
     def probe(self, number: int) -> None:
         """Report the state of all nodes at one moment. Loop thread only."""
@@ -154,7 +153,7 @@ class NodeProcess:
         if self._stack_file is not None:
             self._stack_file.renew()
         for node in tuple(self._nodes):
-            node.reports.write_books()
+            node.reports.write_packet_log()
             self._tell("report", **node.reports.state(), is_final=is_final)
 
     def explain(self) -> None:
@@ -220,11 +219,11 @@ class NodeProcess:
             NodeRuntime(
                 file,
                 self._middleware,
-                self._stage,
+                self._contexts,
                 tell=self._tell,
                 fail=self._fail,
-                tap=None if self._open_tap is None else self._open_tap(file),
-                make_engine=Engine if self._open_tap is None else JournalledEngine,
+                recorder=None if self._open_recorder is None else self._open_recorder(file),
+                make_engine=Engine if self._open_recorder is None else JournalledEngine,
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
                 on_initialised=_keep_for_good,
@@ -269,14 +268,14 @@ class NodeProcess:
             return
         names = set(_filenames(error))
         suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
-        node = next((node for node in suspects if node.is_on_stage), (suspects or self._nodes)[0])
+        node = next((node for node in suspects if node.has_context), (suspects or self._nodes)[0])
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)
 
 
 def declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
-    """What the supervisor has to know of the hooks of a node."""
+    """The hooks of a node, as the supervisor needs them."""
     return {
         "hooks": [
             {

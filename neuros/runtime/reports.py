@@ -1,4 +1,4 @@
-"""What a node says of itself: to the supervisor, in its log, and in its books."""
+"""Reports of a node: its state and counters for the supervisor, its status for observers."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 
 from neuros.core.engine import Engine
 from neuros.core.explain import explain
-from neuros.core.ledger import snapshot
+from neuros.core.ledger import snapshot, steadily
 from neuros.ports import Logger, Middleware, Transport
-from neuros.project.model import NodeFile
+from neuros.project.model import Connection, NodeFile
 from neuros.runtime.effects import NodeEffects
-from neuros.runtime.glimpse import glimpse
-from neuros.runtime.packet_books import PacketBooks
+from neuros.runtime.packet_log import PacketLog
 from neuros.runtime.sampling import Sampler
 from neuros.runtime.simulated_time import SimulatedTime
 from neuros.stacks import LONG_S, Stack, stack_in
 
 _MAIN = threading.main_thread()
+_LAST_SENT = 16
 
 
 class NodeReports:
@@ -46,13 +46,13 @@ class NodeReports:
         self._sampler = sampler
         self._clock = clock
         self._engine: Engine | None = None
-        self._books: PacketBooks | None = None
+        self._packet_log: PacketLog | None = None
 
     def open(self, engine: Engine, logger: Logger) -> None:
         """There is an engine to report of; what is special about it is logged."""
         self._engine = engine
         folder = self._file.folders.run / self._file.node.name
-        self._books = PacketBooks(engine, self._transport.digests, folder)
+        self._packet_log = PacketLog(engine, self._transport.digests, folder)
         for hook in engine.free_running_hooks():
             logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
         for inlet in engine.untaken_inlets():
@@ -61,10 +61,10 @@ class NodeReports:
                 " acknowledged on arrival and dropped"
             )
 
-    def write_books(self) -> None:
+    def write_packet_log(self) -> None:
         """Write out when packets were sent and taken. Any thread."""
-        if self._books is not None:
-            self._books.write()
+        if self._packet_log is not None:
+            self._packet_log.write()
 
     def state(self) -> dict[str, Any]:
         """State and counters. Any thread."""
@@ -78,12 +78,12 @@ class NodeReports:
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "ledger": ledger,
             "stack": self._stack(ledger),
-            "fault": None if self._books is None else self._books.failure,
+            "fault": None if self._packet_log is None else self._packet_log.failure,
             "is_driving": engine is not None and engine.is_driving,
         }
 
     def _stack(self, ledger: Mapping[str, Any] | None) -> Stack | None:
-        """Where the plugin stands, if its hook runs for long, or the node is to end."""
+        """The stack of the plugin, if its hook runs for long, or the node is to end."""
         engine = self._engine
         if engine is None or ledger is None or threading.current_thread() is _MAIN:
             return None
@@ -104,7 +104,7 @@ class NodeReports:
             "node": self._file.node.name,
             "asker": asker,
             "sim_time": self._time.now_s,
-            "books": None if engine is None else glimpse(engine, self._clock()),
+            "books": None if engine is None else node_status(engine, self._clock()),
             "samples": self._sampler.ask(wanted, asker),
         }
 
@@ -126,3 +126,42 @@ class NodeReports:
         if engine is None:
             return [f"imports its plugin {self._file.node.plugin.name}"]
         return explain(engine, self._clock())
+
+
+def node_status(engine: Engine, now_ns: int) -> dict[str, Any]:
+    """Counters, state and latest times, short enough to be sent often. Any thread.
+
+    Besides what :func:`neuros.core.ledger.snapshot` tells: ``now_s``, the time of the status;
+    ``sent_ns``, by connection the position of the last packet sent and when the last few were;
+    ``taken_ns``, the position of the packet that a hook has started on last, and when that was.
+    Both lack the connections whose packet log has just been written out.
+    """
+    status = snapshot(engine, now_ns)
+    nothing: dict[str, list[Any]] = {}
+    status["hooks"] = {
+        name: [hook["executions"], hook["busy_s"]] for name, hook in status["hooks"].items()
+    }
+    return {
+        **status,
+        "now_s": now_ns / 1e9,
+        "sent_ns": steadily(lambda: _sent(engine), nothing),
+        "taken_ns": steadily(lambda: _taken(engine), nothing),
+        "is_paused": engine.is_paused,
+    }
+
+
+def _sent(engine: Engine) -> dict[str, list[Any]]:
+    return {
+        str(outlet.connection): [outlet.sent, outlet.sent_ns[-_LAST_SENT:].tolist()]
+        for outlet in engine.outlets.values()
+        if outlet.is_reliable and outlet.sent_ns
+    }
+
+
+def _taken(engine: Engine) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for key, inlet in engine.inlets.items():
+        count = min(len(inlet.taken), len(inlet.taken_ns))
+        if isinstance(key, Connection) and count:
+            found[str(key)] = [inlet.taken[count - 1], inlet.taken_ns[count - 1]]
+    return found

@@ -1,30 +1,34 @@
-"""What onlookers see of the packets that pass a node: as few as they ask for, and none unasked.
+"""Samples of the packets that pass a node, for observers that ask for them.
 
 Each onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
-So a node that nobody asks pays for one look at an empty table per packet, and one that is asked for
-so many packets per question at most, however fast it sends.
+Without a question a node looks at an empty table for each packet; with one, at so many packets per
+question at most, however fast it sends.
+
+Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small,
+and made without any library: every k-th pixel of every k-th row.
 """
 
 from __future__ import annotations
 
+import base64
+import math
+import re
 import time
-from collections.abc import Mapping
-from typing import Any
-
-from neuros.runtime.packet_fields import Path, all_fields, number_at, parse_path
-from neuros.runtime.preview import Preview, preview
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 MOST_VALUES = 20
 """Packets per question of which chosen fields are read."""
 
 
 class _Request:
-    """What is still wanted of the packets of one port, and what was found."""
+    """A request for packets of one port, and its answer so far."""
 
     def __init__(self, wanted: Mapping[str, Any]) -> None:
         self._names: list[str] = list(wanted.get("fields", ()))
-        self._paths: list[Path] = [parse_path(name) for name in self._names]
+        self._paths: list[FieldPath] = [parse_path(name) for name in self._names]
         self._wants_all = bool(wanted.get("all"))
         self._wants_image = bool(wanted.get("image"))
         self._most = int(wanted.get("most_elements", 0))
@@ -51,11 +55,11 @@ class _Request:
             if self._wants_image:
                 self._wants_image = False
                 self._image = preview(packet)
-        except Exception as error:  # whatever a plugin has put in there
+        except Exception as error:  # a plugin may have put anything in there
             self._fault = f"{type(error).__name__}: {error}"
 
     def answer(self) -> dict[str, Any]:
-        """What was found, ready for JSON; empty if no packet has passed."""
+        """The answer, ready for JSON; empty if no packet has passed."""
         found: dict[str, Any] = {}
         if self._values:
             found |= {"fields": self._names, "values": self._values}
@@ -73,7 +77,7 @@ class Sampler:
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
-            each onlooker; empty as long as nobody looks.
+            each onlooker; empty without requests.
     """
 
     def __init__(self) -> None:
@@ -109,3 +113,154 @@ class Sampler:
                     waiting.setdefault(port, []).append(request)
         self.requests = waiting
         return answers
+
+
+FieldPath: TypeAlias = "tuple[str | int, ...]"
+
+MOST_FIELDS = 300
+MOST_ELEMENTS = 12
+_LONGEST_TEXT = 200
+_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
+
+
+def parse_path(text: str) -> FieldPath:
+    """The steps of a path, names of fields and places in sequences."""
+    return tuple(
+        name if name else int(place) for name, place in (m.groups() for m in _STEP.finditer(text))
+    )
+
+
+def number_at(packet: Any, path: FieldPath) -> float | None:
+    """The number there; ``None`` if there is nothing, or no (finite) number."""
+    try:
+        for step in path:
+            packet = packet[step] if isinstance(step, int) else getattr(packet, step)
+        number = float(packet)
+    except (AttributeError, LookupError, TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def all_fields(packet: Any, most_elements: int = 0) -> dict[str, Any]:
+    """Every field, by its path: numbers, texts, and how long sequences are (``data.length``).
+
+    Args:
+        most_elements: of a sequence of numbers, so many are listed; 0: :data:`MOST_ELEMENTS`.
+    """
+    found: dict[str, Any] = {}
+    for path, value in _walk(packet, "", most_elements or MOST_ELEMENTS):
+        found[path] = value
+        if len(found) >= max(MOST_FIELDS, most_elements):
+            break
+    return found
+
+
+def _walk(value: Any, path: str, most: int) -> Iterator[tuple[str, Any]]:
+    if hasattr(value, "get_fields_and_field_types"):
+        for name in value.get_fields_and_field_types():
+            yield from _walk(getattr(value, name), f"{path}.{name}" if path else name, most)
+    elif isinstance(value, str):
+        yield path, value[:_LONGEST_TEXT]
+    elif isinstance(value, bool | int):
+        yield path, value
+    elif hasattr(value, "__len__"):
+        yield f"{path}.length", len(value)
+        yield from _elements(value, path, most)
+    else:
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            return
+        yield path, number if math.isfinite(number) else str(number)
+
+
+def _elements(values: Sequence[Any], path: str, most: int) -> Iterator[tuple[str, Any]]:
+    for place, each in enumerate(values[:most]):
+        yield from _walk(each, f"{path}[{place}]", most)
+
+
+WIDTH, HEIGHT = 320, 240
+"""A picture is no larger than this."""
+
+_MOST_COMPRESSED_BYTES = 400_000
+
+# Bytes per pixel, by the names of sensor_msgs/image_encodings.
+PIXEL_BYTES = {
+    "rgb8": 3,
+    "bgr8": 3,
+    "rgba8": 4,
+    "bgra8": 4,
+    "mono8": 1,
+    "8UC1": 1,
+    "8UC3": 3,
+    "mono16": 2,
+    "16UC1": 2,
+    "32FC1": 4,
+}
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A picture in the making: what was copied while the packet passed.
+
+    Attributes:
+        rows: of the pixels that are kept and those between them.
+        stride: every so many pixels one is kept.
+        pixel_bytes: 0 for what is compressed already, which is then the only row.
+    """
+
+    encoding: str
+    width: int
+    height: int
+    rows: tuple[bytes, ...]
+    stride: int
+    pixel_bytes: int
+
+    def encode(self) -> dict[str, Any]:
+        """The picture, ready for JSON: ``width``, ``height``, ``encoding``, ``data`` (base64)."""
+        size = self.pixel_bytes
+        if not size:
+            data = self.rows[0]
+            width, height = self.width, self.height
+        else:
+            width, height = -(-self.width // self.stride), len(self.rows)
+            picture = bytearray(width * height * size)
+            for y, row in enumerate(self.rows):
+                begin = y * width * size
+                for byte in range(size):
+                    picture[begin + byte : begin + width * size : size] = row[
+                        byte :: size * self.stride
+                    ]
+            data = bytes(picture)
+        return {
+            "width": width,
+            "height": height,
+            "of": [self.width, self.height],
+            "encoding": self.encoding,
+            "data": base64.b64encode(data).decode(),
+        }
+
+
+def preview(packet: Any) -> Preview:
+    """Copy what a picture needs from a ``sensor_msgs`` Image or CompressedImage.
+
+    Raises:
+        ValueError: if it is none that can be shown.
+    """
+    if hasattr(packet, "format"):
+        data = bytes(packet.data)
+        if len(data) > _MOST_COMPRESSED_BYTES:
+            raise ValueError(f"a compressed image of {len(data)} bytes is too large to be shown")
+        return Preview(packet.format, 0, 0, (data,), 1, 0)
+    size = PIXEL_BYTES.get(packet.encoding)
+    if size is None:
+        raise ValueError(f"images with encoding '{packet.encoding}' are not shown")
+    width, height, step = packet.width, packet.height, packet.step or packet.width * size
+    pixels = memoryview(packet.data).cast("B")
+    if not (width and height) or step < width * size or len(pixels) < step * height:
+        raise ValueError(f"{len(pixels)} bytes are no image of {width} x {height}, {step} per row")
+    stride = max(1, -(-width // WIDTH), -(-height // HEIGHT))
+    rows = tuple(
+        bytes(pixels[y * step : y * step + width * size]) for y in range(0, height, stride)
+    )
+    return Preview(packet.encoding, width, height, rows, stride, size)

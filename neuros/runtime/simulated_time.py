@@ -1,12 +1,12 @@
-"""Simulated time of a node: where it comes from, how it goes on, and when it is over."""
+"""Simulated time of a node: its source, its points in wall time, and the end of its duration."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 from neuros.project.model import Node
-from neuros.runtime.timeline import Timeline
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
@@ -43,7 +43,7 @@ class SimulatedTime:
 
     @property
     def now_s(self) -> float | None:
-        """Simulated seconds, ``None`` where nobody tells them."""
+        """Simulated seconds, ``None`` where they are unknown."""
         return None if self._read_s is None else self._read_s()
 
     def own(self, read_s: Callable[[], float]) -> None:
@@ -78,3 +78,27 @@ class SimulatedTime:
             "expected_end_s": self.expected_end_s,
             "timeline": self._timeline.take(),
         }
+
+
+class Timeline:
+    """Collects points of simulated and wall time until they are taken. Any thread.
+
+    Two threads that note one second at one moment may leave it there twice.
+    """
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+        self._points: list[tuple[float, float]] = []
+
+    def note(self, sim_s: float, wall_s: float) -> None:
+        """It is ``sim_s`` now; the first reading in each simulated second is kept."""
+        if sim_s >= self._next_s:
+            self._next_s = math.floor(sim_s) + 1.0
+            self._points.append((sim_s, wall_s))
+
+    def take(self) -> list[tuple[float, float]]:
+        """The points ``(simulated, wall)`` since this was last asked."""
+        count = len(self._points)
+        taken = self._points[:count]
+        del self._points[:count]
+        return taken

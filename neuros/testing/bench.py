@@ -12,9 +12,9 @@ from neuros.core.engine import Engine
 from neuros.core.ledger import snapshot
 from neuros.errors import NeurosError, NodeError
 from neuros.project.model import NodeFile
+from neuros.runtime.context import ContextSwitch
 from neuros.runtime.handle import NodeHandle
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.scope import Stage
 from neuros.testing.neighbours import Neighbours
 from neuros.testing.stand_ins import Record, Topics, Workbench
 from neuros.testing.step_loop import ManualClock, StepLoop
@@ -45,14 +45,14 @@ class NodeBench:
         self._topics = Topics()
         bench = Workbench(self._loop, self._topics, self.log)
         self._ends = Neighbours(file, bench.hub)
-        self._stage = Stage()
-        self._stage.hide_from_nodes(file.folders.project)
+        self._contexts = ContextSwitch()
+        self._contexts.hide_from_nodes(file.folders.project)
         (file.folders.run / file.node.name).mkdir(parents=True, exist_ok=True)
         with self._on_stage():
             self._runtime = NodeRuntime(
                 file,
                 bench,
-                self._stage,
+                self._contexts,
                 tell=self._listen,
                 fail=self._fail,
                 log_file=None,
@@ -184,12 +184,12 @@ class NodeBench:
 
     @contextlib.contextmanager
     def _on_stage(self) -> Iterator[None]:
-        """The surroundings of the node for a while; those of the test again afterwards."""
+        """The context of the node for a while; that of the test again afterwards."""
         folder = os.getcwd()
         os.chdir(self._file.folders.run)
         try:
             with without_spinning():
                 yield
         finally:
-            self._stage.leave()
+            self._contexts.leave()
             os.chdir(folder)

@@ -44,7 +44,7 @@ def look_on(
             if messages is None:
                 return
             for message in messages:
-                if message["kind"] != "glimpse":
+                if message["kind"] != "node_status":
                     continue
                 for port, sample in message["samples"].items():
                     name = names[message["node"], port]

@@ -70,7 +70,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image, as :mod:`neuros.runtime.preview` encodes it."""
+    """An image, as :mod:`neuros.runtime.sampling` encodes it."""
 
     image: Mapping[str, Any]
 

@@ -13,7 +13,7 @@ from neuros.core.engine import Engine
 from neuros.core.flow import Outlet
 from neuros.core.journal import JournalledEngine
 from neuros.project.model import Connection
-from neuros.runtime.keeper import Keeper
+from neuros.runtime.effects import NodeRecorder
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_without_its_books_a_connection_counts_and_notes_no_times(switch: Any) -
 
 def test_without_the_recording_neither_packets_nor_events_are_kept(switch: Any) -> None:
     taken_out = switch.without_recording()
-    assert (Keeper, "keep") in taken_out
+    assert (NodeRecorder, "keep") in taken_out
     for event in ("on_packet", "on_acknowledgement", "_run"):
         assert taken_out[JournalledEngine, event] is getattr(Engine, event)
 

@@ -12,7 +12,7 @@ LINK = "a.o -> b.x"
 STATES = ("waiting", "blocked", "executing", "idle", "registering", "scheduling", "paused")
 
 
-def glimpse(node: str, now_s: float, **books: Any) -> dict[str, Any]:
+def node_status(node: str, now_s: float, **books: Any) -> dict[str, Any]:
     spent = {state: books.get(state, 0.0) for state in STATES}
     return {
         "node": node,
@@ -45,14 +45,14 @@ def test_rates_are_those_of_the_last_second() -> None:
     figures = Figures()
     for tenth in range(40):
         sent = tenth if tenth < 20 else 20 + (tenth - 20) * 10
-        figures.take(glimpse("a", 100 + tenth / 10, outgoing=outgoing(sent)))
+        figures.take(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(100.0)
 
 
 def test_a_connection_has_the_counters_of_both_its_ends() -> None:
     figures = Figures()
-    figures.take(glimpse("b", 1.0, incoming=incoming(7, discarded=2)))
-    figures.take(glimpse("a", 1.0, outgoing=outgoing(8, outstanding=1)))
+    figures.take(node_status("b", 1.0, incoming=incoming(7, discarded=2)))
+    figures.take(node_status("a", 1.0, outgoing=outgoing(8, outstanding=1)))
     shown = figures.connections[LINK]
     assert {key: shown[key] for key in ("sent", "received", "discarded", "outstanding")} == {
         "sent": 8,
@@ -65,34 +65,36 @@ def test_a_connection_has_the_counters_of_both_its_ends() -> None:
 def test_where_the_sender_is_not_seen_the_rate_is_that_of_arrivals() -> None:
     figures = Figures()
     for second in range(3):
-        figures.take(glimpse("b", second, incoming=incoming(5 * second)))
+        figures.take(node_status("b", second, incoming=incoming(5 * second)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(5.0)
 
 
 def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first() -> None:
     for is_sender_first in (True, False):
         figures = Figures()
-        glimpses = [
-            glimpse("a", 1.0, outgoing=outgoing(12), sent_ns={LINK: [12, [7_000_000, 9_000_000]]}),
-            glimpse("b", 1.0, incoming=incoming(11), taken_ns={LINK: [11, 7_500_000]}),
+        statuses = [
+            node_status(
+                "a", 1.0, outgoing=outgoing(12), sent_ns={LINK: [12, [7_000_000, 9_000_000]]}
+            ),
+            node_status("b", 1.0, incoming=incoming(11), taken_ns={LINK: [11, 7_500_000]}),
         ]
-        for each in glimpses if is_sender_first else reversed(glimpses):
+        for each in statuses if is_sender_first else reversed(statuses):
             figures.take(each)
-        figures.take(glimpses[0])
+        figures.take(statuses[0])
         assert figures.connections[LINK]["latency_ms"] == pytest.approx(0.5)
 
 
 def test_shares_are_seconds_of_each_state_per_second() -> None:
     figures = Figures()
-    figures.take(glimpse("a", 1.0, executing={"f": 1.0}, waiting={"x": 2.0}))
-    figures.take(glimpse("a", 2.0, executing={"f": 1.25}, waiting={"x": 2.5, "y": 0.25}))
+    figures.take(node_status("a", 1.0, executing={"f": 1.0}, waiting={"x": 2.0}))
+    figures.take(node_status("a", 2.0, executing={"f": 1.25}, waiting={"x": 2.5, "y": 0.25}))
     shares = figures.nodes["a"]["shares"]
     assert (shares["executing"], shares["waiting"]) == (0.25, 0.75)
 
 
 def test_hooks_have_their_count_and_mean_time() -> None:
     figures = Figures()
-    figures.take(glimpse("a", 1.0, hooks={"f": [10, 0.05], "g": [0, 0.0]}))
+    figures.take(node_status("a", 1.0, hooks={"f": [10, 0.05], "g": [0, 0.0]}))
     hooks = figures.nodes["a"]["hooks"]
     assert hooks["f"] == {"executions": 10, "rate_hz": 0.0, "mean_ms": pytest.approx(5.0)}
     assert hooks["g"]["mean_ms"] is None
@@ -101,8 +103,8 @@ def test_hooks_have_their_count_and_mean_time() -> None:
 def test_the_real_time_factor_is_that_of_now() -> None:
     figures = Figures()
     assert figures.real_time_factor is None
-    figures.take(glimpse("a", 10.0, sim_time=3.0))
-    figures.take(glimpse("a", 11.0, sim_time=5.0))
+    figures.take(node_status("a", 10.0, sim_time=3.0))
+    figures.take(node_status("a", 11.0, sim_time=5.0))
     assert (figures.sim_time, figures.real_time_factor) == (5.0, 2.0)
 
 
@@ -113,17 +115,17 @@ def test_a_node_that_loads_its_plugin_has_no_figures_yet() -> None:
 
 
 def lost(sent: list[int], received: list[int], hooks: list[float] | None = None) -> int:
-    """What is shown as lost after a glimpse of both ends every 200 ms.
+    """What is shown as lost after a status of both ends every 200 ms.
 
     Args:
-        hooks: for how long a hook of the receiver has been executing at each glimpse, in seconds.
+        hooks: for how long a hook of the receiver has been executing at each status, in seconds.
     """
     figures = Figures()
     for place, (out, arrived) in enumerate(zip(sent, received, strict=True)):
         now_s, for_s = 10 + 0.2 * place, hooks[place] if hooks else 0.0
         hook = {"name": "f", "for_s": for_s, "executions": 1} if for_s else None
-        figures.take(glimpse("a", now_s, outgoing=outgoing(out, is_reliable=False)))
-        figures.take(glimpse("b", now_s, incoming=incoming(arrived), hook=hook))
+        figures.take(node_status("a", now_s, outgoing=outgoing(out, is_reliable=False)))
+        figures.take(node_status("b", now_s, incoming=incoming(arrived), hook=hook))
     return int(figures.connections[LINK]["lost"])
 
 
@@ -147,16 +149,16 @@ def test_what_waits_for_a_hook_to_end_is_not_lost() -> None:
 
 def test_nothing_is_lost_on_a_reliable_connection() -> None:
     figures = Figures()
-    figures.take(glimpse("a", 1.0, outgoing=outgoing(5)))
+    figures.take(node_status("a", 1.0, outgoing=outgoing(5)))
     assert figures.connections[LINK]["lost"] == 0
 
 
 def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     figures = Figures()
     figures.take(
-        glimpse("a", 1.0, outgoing=outgoing(5, 1), sim_time=1.0, hook={"name": "f", "for_s": 1})
+        node_status("a", 1.0, outgoing=outgoing(5, 1), sim_time=1.0, hook={"name": "f", "for_s": 1})
     )
-    figures.take(glimpse("b", 1.0, incoming=incoming(1)))
+    figures.take(node_status("b", 1.0, incoming=incoming(1)))
     nothing = dict.fromkeys(STATES, 0.0) | {"executing": {}, "waiting": {}, "blocked": {}}
     ends = {
         "a": ({LINK: {"sent": 8, "outstanding": 0}}, {}, {"executing": {"f": 1.0}, "idle": 3.0}),

@@ -13,7 +13,7 @@ from PIL import Image as Decoder
 from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.dashboard.pictures import data_url
-from neuros.runtime.preview import preview
+from neuros.runtime.sampling import preview
 
 
 def message(width: int, height: int, encoding: str, data: bytes, step: int = 0) -> Image:

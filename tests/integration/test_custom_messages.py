@@ -22,7 +22,7 @@ from neuros.errors import EnvironmentFault
 from neuros.launch.docker.images import images_for
 from neuros.launch.domain import choose_domain
 from neuros.launch.environments.choice import HERE
-from neuros.messages.installed import Ros
+from neuros.messages.package import Ros
 
 PROJECT = Path(__file__).parent / "custom_messages"
 PACKAGES = ("demo_msgs", "demo_more_msgs")

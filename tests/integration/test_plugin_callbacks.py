@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from neuros.errors import NodeError
 from neuros.launch.domain import choose_domain
-from neuros.runtime.callbacks import callback_error
+from neuros.runtime.failures import callback_error
 from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.messages import message_class

@@ -86,12 +86,12 @@ def test_what_nodes_show_goes_to_the_onlooker_that_asked(run: Run) -> None:
     looks = told(node, 2)
     assert [look["wanted"] for look in looks] == [{"a": {"x": {}}}, {}]
     for look in looks:
-        node.send("glimpse", node="a", asker=look["asker"], samples=look["wanted"].get("a", {}))
+        node.send("node_status", node="a", asker=look["asker"], samples=look["wanted"].get("a", {}))
     run.hear(2)
     for onlooker, samples in ((first, {"x": {}}), (second, {})):
         run.onlookers.tell("log", severity="INFO", text="that is all")
-        found = [each for each in told(onlooker, 3) if each["kind"] in ("glimpse", "log")]
-        assert [each["kind"] for each in found[:2]] == ["glimpse", "log"]
+        found = [each for each in told(onlooker, 3) if each["kind"] in ("node_status", "log")]
+        assert [each["kind"] for each in found[:2]] == ["node_status", "log"]
         assert found[0]["samples"] == samples
     for lines in (node, first, second):
         lines.close()

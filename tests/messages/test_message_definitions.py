@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.messages.definition import read_definition
+from neuros.messages.checking import read_definition
 
 
 def problems_of(folder: Path, text: str, name: str = "Joints.msg") -> list[str]:

@@ -13,7 +13,7 @@ from message_packages import write_package
 
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
-from neuros.messages import building
+from neuros.messages import needed
 from neuros.messages.cache import Built, message_cache, sweep
 from neuros.messages.compilation import Compilers
 from neuros.messages.needed import Messages
@@ -276,9 +276,9 @@ class TestBuilding:
         messages = bench.messages()
         compilers = Compilers("gcc", "g++", ())
         monkeypatch.setattr(Compilers, "here", lambda: compilers)
-        monkeypatch.setattr(building, "_generate", lambda *_: file.write_text("float32 x\n"))
+        monkeypatch.setattr(needed, "_generate", lambda *_: file.write_text("float32 x\n"))
         for part in ("_others", "compile_package", "_install"):
-            monkeypatch.setattr(building, part, lambda *_: None)
+            monkeypatch.setattr(needed, part, lambda *_: None)
 
         with pytest.raises(EnvironmentFault, match="'a_msgs' was changed while it was built"):
             messages.make(Progress(io.StringIO()), {})

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import HookError, PluginError
-from neuros.runtime.nest2 import FUNCTIONS, MODELS, PARAMETERS, nest2_hint
-from neuros.runtime.plugin import load_plugin
+from neuros.runtime.plugin import FUNCTIONS, MODELS, PARAMETERS, load_plugin, nest2_hint
 from neuros.snn import reset_kernel
 from neuros.testing import PluginHarness
 

@@ -1,4 +1,4 @@
-"""What stands behind ``node``, seen through a harness: nothing here needs ROS processes."""
+"""Plugin services, used through a harness: nothing here needs ROS processes."""
 
 from __future__ import annotations
 

@@ -10,8 +10,14 @@ from geometry_msgs.msg import Point, Polygon, PoseStamped
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Bool, Float64MultiArray
 
-from neuros.runtime.packet_fields import MOST_ELEMENTS, all_fields, number_at, parse_path
-from neuros.runtime.sampling import MOST_VALUES, Sampler
+from neuros.runtime.sampling import (
+    MOST_ELEMENTS,
+    MOST_VALUES,
+    Sampler,
+    all_fields,
+    number_at,
+    parse_path,
+)
 
 
 def imu(z: float) -> Imu:

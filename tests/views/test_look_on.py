@@ -28,7 +28,7 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
                 fields = message["wanted"]["robot"]["imu"]["fields"]
                 sample = {"fields": fields, "values": [[1e9, *([0.5] * len(fields))]]}
                 channels.send_to(lines, "phase", phase="running", is_paused=False)
-                channels.send_to(lines, "glimpse", node="robot", samples={"imu": sample})
+                channels.send_to(lines, "node_status", node="robot", samples={"imu": sample})
     channels.close()
     onlooker.join(5.0)
     assert not onlooker.is_alive()

@@ -54,7 +54,7 @@ class ForwardClock:
 
 
 class SpoolWriter:
-    """Keeps the packets of one node (:class:`neuros.ports.Tap`).
+    """Keeps the packets of one node (:class:`neuros.ports.PacketRecorder`).
 
     Args:
         folder: the node's own in the run folder.
@@ -121,7 +121,7 @@ class SpoolWriter:
         self._size = 0
 
 
-def open_tap(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
+def open_recorder(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
     """What keeps the packets of a node."""
     return SpoolWriter(run / node, plan.streams.get(node, ()))
 

@@ -1,4 +1,4 @@
-"""The first executions of a node's hooks, as :mod:`neuros.runtime.packet_books` writes them."""
+"""The first executions of a node's hooks, as :mod:`neuros.runtime.packet_log` writes them."""
 
 from __future__ import annotations
 

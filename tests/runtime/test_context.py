@@ -1,4 +1,4 @@
-"""Nodes of one process take turns on its stage, and share nothing there."""
+"""Nodes of one process take turns, each in its own context."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from pathlib import Path
 
 import pytest
 
-from neuros.runtime.scope import Scope, Stage
+from neuros.runtime.context import Context, ContextSwitch
 
 
 @pytest.fixture
-def stage() -> Iterator[Stage]:
-    stage = Stage()
-    yield stage
-    stage.leave()
+def contexts() -> Iterator[ContextSwitch]:
+    contexts = ContextSwitch()
+    yield contexts
+    contexts.leave()
 
 
-Make = Callable[..., Scope]
+Make = Callable[..., Context]
 
 
 @pytest.fixture
-def scope(stage: Stage, tmp_path: Path) -> Make:
-    def make(log_file: Path | None = None, /, **environment: str) -> Scope:
+def context(contexts: ContextSwitch, tmp_path: Path) -> Make:
+    def make(log_file: Path | None = None, /, **environment: str) -> Context:
         plugin = tmp_path / "project" / "plugins" / "plugin.py"
         plugin.parent.mkdir(parents=True, exist_ok=True)
-        return stage.scope(environment, plugin, tmp_path / "project", log_file)
+        return contexts.make_context(environment, plugin, tmp_path / "project", log_file)
 
     return make
 
@@ -41,92 +41,98 @@ def getenv(name: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_each_node_has_its_own_variables_on_top_of_those_of_the_process(stage, scope, monkeypatch):
+def test_each_node_has_its_own_variables_on_top_of_those_of_the_process(
+    contexts, context, monkeypatch
+):
     monkeypatch.setenv("SHARED", "process")
-    ann, bob = scope(WHO="ann"), scope(WHO="bob", ONLY_BOB="1")
-    stage.enter(bob)
+    ann, bob = context(WHO="ann"), context(WHO="bob", ONLY_BOB="1")
+    contexts.enter(bob)
     assert (os.environ["WHO"], os.environ["ONLY_BOB"]) == ("bob", "1")
-    stage.enter(ann)
+    contexts.enter(ann)
     assert os.environ["WHO"] == "ann"
     assert "ONLY_BOB" not in os.environ
     assert os.environ["SHARED"] == "process"
 
 
-def test_a_scope_takes_nothing_from_the_node_that_plays_when_it_is_made(stage, scope):
-    stage.enter(scope(WHO="ann", ONLY_ANN="1"))
-    bob = scope(WHO="bob")
-    stage.enter(bob)
+def test_a_context_takes_nothing_from_the_node_in_whose_context_it_is_made(contexts, context):
+    contexts.enter(context(WHO="ann", ONLY_ANN="1"))
+    bob = context(WHO="bob")
+    contexts.enter(bob)
     assert "ONLY_ANN" not in os.environ
     assert bob.path.count(bob.path[0]) == 1
 
 
-def test_what_a_node_sets_stays_with_it(stage, scope):
-    ann, bob = scope(WHO="ann"), scope(WHO="bob")
+def test_what_a_node_sets_stays_with_it(contexts, context):
+    ann, bob = context(WHO="ann"), context(WHO="bob")
     held = os.environ
-    stage.enter(ann)
+    contexts.enter(ann)
     os.environ["LATER"] = "x"
-    stage.enter(bob)
+    contexts.enter(bob)
     assert "LATER" not in os.environ
-    stage.enter(ann)
+    contexts.enter(ann)
     assert held["LATER"] == "x"
 
 
-def test_c_libraries_see_the_variables_of_the_node_too(stage, scope, monkeypatch):
+def test_c_libraries_see_the_variables_of_the_node_too(contexts, context, monkeypatch):
     monkeypatch.setenv("COLOUR", "grey")
-    ann, bob = scope(COLOUR="red", SIZE="1"), scope()
-    stage.enter(ann)
+    ann, bob = context(COLOUR="red", SIZE="1"), context()
+    contexts.enter(ann)
     assert (getenv("COLOUR"), getenv("SIZE")) == ("red", "1")
-    stage.enter(bob)
+    contexts.enter(bob)
     assert (getenv("COLOUR"), getenv("SIZE")) == ("grey", "unset")
 
 
-def test_leaving_gives_the_process_its_own_surroundings_back(stage, scope):
+def test_leaving_gives_the_process_its_own_context_back(contexts, context):
     before = dict(os.environ), list(sys.path), os.environ._data
-    stage.enter(scope(WHO="ann"))
-    stage.leave()
+    contexts.enter(context(WHO="ann"))
+    contexts.leave()
     assert (dict(os.environ), list(sys.path)) == before[:2]
     assert os.environ._data is before[2]
 
 
-def test_modules_beside_the_plugin_are_loaded_per_node_and_others_shared(stage, scope, tmp_path):
-    ann, bob = scope(), scope()
+def test_modules_beside_the_plugin_are_loaded_per_node_and_others_shared(
+    contexts, context, tmp_path
+):
+    ann, bob = context(), context()
     (tmp_path / "project/plugins/stage_sibling.py").write_text("import colorsys\nvalue = []\n")
     importlib.invalidate_caches()
     modules = []
     for each in (ann, bob, ann):
-        stage.enter(each)
+        contexts.enter(each)
         modules.append(importlib.import_module("stage_sibling"))
     assert modules[0] is modules[2]
     assert modules[0] is not modules[1]
     assert modules[0].colorsys is modules[1].colorsys
-    stage.leave()
+    contexts.leave()
     assert "stage_sibling" not in sys.modules
 
 
-def test_nest_belongs_to_the_first_node_that_imports_it(stage, scope, tmp_path, monkeypatch):
+def test_nest_belongs_to_the_first_node_that_imports_it(contexts, context, tmp_path, monkeypatch):
     site = tmp_path / "site"
     site.mkdir()
     (site / "nest.py").write_text("KERNEL = object()\n")
     monkeypatch.syspath_prepend(str(site))
-    monkeypatch.delitem(sys.modules, "nest", raising=False)
-    stage = Stage()
+    monkeypatch.setitem(sys.modules, "nest", None)  # so that this one does not outlive the test
+    monkeypatch.delitem(sys.modules, "nest")
+    contexts = ContextSwitch()
     ann, bob = (
-        stage.scope({}, tmp_path / "project" / "plugin.py", tmp_path / "project") for _ in "ab"
+        contexts.make_context({}, tmp_path / "project" / "plugin.py", tmp_path / "project")
+        for _ in "ab"
     )
-    stage.enter(ann)
+    contexts.enter(ann)
     kernel = importlib.import_module("nest").KERNEL
-    stage.enter(bob)
+    contexts.enter(bob)
     with pytest.raises(ImportError, match=r"one kernel per process.*--backend process"):
         importlib.import_module("nest")
-    stage.enter(ann)
+    contexts.enter(ann)
     assert importlib.import_module("nest").KERNEL is kernel
-    stage.leave()
+    contexts.leave()
     assert importlib.import_module("nest").KERNEL is kernel
 
 
-def test_a_virtual_environment_below_the_project_is_shared(stage, tmp_path, monkeypatch):
+def test_a_virtual_environment_below_the_project_is_shared(contexts, tmp_path, monkeypatch):
     project = Path(sys.prefix).parent
-    each = stage.scope({}, project / "plugin.py", project)
+    each = contexts.make_context({}, project / "plugin.py", project)
     shared = importlib.import_module("pytest")
     assert Path(shared.__file__).is_relative_to(project)
     assert not each.hides(shared)
@@ -137,12 +143,12 @@ def test_each_node_writes_to_its_own_log(tmp_path):
     program = """
         import os, sys
         from pathlib import Path
-        from neuros.runtime.scope import Stage
-        stage, folder = Stage(), Path(sys.argv[1])
-        nodes = [stage.scope({}, folder / "plugin.py", folder, folder / name / "node.log")
+        from neuros.runtime.context import ContextSwitch
+        contexts, folder = ContextSwitch(), Path(sys.argv[1])
+        nodes = [contexts.make_context({}, folder / "plugin.py", folder, folder / name / "node.log")
                  for name in ("ann", "bob")]
         for number, node in enumerate(nodes * 2):
-            stage.enter(node)
+            contexts.enter(node)
             print(f"print {number}", flush=True)
             os.system(f"echo child {number} >&2")
     """

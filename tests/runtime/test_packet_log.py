@@ -16,8 +16,8 @@ from neuros.core.inputs import Inlet
 from neuros.core.trace import Trace
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection
-from neuros.runtime import packet_books
-from neuros.runtime.packet_books import PacketBooks
+from neuros.runtime import packet_log
+from neuros.runtime.packet_log import PacketLog
 
 LEAVING = Connection("node", "out", "other", "in", 0, index=3)
 ARRIVING = Connection("other", "out", "node", "in", 0, index=4)
@@ -41,7 +41,7 @@ def test_what_was_noted_is_written_and_taken_away(tmp_path: Path, node: Any) -> 
     node.outlets[LEAVING].spend(1000)
     node.inlets[ARRIVING].taken.append(1)
     node.inlets[ARRIVING].taken_ns.append(2000)
-    PacketBooks(node, digests, tmp_path).write()
+    PacketLog(node, digests, tmp_path).write()
     written = {path.name: numbers(tmp_path, path.name) for path in (tmp_path / "packets").iterdir()}
     assert written == {
         "3.sent_ns": [1000],
@@ -55,22 +55,22 @@ def test_what_was_noted_is_written_and_taken_away(tmp_path: Path, node: Any) -> 
 
 
 def test_what_comes_later_goes_behind_it(tmp_path: Path, node: Any) -> None:
-    books = PacketBooks(node, {}, tmp_path)
+    log = PacketLog(node, {}, tmp_path)
     for time_ns in (1, 2, 3):
         node.outlets[LEAVING].spend(time_ns)
-        books.write()
+        log.write()
     assert numbers(tmp_path, "3.sent_ns") == [1, 2, 3]
 
 
 def test_a_node_that_sends_nothing_has_no_files(tmp_path: Path, node: Any) -> None:
-    PacketBooks(node, {}, tmp_path).write()
+    PacketLog(node, {}, tmp_path).write()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_of_external_topics_nothing_is_kept(tmp_path: Path, node: Any) -> None:
     node.inlets["topic"].taken.append(1)
     node.inlets["topic"].taken_ns.append(5)
-    PacketBooks(node, {}, tmp_path).write()
+    PacketLog(node, {}, tmp_path).write()
     assert list(tmp_path.iterdir()) == []
     assert not node.inlets["topic"].taken
 
@@ -81,7 +81,7 @@ def test_first_executions_are_written_with_the_names_of_their_hooks(
     hook = Hook(HookSpec(HookKind.FUNCTION, test_a_file_does_not_grow_for_ever, (), ()), (), {})
     node.trace.note_execution(hook, 100, 250)
     node.trace.note_credit(LEAVING, 1, 300)
-    PacketBooks(node, {}, tmp_path).write()
+    PacketLog(node, {}, tmp_path).write()
     assert numbers(tmp_path, "executions") == [0, 100, 250]
     assert numbers(tmp_path, "credits") == [3, 1, 300]
     assert json.loads((tmp_path / "packets/hooks.json").read_text()) == [
@@ -93,11 +93,11 @@ def test_first_executions_are_written_with_the_names_of_their_hooks(
 def test_a_file_does_not_grow_for_ever(
     tmp_path: Path, node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(packet_books, "MOST_ENTRIES", 2)
-    books = PacketBooks(node, {}, tmp_path)
+    monkeypatch.setattr(packet_log, "MOST_ENTRIES", 2)
+    log = PacketLog(node, {}, tmp_path)
     for time_ns in (1, 2, 3):
         node.outlets[LEAVING].spend(time_ns)
-        books.write()
+        log.write()
     assert numbers(tmp_path, "3.sent_ns") == [1, 2]
     assert not node.outlets[LEAVING].sent_ns
 
@@ -105,11 +105,11 @@ def test_a_file_does_not_grow_for_ever(
 def test_a_full_disk_is_noted_and_the_run_goes_on(tmp_path: Path, node: Any) -> None:
     (tmp_path / "packets").mkdir()
     (tmp_path / "packets/3.sent_ns").symlink_to("/dev/full")
-    books = PacketBooks(node, {}, tmp_path)
+    log = PacketLog(node, {}, tmp_path)
     node.outlets[LEAVING].spend(1)
-    books.write()
-    assert books.failure is not None
-    assert "No space left on device" in books.failure
+    log.write()
+    assert log.failure is not None
+    assert "No space left on device" in log.failure
     node.outlets[LEAVING].spend(2)
-    books.write()
+    log.write()
     assert not node.outlets[LEAVING].sent_ns

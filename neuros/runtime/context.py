@@ -1,9 +1,9 @@
-"""What nodes of one process must not share: environment, modules of the project, output.
+"""The context of each node of a process: environment variables, modules of the project, output.
 
-The process is a *stage* on which one node plays at a time. When another one enters, the process
-gets that node's environment variables, import path, modules and log file. A process with one node
-switches once; a process with many switches before each hook, so this is kept to a microsecond or
-two: whole dictionaries are exchanged rather than filled.
+One context is in place at a time. Before a hook of another node runs, the process gets that node's
+environment variables, import path, modules and log file. A process with one node switches once; a
+process with many switches before each hook, so this is kept to a microsecond or two: whole
+dictionaries are exchanged rather than filled.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ _SHARED = (str(Path(sys.prefix)) + os.sep, str(Path(__file__).resolve().parents[
 _FOR_ONE_NODE = {"nest": "NEST has one kernel per process"}
 
 
-class Scope:
-    """The surroundings of one node, or those of the process itself; made by a :class:`Stage`.
+class Context:
+    """Environment variables, modules and output of one node, or of the process itself.
+
+    Made by :meth:`ContextSwitch.make_context`.
 
     Attributes:
         variables: environment variables of this node, on top of those of the process.
@@ -63,24 +65,24 @@ class Scope:
         return file.startswith(self.project) and not file.startswith(_SHARED)
 
 
-class Stage:
-    """The process, and the node that plays on it now."""
+class ContextSwitch:
+    """Puts the context of one node at a time in place."""
 
     def __init__(self) -> None:
-        self._process = Scope({}, _environ_data(), sys.path)
+        self._process = Context({}, _environ_data(), sys.path)
         self._current = self._process
         self._known_modules = len(sys.modules)
         self._owned: dict[str, _Owned] = {}
-        self._changes: dict[tuple[Scope, Scope], _Changes] = {}
+        self._changes: dict[tuple[Context, Context], _Changes] = {}
 
-    def scope(
+    def make_context(
         self,
         environment: Mapping[str, str],
         plugin: Path,
         project: Path,
         log_file: Path | None = None,
-    ) -> Scope:
-        """The surroundings for a node.
+    ) -> Context:
+        """The context for a node.
 
         Args:
             environment: variables of this node, on top of those of the process.
@@ -91,7 +93,7 @@ class Stage:
         environ = dict(self._process.environ)
         for key, value in environment.items():
             environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
-        return Scope(
+        return Context(
             environment,
             environ,
             [str(plugin.parent), *self._process.path],
@@ -99,38 +101,38 @@ class Stage:
             None if log_file is None else _open_log(log_file),
         )
 
-    def enter(self, scope: Scope) -> None:
-        """Make the surroundings those of ``scope``."""
+    def enter(self, context: Context) -> None:
+        """Put ``context`` in place."""
         current = self._current
-        if current is scope:
+        if current is context:
             return
         modules = sys.modules
         if len(modules) != self._known_modules:
             self._find_modules(current)
         for name in current.modules:
             modules.pop(name, None)
-        self._current = scope
-        self._set_variables(current, scope)
-        # Within os.environ itself, so that whoever holds a reference to it sees these, too.
-        os.environ._data = scope.environ  # type: ignore[attr-defined]
-        current.path, sys.path = sys.path, scope.path
-        if scope.modules:
-            modules.update(scope.modules)
+        self._current = context
+        self._set_variables(current, context)
+        # Within os.environ itself, so that other references to it show these, too.
+        os.environ._data = context.environ  # type: ignore[attr-defined]
+        current.path, sys.path = sys.path, context.path
+        if context.modules:
+            modules.update(context.modules)
         for owned in self._owned.values():
-            is_visible = scope is owned.owner or scope is self._process
+            is_visible = context is owned.owner or context is self._process
             if is_visible is not owned.is_visible:
                 owned.show(is_visible=is_visible)
         self._known_modules = len(modules)
-        if scope.log_fd is not None:
-            os.dup2(scope.log_fd, 1)
-            os.dup2(scope.log_fd, 2)
+        if context.log_fd is not None:
+            os.dup2(context.log_fd, 1)
+            os.dup2(context.log_fd, 2)
 
-    def has(self, scope: Scope) -> bool:
-        """Whether the surroundings are those of ``scope``."""
-        return self._current is scope
+    def has(self, context: Context) -> bool:
+        """Whether ``context`` is in place."""
+        return self._current is context
 
     def leave(self) -> None:
-        """Give the process its own surroundings back (but for its output, if a node has a log)."""
+        """Give the process its own context back (but for its output, if a node has a log)."""
         self.enter(self._process)
 
     def hide_from_nodes(self, project: Path) -> None:
@@ -138,14 +140,14 @@ class Stage:
         self._process.project = str(project) + os.sep
         self._known_modules = -1
 
-    def _find_modules(self, scope: Scope) -> None:
+    def _find_modules(self, context: Context) -> None:
         """Note which modules of the process are private to a node."""
         for name, module in tuple(sys.modules.items()):
-            if scope.hides(module):
-                scope.modules[name] = module
-        self._note_owned(scope)
+            if context.hides(module):
+                context.modules[name] = module
+        self._note_owned(context)
 
-    def _set_variables(self, old: Scope, new: Scope) -> None:
+    def _set_variables(self, old: Context, new: Context) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""
         changes = self._changes.get((old, new))
         if changes is None:
@@ -159,22 +161,22 @@ class Stage:
         for key, value in changes.new:
             os.putenv(key, value)
 
-    def _note_owned(self, scope: Scope) -> None:
+    def _note_owned(self, context: Context) -> None:
         for name in _FOR_ONE_NODE:
             module = sys.modules.get(name)
-            if module is not None and name not in self._owned and scope is not self._process:
-                self._owned[name] = _Owned(name, module, scope)
+            if module is not None and name not in self._owned and context is not self._process:
+                self._owned[name] = _Owned(name, module, context)
 
 
 class _Changes:
-    """Which variables differ between two scopes, encoded: looked up once, needed at each switch.
+    """Which variables differ between two contexts, encoded: looked up once, needed at each switch.
 
     Attributes:
-        gone: those that the new scope has not as a node, though perhaps as the process.
+        gone: those that the new context has not as a node, though perhaps as the process.
         new: the values of those that it has, and that are other ones than before.
     """
 
-    def __init__(self, old: Scope, new: Scope) -> None:
+    def __init__(self, old: Context, new: Context) -> None:
         key, value = os.environ.encodekey, os.environ.encodevalue
         self.gone = [key(name) for name in old.variables if name not in new.variables]
         self.new = [
@@ -190,7 +192,7 @@ class _Owned:
     It is a finder on ``sys.meta_path`` (``importlib.abc`` would cost 10 ms at the start).
     """
 
-    def __init__(self, name: str, module: ModuleType, owner: Scope) -> None:
+    def __init__(self, name: str, module: ModuleType, owner: Context) -> None:
         self.name, self.module, self.owner = name, module, owner
         self.is_visible = True
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuros.runtime.results import Results
+from neuros.runtime.handle import Results
 
 
 def results_in(folder: Path) -> object:

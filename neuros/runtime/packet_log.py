@@ -1,4 +1,4 @@
-"""When every packet was sent and taken, and its digest: written beside the node's log.
+"""The packet log of a node: when each packet was sent and taken, and its digest.
 
 ``<node>/packets/<index of the connection>.<what>`` are files of 8-byte numbers, in the byte order
 of the machine, one per packet:
@@ -41,8 +41,8 @@ MOST_ENTRIES = 8_000_000
 """Of a file, 64 MB; what comes later is counted and not listed."""
 
 
-class PacketBooks:
-    """Writes the books of one node.
+class PacketLog:
+    """Writes the packet log of one node.
 
     Args:
         folder: the node's own.
@@ -82,7 +82,7 @@ class PacketBooks:
         for connection, outlet in self._engine.outlets.items():
             yield f"{connection.index}.sent_ns", outlet.sent_ns
         for key, inlet in self._engine.inlets.items():
-            # Nobody knows when a packet of an external topic was sent: only room is made.
+            # The sending time of a packet of an external topic is unknown: only room is made.
             name = f"{key.index}." if isinstance(key, Connection) else ""
             yield name and f"{name}taken", inlet.taken
             yield name and f"{name}taken_ns", inlet.taken_ns

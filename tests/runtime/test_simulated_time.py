@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuros.runtime.timeline import Timeline
+from neuros.runtime.simulated_time import Timeline
 
 
 def test_the_first_reading_of_every_simulated_second_is_kept() -> None:
