@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 
 from neuros.errors import NodeError
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.plain_node import PlainNode, not_in_hooks
+from neuros.transport.lean_node import LeanNode, not_in_hooks
 from neuros.transport.ros_loop import RosLoop
 
 Fail: TypeAlias = Callable[[Any, BaseException], None]
@@ -37,7 +37,7 @@ class PluginCallbacks:
     """
 
     def __init__(
-        self, ros_node: PlainNode, loop: RosLoop, enter: Callable[[], None], fail: Fail
+        self, ros_node: LeanNode, loop: RosLoop, enter: Callable[[], None], fail: Fail
     ) -> None:
         self._loop = loop
         self._enter = enter

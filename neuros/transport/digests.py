@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from xxhash import xxh3_64, xxh3_64_intdigest
 
 from neuros.project.model import Connection
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
 from neuros.transport.message_buffers import MessageBuffers, message_buffers
 
@@ -51,8 +51,8 @@ def digest_of(packet: Any) -> int:
     kind: Any = type(packet)
     buffers = message_buffers(kind)
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
-        return _digest(message_carrier(kind).encode(buffers.leave_out(packet)), buffers, packet)
-    return _whole(message_carrier(kind).encode(packet))
+        return _digest(message_codec(kind).encode(buffers.leave_out(packet)), buffers, packet)
+    return _whole(message_codec(kind).encode(packet))
 
 
 class TriedDigest:
@@ -104,7 +104,7 @@ class _LargeDigest:
     """Digests messages that can be large."""
 
     def __init__(self, kind: type, buffers: MessageBuffers) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
 
     def __call__(self, packet: Any, data: bytes) -> int:

@@ -21,7 +21,7 @@ from rclpy.subscription import Subscription
 from neuros.ports import Inbox
 from neuros.project.model import NodeFile, Port
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.messages import message_class
 from neuros.transport.mismatches import Mismatches
 from neuros.transport.ros_loop import RosLoop
@@ -86,7 +86,7 @@ class ExternalTopics:
         )
 
     def _receiver(self, kind: type, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
-        decode = message_carrier(kind).decode
+        decode = message_codec(kind).decode
 
         def receive(data: bytes) -> None:
             if self._is_open:

@@ -10,14 +10,14 @@ import os
 from collections.abc import Callable
 
 from neuros.project.model import Connection, NodeFile
-from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.codecs import Decoder, Encoder, message_codec
 from neuros.transport.large_packets import LargeInput, LargeOutput, machine_token, slots_for
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.messages import message_class
 
 
-class LargeCarriers:
-    """The carriers of one node's large packets.
+class LargeCodecs:
+    """The codecs of one node's large packets.
 
     Attributes:
         inputs: what receives on each connection whose packets can be large.
@@ -35,7 +35,7 @@ class LargeCarriers:
         kind = message_class(self._node.input(connection.destination_input).type)
         buffers = message_buffers(kind)
         if buffers is None:
-            return message_carrier(kind)
+            return message_codec(kind)
         decoder = LargeInput(kind, buffers, is_reliable=connection.is_reliable)
         self.inputs[connection] = decoder
         return decoder

@@ -27,7 +27,7 @@ from weakref import ReferenceType, ref
 
 from neuros.errors import ProtocolError
 from neuros.project.model import Connection
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.message_buffers import MessageBuffers
 from neuros.transport.packet_segment import (
     SHARED_MEMORY,
@@ -67,7 +67,7 @@ class LargeOutput:
         warn: Callable[[str], object],
         folder: Path = SHARED_MEMORY,
     ) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
         self._writer = SegmentWriter(owner, slots, folder)
         self._owner = owner
@@ -113,7 +113,7 @@ class LargeInput:
         is_reliable: bool,
         folder: Path = SHARED_MEMORY,
     ) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
         self._is_reliable = is_reliable
         self._reader = SegmentReader(folder)

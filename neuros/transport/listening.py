@@ -19,8 +19,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from neuros.errors import EnvironmentFault
 from neuros.transport.dds_profile import dds_environment
+from neuros.transport.lean_node import LeanNode
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.teardown import give_up
 
@@ -68,7 +68,7 @@ class Listener:
         os.environ.update(dds_environment(os.environ))
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        node = PlainNode("neuros_recorder", context)
+        node = LeanNode("neuros_recorder", context)
         loop = RosLoop(context, self._fail)
         loop.add_node(node)
         node.create_timer(_LOOK_S, lambda: loop.guard(lambda: self._look(node, loop)))

@@ -13,8 +13,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
+from neuros.transport.lean_node import LeanNode
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
 from neuros.transport.teardown import give_up
 
 _LAST_S = 5.0
@@ -58,7 +58,7 @@ def play(
     os.environ.update(dds_environment(os.environ))
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
-    node = PlainNode("neuros_replay", context)
+    node = LeanNode("neuros_replay", context)
     publishers = {
         name: node.create_publisher(kinds[name], name, _qos(topic))
         for name, topic in topics.items()

@@ -19,11 +19,11 @@ from std_msgs.msg import UInt64
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.codecs import Decoder, Encoder, message_codec
 from neuros.transport.copying import make_packet
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.external import ExternalTopics
-from neuros.transport.large_carriers import LargeCarriers
+from neuros.transport.large_carriers import LargeCodecs
 from neuros.transport.large_packets import is_parcel
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.registration import LATCHED, Registration
@@ -34,13 +34,13 @@ _ANNOUNCE_S = 0.02
 
 @dataclass
 class _Way:
-    """How packets leave on one connection: bytes by ``publish``, made by ``carrier``.
+    """How packets leave on one connection: bytes by ``publish``, made by ``codec``.
 
     ``count_readers`` says how many read the topic now, whoever they are.
     """
 
     publish: Callable[[bytes], None]
-    carrier: Encoder
+    codec: Encoder
     digest: Digest
     count_readers: Callable[[], int]
 
@@ -58,7 +58,7 @@ class RosTransport:
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self._registrations: list[Registration] = []
-        self._large = LargeCarriers(file, ros_node.get_logger().warning)
+        self._large = LargeCodecs(file, ros_node.get_logger().warning)
         self._is_open = False
 
     def open(self, inbox: Inbox) -> None:
@@ -90,10 +90,10 @@ class RosTransport:
         encoded: dict[Encoder, tuple[bytes, int]] = {}
         for connection in connections:
             way = self._ways[connection]
-            found = encoded.get(way.carrier)
+            found = encoded.get(way.codec)
             if found is None:
-                data = way.carrier.encode(packet)
-                found = encoded[way.carrier] = (data, way.digest(packet, data))
+                data = way.codec.encode(packet)
+                found = encoded[way.codec] = (data, way.digest(packet, data))
                 if not is_parcel(data):
                     whole = data
             way.publish(found[0])
@@ -141,7 +141,7 @@ class RosTransport:
         )
         self._ways[connection] = _Way(
             data.handle.publish_raw,
-            message_carrier(kind),
+            message_codec(kind),
             digest_for(kind),
             data.get_subscription_count,
         )
@@ -205,7 +205,7 @@ class RosTransport:
     def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
         """The receiver of a connection is there, and lets us know ``note`` of itself."""
         way = self._ways[connection]
-        way.carrier = self._large.encoder(connection, note, way.count_readers) or way.carrier
+        way.codec = self._large.encoder(connection, note, way.count_readers) or way.codec
         inbox.on_registered(connection)
 
     def _subscribe(
@@ -241,10 +241,10 @@ def data_qos(connection: Connection) -> QoSProfile:
 
 
 def _decoding(
-    carrier: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
+    codec: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
 ) -> Callable[[bytes], None]:
     """What receives bytes: it delivers the packet, unless that was lost on its way."""
-    decode = carrier.decode
+    decode = codec.decode
 
     def receive(data: bytes) -> None:
         packet = decode(data)

@@ -14,14 +14,14 @@ from rclpy.signals import SignalHandlerOptions
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.transport.callbacks import Fail, PluginCallbacks
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
+from neuros.transport.lean_node import LeanNode, lean_node, without_spinning
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.outside import RosOutside
-from neuros.transport.plain_node import PlainNode, plain_node, without_spinning
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
@@ -75,7 +75,7 @@ class RosProcess:
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
         self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
-        self._ros_nodes: dict[str, PlainNode] = {}
+        self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
@@ -89,7 +89,7 @@ class RosProcess:
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
-        ros_node = plain_node(file, self._context)
+        ros_node = lean_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
         transport: Transport
@@ -108,7 +108,7 @@ class RosProcess:
         self._transports.append(transport)
         return transport
 
-    def ros_node(self, file: NodeFile) -> PlainNode:
+    def ros_node(self, file: NodeFile) -> LeanNode:
         """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
@@ -140,7 +140,7 @@ class RosProcess:
     def encode(self, packet: Any) -> bytes:
         """A packet as ROS serialises it."""
         kind: type = type(packet)
-        return message_carrier(kind).encode(packet)
+        return message_codec(kind).encode(packet)
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""

@@ -29,11 +29,11 @@ from neuros.project.model import NodeFile, Value
 from neuros.project.names import Names
 
 __all__ = [
+    "LeanNode",
     "Parameter",
     "ParameterNotDeclaredException",
-    "PlainNode",
+    "lean_node",
     "not_in_hooks",
-    "plain_node",
     "without_spinning",
 ]
 
@@ -48,7 +48,7 @@ _threads: list[int] = []
 _replaced: dict[str, Callable[..., Any]] = {}
 
 
-class PlainNode(Node):  # type: ignore[misc]
+class LeanNode(Node):  # type: ignore[misc]
     """Offers its parameters to others as soon as there is one besides those of ROS.
 
     Args:
@@ -130,9 +130,9 @@ class _Tasks:
         return getattr(self._executor, name)
 
 
-def plain_node(file: NodeFile, context: Context) -> PlainNode:
+def lean_node(file: NodeFile, context: Context) -> LeanNode:
     """The ROS node of a node of a project."""
-    return PlainNode(file.node.name, context, file.names, file.node.parameters)
+    return LeanNode(file.node.name, context, file.names, file.node.parameters)
 
 
 @contextmanager
