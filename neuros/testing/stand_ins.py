@@ -140,7 +140,7 @@ class RosNodeStandIn:
 
 
 class Topics:
-    """External topics in a test: what the node publishes is kept (``Outside`` of a transport)."""
+    """External topics in a test (``GraphBridge`` of a transport): what is published is kept."""
 
     heard: tuple[Connection, ...] = ()
 

@@ -11,8 +11,7 @@ from typing import Any, Protocol
 
 from rclpy.serialization import deserialize_message, serialize_message
 
-from neuros.transport.cdr import Decode, Encode, cdr
-from neuros.transport.cdr_parts import NOT_OURS
+from neuros.transport.cdr import NOT_OURS, Decode, Encode, cdr
 
 
 class Encoder(Protocol):

@@ -16,12 +16,12 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.ownership import is_unshared_inside, unheld
 
 
-class Outside(Protocol):
-    """What lies beyond the process: external topics, and listeners to the data topics."""
+class GraphBridge(Protocol):
+    """ROS graph bridge: external topics, and subscriptions of ROS to the data topics."""
 
     @property
     def heard(self) -> Collection[Connection]:
-        """The connections whose packets somebody listens to there."""
+        """The connections whose data topic has subscriptions."""
 
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...
@@ -88,7 +88,7 @@ class MemoryTransport:
         self,
         file: NodeFile,
         hub: MemoryHub,
-        outside: Outside,
+        bridge: GraphBridge,
         digest: Callable[[Any], int | None] | None = None,
         digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
@@ -97,14 +97,14 @@ class MemoryTransport:
         self._arrivals = hub.arrivals[file.node.name]
         self._connections = file.connections
         self._hub = hub
-        self._outside = outside
+        self._bridge = bridge
         self._is_open = False
         self._given_up: list[Any] = []
         self._digest = digest
         elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
         digested = [c for c in elsewhere if digest is not None and digests_of(c)]
         self.digests = {c: array("Q") for c in digested}
-        self.make_packet = outside.make_packet
+        self.make_packet = bridge.make_packet
         hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
@@ -116,7 +116,7 @@ class MemoryTransport:
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
         self._is_open = True
-        self._outside.open(inbox)
+        self._bridge.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
     def note_result(self, box: Sequence[Any]) -> None:
@@ -137,12 +137,12 @@ class MemoryTransport:
             self._channels[connection].send(self._hub.copy(packet))
         own = packet if self._is_unshared(packet) else self._hub.copy(packet)
         self._channels[last].send(own)
-        if self._outside.heard:
-            self._outside.show(connections, packet)
+        if self._bridge.heard:
+            self._bridge.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
-        self._outside.send_external(port, packet)
+        self._bridge.send_external(port, packet)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
@@ -172,7 +172,7 @@ class MemoryTransport:
         self._is_open = False
         self._given_up = []
         self._hub.leave(self._name)
-        self._outside.close()
+        self._bridge.close()
 
     def _note_digest(self, connections: Sequence[Connection], packet: Any) -> None:
         if not connections or self._digest is None:

@@ -21,8 +21,8 @@ from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.lean_node import LeanNode, lean_node, without_spinning
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
-from neuros.transport.outside import RosOutside
 from neuros.transport.ros import RosTransport
+from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
 from neuros.transport.teardown import give_up
@@ -96,12 +96,11 @@ class RosProcess:
         if self._hub is None:
             transport = RosTransport(file, ros_node, self._loop)
         else:
-            outside = RosOutside(file, ros_node, self._loop)
             is_asked = self._has_digests or self._is_recorded
             transport = MemoryTransport(
                 file,
                 self._hub,
-                outside,
+                RosGraphBridge(file, ros_node, self._loop),
                 digest_of if is_asked else self._tried_digest,
                 lambda c: not self._is_recorded or self._has_digests or not c.is_reliable,
             )
