@@ -13,19 +13,24 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.transport.callbacks import Fail, PluginCallbacks
 from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
-from neuros.transport.lean_node import LeanNode, lean_node, without_spinning
+from neuros.transport.lean_node import (
+    Fail,
+    LeanNode,
+    PluginCallbacks,
+    give_up,
+    lean_node,
+    without_spinning,
+)
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
-from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 _LINGER_S = 0.05

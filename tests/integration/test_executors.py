@@ -21,9 +21,8 @@ from std_msgs.msg import Int32
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import choose_domain
 from neuros.transport import ros_loop
-from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
-from neuros.transport.lean_node import LeanNode
+from neuros.transport.lean_node import LeanNode, PluginCallbacks
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 

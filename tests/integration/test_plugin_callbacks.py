@@ -19,12 +19,10 @@ from std_srvs.srv import Trigger
 from neuros.errors import NodeError
 from neuros.launch.domain import choose_domain
 from neuros.runtime.callbacks import callback_error
-from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.lean_node import LeanNode
+from neuros.transport.lean_node import LeanNode, PluginCallbacks, give_up
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.teardown import give_up
 
 LIMIT_S = 20.0
 
