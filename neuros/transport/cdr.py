@@ -2,11 +2,11 @@
 
 For a small message rclpy spends most of the time on looking up Python classes from C. Here the
 layout of a message class is worked out once: runs of numbers become one ``struct`` each, and only
-strings and sequences are looked at one by one. The encoding is the same (plain CDR, little-
-endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
-What is written has been checked (:mod:`neuros.transport.values`). Whatever is out of the ordinary,
-in a class or in bytes, is left to rclpy, and so are errors: single characters, more items than a
-bound allows, senders of the other byte order.
+strings and sequences are looked at one by one. The encoding is that of rclpy (plain CDR,
+little-endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
+Messages have been checked before (:mod:`neuros.transport.values`). Unusual classes and bytes are
+left to rclpy, and so are errors: single characters, more items than a bound allows, senders of the
+other byte order.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Codecs: a packet to the bytes that its data topic carries, and back.
 
 The transport publishes and receives bytes only. So what is behind them can differ between two
-connections of one output, and a packet is serialised once for all receivers with the same codec.
+connections of one output, and a packet is serialised once for all receivers with one codec.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Encoder(Protocol):
     """The sender's half of a codec; connections of one output share it where they can."""
 
     def encode(self, packet: Any) -> bytes:
-        """What is published for a packet, which may change as soon as this returns."""
+        """Serialise a packet, which may change as soon as this returns."""
 
 
 class Decoder(Protocol):

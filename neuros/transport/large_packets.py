@@ -2,14 +2,14 @@
 
 DDS copies a large message six or seven times on its way from one Python to another. Here the sender
 copies each buffer once, into a slot of a :mod:`segment <neuros.transport.packet_segment>`, and
-publishes on the same topic as always a *parcel*: the serialised message with empty buffers, and
+publishes on the data topic a *parcel*: the serialised message with empty buffers, and
 behind it a note of where they are. The receiver copies them out, as it takes the parcel, before
 it acknowledges anything.
 
 A parcel is told from an ordinary serialised message by the two option bytes of its encapsulation
 header, which are zero in the plain CDR of ROS (DDSI-RTPS 2.3, 10.5). A reader that knows nothing of
-this sees a message with empty buffers; therefore parcels are for receivers alone that have said
-that they can read them (:func:`machine_token`), on topics that nobody else reads.
+this sees a message with empty buffers; therefore parcels go only to receivers that have
+announced that they can read them (:func:`machine_token`), on topics without other readers.
 """
 
 from __future__ import annotations
@@ -101,8 +101,9 @@ class LargeOutput:
 class LargeInput:
     """The packets that arrive on one connection, with their buffers.
 
-    On a reliable connection the buffers stay where they are until somebody looks at them, or at the
-    latest until the hook after is about to start: before that is acknowledged, nobody writes there.
+    On a reliable connection the buffers stay in shared memory until a plugin reads them, or at the
+    latest until the hook after is about to start: the sender writes there only once that is
+    acknowledged.
     On one of best effort they are copied at once, and a packet that was overtaken counts as lost.
     """
 
@@ -188,7 +189,7 @@ class LargeCodecs:
         self.inputs: dict[Connection, LargeInput] = {}
 
     def decoder(self, connection: Connection) -> Decoder:
-        """What receives on a connection to this node."""
+        """The decoder of a connection to this node."""
         kind = message_class(self._node.input(connection.destination_input).type)
         buffers = message_buffers(kind)
         if buffers is None:
@@ -198,13 +199,13 @@ class LargeCodecs:
         return decoder
 
     def note(self, connection: Connection) -> str:
-        """What the receiver of a connection lets its sender know; empty: no parcels."""
+        """The note from the receiver of a connection to its sender; empty: no parcels."""
         return machine_token() if connection in self.inputs else ""
 
     def encoder(
         self, connection: Connection, note: str, count_readers: Callable[[], int]
     ) -> Encoder | None:
-        """What sends to a receiver that has let us know ``note``; ``None``: the plain way."""
+        """The encoder for a receiver that has sent ``note``; ``None``: :func:`message_codec`."""
         if not note or note != machine_token():
             return None
         kind = message_class(self._node.output(connection.source_output).type)
@@ -250,7 +251,7 @@ def message_of(parcel: bytes) -> bytes:
 
 @cache
 def machine_token(folder: Path = SHARED_MEMORY) -> str:
-    """What is equal in two processes that see the same shared memory as the same user.
+    """A token that is equal in two processes with common shared memory and user.
 
     Empty where large packets had better go through DDS.
     """
@@ -269,7 +270,7 @@ def slots_for(connections: Sequence[Connection]) -> int:
     """The slots that an output with these connections needs.
 
     What is outstanding on a reliable connection, its window, and the packet before, which a hook
-    may be working on; for one of best effort one more, since nobody waits while it is copied.
+    may be working on; for one of best effort one more, since its sender does not wait for the copy.
     """
     return max(each.window + (1 if each.is_reliable else 2) for each in connections)
 

@@ -110,7 +110,7 @@ class LeanNode(RosNode):  # type: ignore[misc]
 
     @property
     def executor(self) -> Any:
-        """What serves the node; tasks that a plugin has it run are parts of the node, too."""
+        """The executor of the node; tasks that a plugin creates there are part of the node."""
         found = super().executor
         return found if found is None or self._wrap is None else _Tasks(found, self._wrap)
 
@@ -122,7 +122,7 @@ class LeanNode(RosNode):  # type: ignore[misc]
         RosNode.executor.fset(self, executor)
 
     def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
-        """Wrap whatever is to run as a task from now on."""
+        """Wrap all callbacks that run as tasks from now on."""
         self._wrap = wrap
 
 
@@ -307,7 +307,7 @@ class PluginCallbacks:
         return subscribing
 
     def _answering(self, send_response: Callable[..., None]) -> Any:
-        """What has failed answers nothing."""
+        """A service does not answer after a failure."""
 
         def answering(*arguments: Any) -> None:
             if not self._is_over:
@@ -363,7 +363,7 @@ class PluginCallbacks:
 
     @types.coroutine
     def _entering_steps(self, steps: Coroutine[Any, Any, Any]) -> Generator[Any, Any, Any]:
-        """What runs between two steps of a coroutine may belong to another node."""
+        """Enter the node for each step: code of another node may run between two steps."""
         try:
             while True:
                 self._enter()
@@ -398,7 +398,7 @@ class _Rationed:
         self._left = 0
 
     def receive(self, callback: Any) -> Any:
-        """What to hand to rclpy, which asks for the signature of the plugin's ``callback``."""
+        """The callback for rclpy, which asks for the signature of the plugin's ``callback``."""
 
         @functools.wraps(callback)
         def receive(*message: Any) -> None:

@@ -1,4 +1,4 @@
-"""Listens to any topics of the ROS graph and passes on their messages as bytes.
+"""Listener to any topics of the ROS graph, which passes on their messages as bytes.
 
 A subscription gets nothing from a publisher that offers less than it asks for, and misses what was
 latched if it asks for less. So it is made as the publishers are, once there is one.
@@ -29,7 +29,7 @@ _DEPTH = 1000
 
 @dataclass(frozen=True)
 class FoundTopic:
-    """A topic that somebody publishes."""
+    """A topic with a publisher."""
 
     name: str
     type: str

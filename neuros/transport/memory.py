@@ -1,7 +1,7 @@
-"""Packets within one process: handed over in memory, in the order in which they were sent.
+"""The in-memory transport: packets within one process, in the order in which they were sent.
 
-What rclcpp calls intra-process communication. It needs no ROS itself: how a packet is copied is
-given from outside, which is also what makes it the deterministic transport of the tests.
+rclcpp calls it intra-process communication. It needs no ROS itself: its user passes the function
+that copies a packet. So it is also the deterministic transport of the tests.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class MemoryHub:
         self._waiting: list[Connection] = []
 
     def join(self, name: str, inbox: Inbox, connections: Sequence[Connection]) -> None:
-        """Add a node; whoever waited for it is told."""
+        """Add a node, and tell the senders that waited for it."""
         self.inboxes[name] = inbox
         self._waiting += [c for c in connections if c.source_node == name]
         for connection in tuple(self._waiting):
@@ -74,7 +74,7 @@ class MemoryHub:
 
 
 class MemoryTransport:
-    """Carries the packets of one node to the others in the same process.
+    """Carries the packets of one node to the others in its process.
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
     serialised for one, which is not done here otherwise. Once it gives ``None``, none are kept any
@@ -120,7 +120,7 @@ class MemoryTransport:
         self._hub.join(self._name, inbox, self._connections)
 
     def note_result(self, box: Sequence[Any]) -> None:
-        """Remember which packets of a hook's result nobody but NeuROS holds any more."""
+        """Remember which packets of a hook's result the plugin does not hold any more."""
         self._given_up = unheld(box)
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
@@ -186,7 +186,7 @@ class MemoryTransport:
             self._channels[connection].announce(digest)
 
     def _forget_digests(self) -> None:
-        """Keep none of what this node sends; half of them would tell nobody anything."""
+        """Keep none of what this node sends; half of them would be of no use."""
         self._digest = None
         for connection, channel in self._channels.items():
             if connection in self.digests:
@@ -228,9 +228,9 @@ class _Nobody:
 
 
 class _Channel:
-    """What is on its way on one connection: the last K + N packets, as a DDS reader keeps them.
+    """Packets on their way on one connection: the last K + N packets, as a DDS reader keeps them.
 
-    A sender that nobody acknowledges (BEST_EFFORT) may be faster than its receiver for ever; what
+    A sender without acknowledgements (BEST_EFFORT) may be faster than its receiver for ever; what
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 

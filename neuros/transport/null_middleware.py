@@ -1,8 +1,8 @@
 """A middleware that carries nothing, for one node without neighbours, with a real ROS node.
 
-What arrives, and when, is up to whoever plays the neighbours; what is sent goes nowhere. The ROS
-node is one of rclpy, so that plugins find all that they are used to, but callbacks that a plugin
-registers there are not served.
+The caller plays the neighbours: it decides which packets arrive, and when. Packets that the node
+sends go nowhere. The ROS node is one of rclpy, so that plugins find its whole interface, but
+callbacks that a plugin registers there are not served.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class HeldLoop:
         """Nothing has arrived meanwhile."""
 
     def post_from_thread(self, event: Event) -> None:
-        """Keep an event for whoever takes it."""
+        """Keep an event until the caller takes it."""
         self.from_threads.put(event)
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
-        """Timers are up to whoever plays the neighbours."""
+        """Timers are up to the caller."""
 
     def run(self) -> None:
         """There is nothing to run."""
@@ -150,7 +150,7 @@ class NullMiddleware:
         return message_class(type_name)
 
     def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
+        """The function that checks packets of a class before they are sent."""
         return checker(kind)
 
     def take_in(self) -> None:

@@ -1,4 +1,4 @@
-"""Publishes serialised messages on the ROS graph at given times."""
+"""Player of serialised messages: publishes them on the ROS graph at given times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neuros.transport.messages import message_class
 
 _LAST_S = 5.0
 _POLL_S = 0.01
-# A connection's own depth goes with acknowledgements, which nobody sends here.
+# A connection's own depth goes with acknowledgements, which the player does not get.
 _DEPTH = 1000
 
 

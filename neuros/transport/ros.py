@@ -1,4 +1,4 @@
-"""Packets over ROS 2 topics: the only use of rclpy on the data path.
+"""The ROS 2 transport: packets of a node over topics, and the registration of its connections.
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
 ``/ack`` (the position of the last packet that every taker has started on), and ``/reg``.
@@ -34,9 +34,9 @@ _ANNOUNCE_S = 0.02
 
 @dataclass
 class _Way:
-    """How packets leave on one connection: bytes by ``publish``, made by ``codec``.
+    """The way out of one connection: ``publish`` sends the bytes that ``codec`` makes.
 
-    ``count_readers`` says how many read the topic now, whoever they are.
+    ``count_readers`` returns the number of all subscriptions to the topic.
     """
 
     publish: Callable[[bytes], None]
@@ -252,7 +252,7 @@ class RosTransport:
 def _decoding(
     codec: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
 ) -> Callable[[bytes], None]:
-    """What receives bytes: it delivers the packet, unless that was lost on its way."""
+    """A receiver of bytes that delivers the packet, unless that was lost on its way."""
     decode = codec.decode
 
     def receive(data: bytes) -> None:

@@ -36,7 +36,7 @@ from neuros.transport.ros_loop import RosLoop
 
 _QOS_LOOK_S = 0.3
 _MOST_QOS_LOOKS = 20
-"""What DDS has told of, the graph lists a moment later; seconds later on a machine under load."""
+"""The graph lists an endpoint a moment after DDS reports it, or seconds later under load."""
 
 _ADVICE = 'give both the same, with "qos" in the project'
 
@@ -282,7 +282,7 @@ class QosCheck:
 
 
 def qos_differences(offered: QoSProfile, asked: QoSProfile) -> Iterator[tuple[str, str]]:
-    """Where a publisher offers less than a subscription asks for: ``(offered, asked)`` in words."""
+    """Policies, ``(offered, asked)``, by which a publisher offers less than a subscription asks."""
     reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
     if (offered.reliability, asked.reliability) == (best_effort, reliable):
         yield "best_effort", "reliable"

@@ -1,4 +1,4 @@
-"""Everything of ROS that the nodes of one process share: context, loop, and how they are joined."""
+"""The middleware of a process: the ROS context, loop and transports that its nodes share."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ class RosProcess:
         return message_class(type_name)
 
     def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
+        """The function that checks packets of a class before they are sent."""
         return checker(kind)
 
     def take_in(self) -> None:
