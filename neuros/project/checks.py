@@ -15,8 +15,8 @@ from neuros.project.budgets import budget_mistakes
 from neuros.project.draft import Draft
 from neuros.project.gazebo import remarks_on_gazebo
 from neuros.project.message_types import normalised
-from neuros.project.outside import outside_mistakes, outside_remarks
 from neuros.project.parameters import parameter_mistakes
+from neuros.project.ros_graph_checks import ros_graph_mistakes, ros_graph_remarks
 from neuros.project.source import Element
 from neuros.project.suggest import did_you_mean
 
@@ -40,14 +40,14 @@ def mistakes(draft: Draft) -> list[Problem]:
         *_duplicate_connections(draft),
         *_connection_ends(draft),
         *budget_mistakes(draft),
-        *outside_mistakes(draft),
+        *ros_graph_mistakes(draft),
         *parameter_mistakes(draft),
     ]
 
 
 def remarks(draft: Draft) -> list[Problem]:
     """What is allowed, but may be a mistake. For a project without mistakes."""
-    return sorted([*remarks_on_gazebo(draft), *_unconnected(draft), *outside_remarks(draft)])
+    return sorted([*remarks_on_gazebo(draft), *_unconnected(draft), *ros_graph_remarks(draft)])
 
 
 def _duplicate_nodes(draft: Draft) -> Iterator[Problem]:

@@ -13,11 +13,11 @@ from neuros.project.checks import mistakes, remarks
 from neuros.project.draft import Draft, read_draft
 from neuros.project.message_types import NO_PACKAGES, MessagePackages
 from neuros.project.model import Project
-from neuros.project.outside import names_of
 from neuros.project.overrides import apply_override
 from neuros.project.paths import Roots
 from neuros.project.plugin_checks import plugin_problems, unread_variables
 from neuros.project.renaming import apply_namespace, apply_remaps
+from neuros.project.ros_graph_checks import names_of
 from neuros.project.scanner import SourceError, display_name
 from neuros.project.suggest import did_you_mean
 

@@ -14,10 +14,10 @@ from typing import Any
 from neuros.project.budgets import budgets_to_json
 from neuros.project.model import Budgets, Connection, Folders, Node, NodeFile, Port, Project
 from neuros.project.names import Names
-from neuros.project.outside import names_from, names_to_json
 from neuros.project.parameters import parameters_of, parameters_to_json
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
+from neuros.project.ros_graph_checks import names_from, names_to_json
 
 _NO_BUDGETS = Budgets()
 _ENDS = ("source_node", "source_output", "destination_node", "destination_input")

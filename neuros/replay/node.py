@@ -21,8 +21,8 @@ from neuros.replay.comparison import Comparison
 from neuros.replay.debugging import is_quit
 from neuros.runtime.context import ContextSwitch
 from neuros.runtime.node import NodeRuntime
-from neuros.transport.alone import Alone, HeldLoop
 from neuros.transport.messages import decode, message_class
+from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
 _LOOK_S = 0.1
 
@@ -44,7 +44,7 @@ class ReplayedNode:
         self._file, self._recorded = file, recorded
         self._script = Script(recorded.journal)
         self._loop = HeldLoop(self._script.deliveries.append, self._note_loop_back)
-        self._middleware = Alone(file, self._loop)
+        self._middleware = NullMiddleware(file, self._loop)
         lacking = recorded.lacking()
         self.comparison = Comparison(recorded.sent(), recorded.message, lacking)
         self.failure: NeurosError | None = None

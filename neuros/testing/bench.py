@@ -18,7 +18,7 @@ from neuros.runtime.node import NodeRuntime
 from neuros.testing.neighbours import Neighbours
 from neuros.testing.stand_ins import Record, Topics, Workbench
 from neuros.testing.step_loop import ManualClock, StepLoop
-from neuros.transport.plain_node import without_spinning
+from neuros.transport.lean_node import without_spinning
 
 _MANY = 10_000
 """Hook executions after which :meth:`NodeBench.run` takes it that they will never end."""

@@ -12,9 +12,9 @@ from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.testing.step_loop import StepLoop
 from neuros.transport.copying import copy_packet, make_packet
+from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
-from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.values import checker
 
 _LEVELS = {
@@ -140,7 +140,7 @@ class RosNodeStandIn:
 
 
 class Topics:
-    """External topics in a test: what the node publishes is kept (``Outside`` of a transport)."""
+    """External topics in a test (``GraphBridge`` of a transport): what is published is kept."""
 
     heard: tuple[Connection, ...] = ()
 

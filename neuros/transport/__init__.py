@@ -1,1 +1,1 @@
-"""How packets travel: over ROS 2 topics between processes, or handed over within one."""
+"""Transports: ROS 2 topics between processes, memory within one."""

@@ -1,10 +1,10 @@
-"""Copies of ROS messages that come out as if they had travelled, and new messages.
+"""Copies of ROS messages, equal to what a receiver of their bytes gets; the message factory.
 
 The plain way is to serialise and to deserialise. For a small message that takes long (an ``Imu``
 30 µs), mostly for looking up Python classes from C. A message that has been checked
-(:mod:`neuros.transport.values`) holds what its receivers see already, so its values are taken over
-as they are, and only what can be changed is copied. A new message is a copy of the first one of its
-class: what its constructor does, it does once.
+(:mod:`neuros.transport.values`) holds what its receivers see already, so its copy shares
+its values, except those that can be changed. A new message is a copy of the first one of its class,
+so that its constructor runs once.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ def copy_packet(packet: Any) -> Any:
 
 def make_packet(type_name: str) -> Any:
     """A new message of a type in ROS notation, as its class without arguments would make it."""
-    return _maker(message_class(type_name))()
+    return _factory(message_class(type_name))()
 
 
 @cache
-def _maker(kind: Any) -> Callable[[], Any]:
+def _factory(kind: Any) -> Callable[[], Any]:
     default = kind()
     values = [(slot, getattr(default, slot)) for slot in kind.__slots__]
     changeable = {
-        field.slot: _maker_of(field) for field in schema(kind).fields if _can_change(field)
+        field.slot: _factory_of(field) for field in schema(kind).fields if _can_change(field)
     }
     shared = tuple((slot, value) for slot, value in values if slot not in changeable)
     made = tuple((slot, changeable[slot](value)) for slot, value in values if slot in changeable)
@@ -54,10 +54,10 @@ def _maker(kind: Any) -> Callable[[], Any]:
     return make
 
 
-def _maker_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
-    """From a default value to what makes it anew."""
+def _factory_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
+    """A function from a default value to the factory of its copies."""
     if field.is_message:
-        return lambda _: _maker(field.type.message)
+        return lambda _: _factory(field.type.message)
     copy = _copier_of(field)
     return lambda value: partial(copy, value)
 

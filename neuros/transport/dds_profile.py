@@ -1,9 +1,9 @@
-"""Which settings Fast DDS gets, and how far the nodes of a process look for each other.
+"""Settings of Fast DDS and the discovery range of the nodes of a process.
 
 ROS's range ``LOCALHOST`` ("this machine only") brings transports of its own, which announce a
 participant to the first 32 of the domain only: of 64 processes some never find each other. So
 NeuROS takes the range ``SYSTEM_DEFAULT`` instead, which leaves transports to the settings, and has
-settings with the same meaning and room for all 120 participants of a domain. ROS programs of the
+settings of equal meaning with room for all 120 participants of a domain. ROS programs of the
 user with the ranges ``LOCALHOST`` and ``SUBNET`` find such nodes, and are found.
 
 They use UDP alone. Fast DDS takes shared memory wherever both ends offer it on one host, and then
@@ -18,13 +18,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-"""Where Fast DDS 2 looks for its settings when the first ROS node of a process is created."""
+"""Names the settings that Fast DDS 2 reads when the first ROS node of a process is created."""
 
 PROFILES = Path(__file__).with_name("fast_dds.xml")
 """NeuROS's settings of Fast DDS for a network: what is lost there is sent again soon."""
 
 LOCAL_PROFILES = Path(__file__).with_name("fast_dds_local.xml")
-"""Those with transports that stay on this machine."""
+"""NeuROS's settings with transports that stay on this machine."""
 
 MOST_LOCAL_PARTICIPANTS = 120
 """Processes with ROS nodes that one domain has ports for (DDSI-RTPS 2.5, 9.6.2)."""
@@ -37,7 +37,7 @@ _LOCAL = {PROFILES_VARIABLE: str(LOCAL_PROFILES), RANGE_VARIABLE: "SYSTEM_DEFAUL
 
 
 def dds_environment(environ: Mapping[str, str]) -> dict[str, str]:
-    """What to add to ``environ`` before the first ROS node of a process is created.
+    """Variables to add to ``environ`` before the first ROS node of a process is created.
 
     Nothing if it names settings of the user's own. A range other than ``LOCALHOST``, and
     ``LOCALHOST`` with peers on other machines, are left to ROS.

@@ -1,8 +1,8 @@
-"""A number per packet that differs where packets differ: 64 bits of XXH3 over what is serialised.
+"""Digests of packets: 64 bits of XXH3 over the serialised message.
 
-It is the same however the packet travelled. The buffers of a large packet are not part of the bytes
-that are published, so the packet without them is digested, and then each buffer where it lies. XXH3
-is no cryptographic hash: it tells runs apart, not forgers from the honest. It was taken for its
+It does not depend on how the packet travelled. The published bytes of a large packet lack its
+buffers, so the packet without them is digested, and then each buffer where it lies. XXH3 is no
+cryptographic hash: it tells runs apart, not forgers from the honest. It was taken for its
 speed (a camera's 921,600 bytes in 0.03 ms, where BLAKE2b takes 1.6 ms and CRC-32 0.4 ms).
 """
 
@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from xxhash import xxh3_64, xxh3_64_intdigest
 
 from neuros.project.model import Connection
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
 from neuros.transport.message_buffers import MessageBuffers, message_buffers
 
@@ -27,7 +27,7 @@ Digest: TypeAlias = Callable[[Any, bytes], int]
 
 _WARMING_UP, _TRIED = 16, 48
 _DEAR = 0.02
-"""Share of a run that digests may cost where nobody has asked for them."""
+"""Share of a run that digests may cost unless the user has asked for them."""
 
 Digests: TypeAlias = "dict[Connection, array[int]]"
 
@@ -39,7 +39,7 @@ def make_digests(connections: Sequence[Connection]) -> Digests:
 
 @cache
 def digest_for(kind: type) -> Digest:
-    """What digests messages of a class."""
+    """The digest function of a message class."""
     buffers = message_buffers(kind)
     if buffers is None:
         return lambda packet, data: _whole(data)
@@ -51,12 +51,12 @@ def digest_of(packet: Any) -> int:
     kind: Any = type(packet)
     buffers = message_buffers(kind)
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
-        return _digest(message_carrier(kind).encode(buffers.leave_out(packet)), buffers, packet)
-    return _whole(message_carrier(kind).encode(packet))
+        return _digest(message_codec(kind).encode(buffers.leave_out(packet)), buffers, packet)
+    return _whole(message_codec(kind).encode(packet))
 
 
 class TriedDigest:
-    """Digests of packets in memory, for as long as they are cheap: that is found out once.
+    """Digests of packets in memory, for as long as they are cheap, which is measured once.
 
     A packet in memory is serialised for its digest alone. Of the first packets it is measured how
     long that takes, the median, as a share of the processor time in which they are sent; if that is
@@ -104,7 +104,7 @@ class _LargeDigest:
     """Digests messages that can be large."""
 
     def __init__(self, kind: type, buffers: MessageBuffers) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
 
     def __call__(self, packet: Any, data: bytes) -> int:
@@ -117,7 +117,7 @@ class _LargeDigest:
 
 
 def _whole(data: bytes) -> int:
-    """Of a whole message, padded to four bytes: so it arrives, whatever was sent (RTPS, 9.4.1)."""
+    """Of a whole message, padded to four bytes, as it arrives in any case (RTPS, 9.4.1)."""
     missing = -len(data) % 4
     return int(xxh3_64_intdigest(data + bytes(missing) if missing else data))
 

@@ -3,8 +3,8 @@
 ``events`` is rclpy's ``EventsExecutor``, one queue in C++, and the default: ``rclpy.spin`` with its
 ``SingleThreadedExecutor`` builds a new wait set for every callback and takes twice to three times
 as long for a round trip. But it is in rclpy's *experimental* package. Should a release move or
-change it, the loop falls back to ``wait_set``, on the public parts of the old executor: slower, and
-with the same order of events. The environment variable ``NEUROS_EXECUTOR`` asks for one of the two.
+change it, the loop falls back to ``wait_set``, on the public parts of the old executor: slower,
+with an equal order of events. The environment variable ``NEUROS_EXECUTOR`` asks for one of the two.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ OnFailure: TypeAlias = Callable[[BaseException], None]
 
 
 class Waker(Protocol):
-    """What ends a spin: the executor registers how it is to be woken, in the manner of a future."""
+    """Ends a spin; looks like a future, with which the executor registers how to wake it."""
 
     def add_done_callback(self, callback: Callable[[Any], None]) -> None: ...
     def remove_done_callback(self, callback: Callable[[Any], None]) -> None: ...
 
 
 class Executor(Protocol):
-    """What the loop needs of an executor."""
+    """The part of an rclpy executor that the loop needs."""
 
     def add_node(self, node: RosNode) -> object: ...
 
@@ -92,7 +92,7 @@ class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
             self.on_failure(error)
 
     def exception(self) -> BaseException | None:
-        """What the task has raised; nothing for the executor, which asks first."""
+        """The error of the task; ``None`` for the executor, which asks first."""
         if self._is_hidden:
             self._is_hidden = False
             return None
@@ -207,13 +207,13 @@ class WaitSetExecutor:
         left, has_run = self._most_that_waits(), True
         while not self._is_woken and left > 0:
             had_run, has_run = has_run, self._run_one_of_ros(0.0)
-            # What ended with a callback says "timeout" once, whatever has come meanwhile.
+            # A wait that a callback ended says "timeout" once, even if more has come meanwhile.
             if not (has_run or had_run):
                 return
             left -= has_run
 
     def _most_that_waits(self) -> int:
-        """How many callbacks can have been waiting at one moment."""
+        """The most callbacks that can wait at one moment."""
         return sum(
             sum(each.qos_profile.depth or _SERVICE_DEPTH for each in node.subscriptions)
             + len([*node.timers])

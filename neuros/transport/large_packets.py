@@ -2,14 +2,14 @@
 
 DDS copies a large message six or seven times on its way from one Python to another. Here the sender
 copies each buffer once, into a slot of a :mod:`segment <neuros.transport.packet_segment>`, and
-publishes on the same topic as always a *parcel*: the serialised message with empty buffers, and
+publishes on the data topic a *parcel*: the serialised message with empty buffers, and
 behind it a note of where they are. The receiver copies them out, as it takes the parcel, before
 it acknowledges anything.
 
 A parcel is told from an ordinary serialised message by the two option bytes of its encapsulation
 header, which are zero in the plain CDR of ROS (DDSI-RTPS 2.3, 10.5). A reader that knows nothing of
-this sees a message with empty buffers; therefore parcels are for receivers alone that have said
-that they can read them (:func:`machine_token`), on topics that nobody else reads.
+this sees a message with empty buffers; therefore parcels go only to receivers that have
+announced that they can read them (:func:`machine_token`), on topics without other readers.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from typing import Any
 from weakref import ReferenceType, ref
 
 from neuros.errors import ProtocolError
-from neuros.project.model import Connection
-from neuros.transport.carriers import message_carrier
-from neuros.transport.message_buffers import MessageBuffers
+from neuros.project.model import Connection, NodeFile
+from neuros.transport.codecs import Decoder, Encoder, message_codec
+from neuros.transport.message_buffers import MessageBuffers, message_buffers
+from neuros.transport.messages import message_class
 from neuros.transport.packet_segment import (
     SHARED_MEMORY,
     Overwritten,
@@ -67,7 +68,7 @@ class LargeOutput:
         warn: Callable[[str], object],
         folder: Path = SHARED_MEMORY,
     ) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
         self._writer = SegmentWriter(owner, slots, folder)
         self._owner = owner
@@ -100,8 +101,9 @@ class LargeOutput:
 class LargeInput:
     """The packets that arrive on one connection, with their buffers.
 
-    On a reliable connection the buffers stay where they are until somebody looks at them, or at the
-    latest until the hook after is about to start: before that is acknowledged, nobody writes there.
+    On a reliable connection the buffers stay in shared memory until a plugin reads them, or at the
+    latest until the hook after is about to start: the sender writes there only once that is
+    acknowledged.
     On one of best effort they are copied at once, and a packet that was overtaken counts as lost.
     """
 
@@ -113,7 +115,7 @@ class LargeInput:
         is_reliable: bool,
         folder: Path = SHARED_MEMORY,
     ) -> None:
-        self._plain = message_carrier(kind)
+        self._plain = message_codec(kind)
         self._buffers = buffers
         self._is_reliable = is_reliable
         self._reader = SegmentReader(folder)
@@ -168,6 +170,75 @@ class LargeInput:
         self._reader.close()
 
 
+class LargeCodecs:
+    """The codecs of one node's large packets.
+
+    A receiver tells with its registration which shared memory it sees (:func:`machine_token`); to
+    one that sees that of the sender, the output sends parcels. All receivers of an output share its
+    segment.
+
+    Attributes:
+        inputs: what receives on each connection whose packets can be large.
+    """
+
+    def __init__(self, file: NodeFile, warn: Callable[[str], object]) -> None:
+        self._node = file.node
+        self._connections = file.connections
+        self._warn = warn
+        self._outputs: dict[str, LargeOutput] = {}
+        self.inputs: dict[Connection, LargeInput] = {}
+
+    def decoder(self, connection: Connection) -> Decoder:
+        """The decoder of a connection to this node."""
+        kind = message_class(self._node.input(connection.destination_input).type)
+        buffers = message_buffers(kind)
+        if buffers is None:
+            return message_codec(kind)
+        decoder = LargeInput(kind, buffers, is_reliable=connection.is_reliable)
+        self.inputs[connection] = decoder
+        return decoder
+
+    def note(self, connection: Connection) -> str:
+        """The note from the receiver of a connection to its sender; empty: no parcels."""
+        return machine_token() if connection in self.inputs else ""
+
+    def encoder(
+        self, connection: Connection, note: str, count_readers: Callable[[], int]
+    ) -> Encoder | None:
+        """The encoder for a receiver that has sent ``note``; ``None``: :func:`message_codec`."""
+        if not note or note != machine_token():
+            return None
+        kind = message_class(self._node.output(connection.source_output).type)
+        buffers = message_buffers(kind)
+        if buffers is None:
+            return None
+        name = connection.source_output
+        if name not in self._outputs:
+            run = os.environ.get("NEUROS_RUN_ID") or f"pid{os.getpid()}"
+            self._outputs[name] = LargeOutput(
+                kind,
+                buffers,
+                owner=f"{run}_{self._node.name}_{name}",
+                slots=slots_for([each for each in self._connections if each.source_output == name]),
+                warn=self._warn,
+            )
+        self._outputs[name].add_receiver(count_readers)
+        return self._outputs[name]
+
+    def settle(self, connection: Connection, position: int) -> None:
+        """A receiver is about to acknowledge a position."""
+        decoder = self.inputs.get(connection)
+        if decoder is not None:
+            decoder.settle(position)
+
+    def close(self) -> None:
+        """Remove what this node has in shared memory, and give up what it has mapped."""
+        for output in self._outputs.values():
+            output.close()
+        for decoder in self.inputs.values():
+            decoder.close()
+
+
 def is_parcel(data: bytes) -> bool:
     """Whether these bytes are a parcel, and not a whole message."""
     return data[_OPTIONS] == _MARK
@@ -180,7 +251,7 @@ def message_of(parcel: bytes) -> bytes:
 
 @cache
 def machine_token(folder: Path = SHARED_MEMORY) -> str:
-    """What is equal in two processes that see the same shared memory as the same user.
+    """A token that is equal in two processes with common shared memory and user.
 
     Empty where large packets had better go through DDS.
     """
@@ -199,7 +270,7 @@ def slots_for(connections: Sequence[Connection]) -> int:
     """The slots that an output with these connections needs.
 
     What is outstanding on a reliable connection, its window, and the packet before, which a hook
-    may be working on; for one of best effort one more, since nobody waits while it is copied.
+    may be working on; for one of best effort one more, since its sender does not wait for the copy.
     """
     return max(each.window + (1 if each.is_reliable else 2) for each in connections)
 

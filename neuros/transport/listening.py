@@ -1,4 +1,4 @@
-"""Listens to any topics of the ROS graph and passes on their messages as bytes.
+"""Listener to any topics of the ROS graph, which passes on their messages as bytes.
 
 A subscription gets nothing from a publisher that offers less than it asks for, and misses what was
 latched if it asks for less. So it is made as the publishers are, once there is one.
@@ -19,10 +19,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from neuros.errors import EnvironmentFault
 from neuros.transport.dds_profile import dds_environment
+from neuros.transport.lean_node import LeanNode, give_up
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.teardown import give_up
 
 _LOOK_S = 0.1
 _DEPTH = 1000
@@ -30,7 +29,7 @@ _DEPTH = 1000
 
 @dataclass(frozen=True)
 class FoundTopic:
-    """A topic that somebody publishes."""
+    """A topic with a publisher."""
 
     name: str
     type: str
@@ -68,7 +67,7 @@ class Listener:
         os.environ.update(dds_environment(os.environ))
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        node = PlainNode("neuros_recorder", context)
+        node = LeanNode("neuros_recorder", context)
         loop = RosLoop(context, self._fail)
         loop.add_node(node)
         node.create_timer(_LOOK_S, lambda: loop.guard(lambda: self._look(node, loop)))

@@ -1,7 +1,7 @@
-"""Packets within one process: handed over in memory, in the order in which they were sent.
+"""The in-memory transport: packets within one process, in the order in which they were sent.
 
-What rclcpp calls intra-process communication. It needs no ROS itself: how a packet is copied is
-given from outside, which is also what makes it the deterministic transport of the tests.
+rclcpp calls it intra-process communication. It needs no ROS itself: its user passes the function
+that copies a packet. So it is also the deterministic transport of the tests.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.ownership import is_unshared_inside, unheld
 
 
-class Outside(Protocol):
-    """What lies beyond the process: external topics, and listeners to the data topics."""
+class GraphBridge(Protocol):
+    """ROS graph bridge: external topics, and subscriptions of ROS to the data topics."""
 
     @property
     def heard(self) -> Collection[Connection]:
-        """The connections whose packets somebody listens to there."""
+        """The connections whose data topic has subscriptions."""
 
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...
@@ -56,7 +56,7 @@ class MemoryHub:
         self._waiting: list[Connection] = []
 
     def join(self, name: str, inbox: Inbox, connections: Sequence[Connection]) -> None:
-        """Add a node; whoever waited for it is told."""
+        """Add a node, and tell the senders that waited for it."""
         self.inboxes[name] = inbox
         self._waiting += [c for c in connections if c.source_node == name]
         for connection in tuple(self._waiting):
@@ -74,7 +74,7 @@ class MemoryHub:
 
 
 class MemoryTransport:
-    """Carries the packets of one node to the others in the same process.
+    """Carries the packets of one node to the others in its process.
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
     serialised for one, which is not done here otherwise. Once it gives ``None``, none are kept any
@@ -88,7 +88,7 @@ class MemoryTransport:
         self,
         file: NodeFile,
         hub: MemoryHub,
-        outside: Outside,
+        bridge: GraphBridge,
         digest: Callable[[Any], int | None] | None = None,
         digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
@@ -97,14 +97,14 @@ class MemoryTransport:
         self._arrivals = hub.arrivals[file.node.name]
         self._connections = file.connections
         self._hub = hub
-        self._outside = outside
+        self._bridge = bridge
         self._is_open = False
         self._given_up: list[Any] = []
         self._digest = digest
         elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
         digested = [c for c in elsewhere if digest is not None and digests_of(c)]
         self.digests = {c: array("Q") for c in digested}
-        self.make_packet = outside.make_packet
+        self.make_packet = bridge.make_packet
         hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
         self._channels = {
             c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
@@ -116,11 +116,11 @@ class MemoryTransport:
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
         self._is_open = True
-        self._outside.open(inbox)
+        self._bridge.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
     def note_result(self, box: Sequence[Any]) -> None:
-        """Remember which packets of a hook's result nobody but NeuROS holds any more."""
+        """Remember which packets of a hook's result the plugin does not hold any more."""
         self._given_up = unheld(box)
 
     def send(self, connections: Sequence[Connection], packet: Any) -> None:
@@ -137,12 +137,12 @@ class MemoryTransport:
             self._channels[connection].send(self._hub.copy(packet))
         own = packet if self._is_unshared(packet) else self._hub.copy(packet)
         self._channels[last].send(own)
-        if self._outside.heard:
-            self._outside.show(connections, packet)
+        if self._bridge.heard:
+            self._bridge.show(connections, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
-        self._outside.send_external(port, packet)
+        self._bridge.send_external(port, packet)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Tell the sender which position every taker has reached."""
@@ -172,7 +172,7 @@ class MemoryTransport:
         self._is_open = False
         self._given_up = []
         self._hub.leave(self._name)
-        self._outside.close()
+        self._bridge.close()
 
     def _note_digest(self, connections: Sequence[Connection], packet: Any) -> None:
         if not connections or self._digest is None:
@@ -186,7 +186,7 @@ class MemoryTransport:
             self._channels[connection].announce(digest)
 
     def _forget_digests(self) -> None:
-        """Keep none of what this node sends; half of them would tell nobody anything."""
+        """Keep none of what this node sends; half of them would be of no use."""
         self._digest = None
         for connection, channel in self._channels.items():
             if connection in self.digests:
@@ -228,9 +228,9 @@ class _Nobody:
 
 
 class _Channel:
-    """What is on its way on one connection: the last K + N packets, as a DDS reader keeps them.
+    """Packets on their way on one connection: the last K + N packets, as a DDS reader keeps them.
 
-    A sender that nobody acknowledges (BEST_EFFORT) may be faster than its receiver for ever; what
+    A sender without acknowledgements (BEST_EFFORT) may be faster than its receiver for ever; what
     no longer fits is lost in transport, and the loop's queue stays short.
     """
 

@@ -1,4 +1,4 @@
-"""The large part of a message: its sequences of numbers, apart from the rest.
+"""Buffers of a message, its sequences of numbers: found, left out, and put back as lazy ones.
 
 Pixels, points and scans are fields of the kind ``uint8[]`` or ``float32[]``: sequences without a
 bound, which Python holds as ``array.array``. Which fields of a message type those are is found out
@@ -8,11 +8,10 @@ once, from its class: its own, and those of messages within it (not of *sequence
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
-from neuros.transport.late_message import make_late
 from neuros.transport.packet_segment import StoredBuffer
 from neuros.transport.schema import Shape, getter, schema
 
@@ -89,7 +88,7 @@ class MessageBuffers:
         for path, buffer in zip(self._paths, buffers, strict=True):
             setattr(_follow(packet, path[:-1]), path[-1], buffer)
         for path, slots in self._holders.items():
-            make_late(_follow(packet, path), slots)
+            _make_lazy(_follow(packet, path), slots)
 
 
 @cache
@@ -110,3 +109,60 @@ def _shallow(message: Any, kind: Any) -> Any:
     for slot in kind.__slots__:
         setattr(twin, slot, getattr(message, slot))
     return twin
+
+
+def _make_lazy(message: Any, slots: tuple[str, ...]) -> None:
+    """Turn a message into a lazy one: it copies its stored buffers when a plugin asks for one.
+
+    A message that is only passed on, or of which a plugin reads the header alone, is never copied.
+    Until then its class is one derived from that of ROS, with a property for each buffer. The first
+    access to any of them puts all into place and gives the message the class of ROS: the class of
+    an object may change where the layout is equal.
+    """
+    kind: Any = type(message)
+    message.__class__ = _lazy_class(kind, slots)
+
+
+@cache
+def _lazy_class(kind: Any, slots: tuple[str, ...]) -> type:
+    def complete(message: Any) -> None:
+        for slot in slots:
+            value = getattr(message, slot, None)  # none yet while it is being created
+            if type(value) is StoredBuffer:
+                setattr(message, slot, value.fetch())
+        message.__class__ = kind
+
+    def compare(message: Any, other: object) -> bool:
+        complete(message)
+        return bool(message == other)
+
+    def reduce(message: Any, protocol: Any) -> Any:
+        complete(message)
+        return message.__reduce_ex__(protocol)
+
+    content = {
+        "__slots__": (),
+        "__module__": kind.__module__,
+        "__qualname__": kind.__qualname__,
+        "__doc__": kind.__doc__,
+        "__eq__": compare,
+        "__hash__": None,
+        "__reduce_ex__": reduce,
+        **{slot[1:]: _property(slot[1:], complete) for slot in slots},
+    }
+    lazy: Any = type(kind)(kind.__name__, (kind,), content)
+    lazy.__slots__ = kind.__slots__  # what people list the fields of a message by
+    assert isinstance(lazy, type)
+    return lazy
+
+
+def _property(name: str, complete: Callable[[Any], None]) -> property:
+    def get(message: Any) -> Any:
+        complete(message)
+        return getattr(message, name)
+
+    def put(message: Any, value: Any) -> None:
+        complete(message)
+        setattr(message, name, value)
+
+    return property(get, put)

@@ -1,4 +1,4 @@
-"""ROS message classes: found by their type name, created, and carried over byte by byte."""
+"""ROS message classes by their type name, and messages to bytes and back by rclpy."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def message_class(type_name: str) -> type:
 
 
 def encode(packet: Any) -> tuple[type, bytes]:
-    """What travels of a packet: its class, and its bytes as DDS would carry them."""
+    """The class of a packet, and its bytes as DDS would carry them."""
     return type(packet), serialize_message(packet)
 
 

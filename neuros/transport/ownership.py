@@ -1,6 +1,6 @@
-"""Whether a packet may be handed to another node as it is, because nobody else holds any of it.
+"""Ownership of packets: one without other holders goes to the next node without a copy.
 
-CPython counts references, and whoever could change a packet later holds one: to the packet, to a
+CPython counts references, and code that could change a packet later holds one: to the packet, to a
 message, list or array in it, or, for a view of a buffer, to that buffer. So a packet is unshared if
 it and each changeable part of it have exactly the one reference of what contains them. A part that
 can be reached without being counted (a weak reference, memory that an array does not own) makes it
@@ -30,17 +30,17 @@ _SEVERAL = (tuple, list)  # as a union it would be made anew at each use
 
 
 def _count(box: Sequence[Any], place: int) -> int:
-    """How many references there are to an item, those that counting needs included."""
+    """Count the references to an item, those that counting needs included."""
     return sys.getrefcount(getitem(box, place))
 
 
 def _counts(found: tuple[Any, ...]) -> tuple[int, ...]:
-    """The same for parts of a message, which have been got from it."""
+    """Count the references to parts of a message, which have been got from it."""
     return tuple(map(sys.getrefcount, found))
 
 
 def _measured() -> tuple[int, int]:
-    """What both say of an object with one holder; 0, which never occurs, if they do not count."""
+    """Both counts of an object with one holder; 0, which never occurs, if they do not count."""
     box, get = [[0], [0]], attrgetter("free", "held")
     message = SimpleNamespace(free=[0], held=[0])
     keeper = [box[1], message.held]
@@ -73,14 +73,14 @@ def unheld(box: Sequence[Any]) -> list[Any]:
 
 
 def is_unshared_inside(packet: Any) -> bool:
-    """Whether nobody holds a part of a packet, which has been checked."""
+    """Whether no part of a packet, which has been checked, has another holder."""
     kind: Any = type(packet)
     return _check_of(kind)(packet)
 
 
 @cache
 def _check_of(kind: Any) -> Check:
-    """What checks messages of a class."""
+    """The check of a message class."""
     layout = schema(kind)
     if any(each.__weakrefoffset__ or each.__dictoffset__ for each in layout.kinds):
         return lambda message: False

@@ -1,10 +1,10 @@
-"""A ring of slots in shared memory: how a large packet gets to other processes by one copy.
+"""A ring of slots in shared memory, by which a large packet reaches other processes in one copy.
 
 A *segment* is a file in ``/dev/shm`` that its sender writes and its receivers map. It is divided
 into slots of equal size, used in turn, so that a slot keeps its content until as many packets have
 followed. Each slot begins with its *generation*, the number of the packet in it: 0 while the slot
-is being written. Who copies from a slot looks at it before and after, and so never takes what was
-overwritten meanwhile for the packet that it wanted.
+is being written. A reader looks at it before and after its copy, and so never takes a packet
+that was written meanwhile for the one that it wanted.
 
 That needs stores and loads to be seen in the order of the program, which x86 guarantees for
 ordinary memory (Intel SDM, volume 3, "Memory Ordering"); elsewhere it is not used
@@ -27,7 +27,7 @@ from neuros.errors import ProtocolError
 
 SHARED_MEMORY = Path("/dev/shm")
 NAME_PREFIX = "neuros"
-"""How the names of segments begin: ``neuros_<run id>_``; a run's own are removed by that."""
+"""Prefix of the names of segments: ``neuros_<run id>_``; a run's own are removed by that."""
 
 _ALIGNMENT = 64  # a cache line: buffers begin where vector instructions like it
 _HEADER_BYTES = _ALIGNMENT  # the generation, as 8 bytes
@@ -36,7 +36,7 @@ _GROWTH = 1.5  # at least, from a segment to its successor
 
 @dataclass(frozen=True)
 class Place:
-    """Where the buffers of one packet are; ``lengths`` are theirs, in bytes."""
+    """Place of the buffers of one packet; ``lengths`` are theirs, in bytes."""
 
     segment: str
     slot_bytes: int
@@ -63,7 +63,7 @@ class SegmentWriter:
         self._folder = folder
         self._generation = 0
         self._current: _Mapping | None = None
-        # With the generation from which on nobody opens it any more.
+        # With the generation from which on no receiver opens it any more.
         self._former: list[tuple[int, _Mapping]] = []
 
     def write(self, buffers: Sequence[array[Any]]) -> Place:
@@ -170,7 +170,7 @@ class StoredBuffer:
         self._array: array[Any] = array(typecode)
 
     def fetch(self) -> array[Any]:
-        """The buffer as an array, always the same one.
+        """The buffer as an array, always one object.
 
         Raises:
             Overwritten: if its slot has been used again.
@@ -217,7 +217,7 @@ def _create(folder: Path, owner: str, slots: int, slot_bytes: int) -> _Mapping:
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     descriptor = os.open(folder / name, flags, 0o600)
     try:
-        # Until this process unmaps it, or ends: whoever looks for leftovers can tell.
+        # Until this process unmaps it, or ends: the search for leftovers sees it.
         fcntl.flock(descriptor, fcntl.LOCK_SH)
         # Room that is only promised would be missed later, by a SIGBUS in the midst of a copy.
         os.posix_fallocate(descriptor, 0, size)

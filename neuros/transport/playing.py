@@ -1,4 +1,4 @@
-"""Publishes serialised messages on the ROS graph at given times."""
+"""Player of serialised messages: publishes them on the ROS graph at given times."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
+from neuros.transport.lean_node import LeanNode, give_up
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
-from neuros.transport.teardown import give_up
 
 _LAST_S = 5.0
 _POLL_S = 0.01
-# A connection's own depth goes with acknowledgements, which nobody sends here.
+# A connection's own depth goes with acknowledgements, which the player does not get.
 _DEPTH = 1000
 
 
@@ -58,7 +57,7 @@ def play(
     os.environ.update(dds_environment(os.environ))
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
-    node = PlainNode("neuros_replay", context)
+    node = LeanNode("neuros_replay", context)
     publishers = {
         name: node.create_publisher(kinds[name], name, _qos(topic))
         for name, topic in topics.items()

@@ -1,4 +1,4 @@
-"""Packets over ROS 2 topics: the only use of rclpy on the data path.
+"""The ROS 2 transport: packets of a node over topics, and the registration of its connections.
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
 ``/ack`` (the position of the last packet that every taker has started on), and ``/reg``.
@@ -13,20 +13,20 @@ from functools import partial
 from typing import Any
 
 from rclpy.node import Node as RosNode
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
-from std_msgs.msg import UInt64
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_msgs.msg import String, UInt64
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.carriers import Decoder, Encoder, message_carrier
+from neuros.transport.codecs import Decoder, Encoder, message_codec
 from neuros.transport.copying import make_packet
 from neuros.transport.digests import Digest, digest_for, make_digests
-from neuros.transport.external import ExternalTopics
-from neuros.transport.large_carriers import LargeCarriers
-from neuros.transport.large_packets import is_parcel
+from neuros.transport.large_packets import LargeCodecs, is_parcel
 from neuros.transport.messages import decode_position, encode_position, message_class
-from neuros.transport.registration import LATCHED, Registration
+from neuros.transport.ros_graph import ExternalTopics, data_qos
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
@@ -34,15 +34,33 @@ _ANNOUNCE_S = 0.02
 
 @dataclass
 class _Way:
-    """How packets leave on one connection: bytes by ``publish``, made by ``carrier``.
+    """The way out of one connection: ``publish`` sends the bytes that ``codec`` makes.
 
-    ``count_readers`` says how many read the topic now, whoever they are.
+    ``count_readers`` returns the number of all subscriptions to the topic.
     """
 
     publish: Callable[[bytes], None]
-    carrier: Encoder
+    codec: Encoder
     digest: Digest
     count_readers: Callable[[], int]
+
+
+_LATCHED = QoSProfile(
+    depth=1,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""QoS of ``/reg`` and ``/ack``: the last message also reaches who comes later."""
+
+_HEARD = QoSProfile(
+    depth=10,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""QoS of the reader of ``/reg``: both ends speak there, so it keeps more than the last word."""
+
+_READY = "ready"
+_CONFIRMED = "confirmed"
 
 
 class RosTransport:
@@ -58,7 +76,7 @@ class RosTransport:
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self._registrations: list[Registration] = []
-        self._large = LargeCarriers(file, ros_node.get_logger().warning)
+        self._large = LargeCodecs(file, ros_node.get_logger().warning)
         self._is_open = False
 
     def open(self, inbox: Inbox) -> None:
@@ -66,7 +84,7 @@ class RosTransport:
         self._is_open = True
         for connection in self._connections:
             if connection.source_node == connection.destination_node:
-                self._loop.post(_call(inbox.on_registered, connection))
+                self._loop.post(partial(inbox.on_registered, connection))
             elif connection.source_node == self._node.name:
                 self._open_sender(connection, inbox)
             else:
@@ -90,10 +108,10 @@ class RosTransport:
         encoded: dict[Encoder, tuple[bytes, int]] = {}
         for connection in connections:
             way = self._ways[connection]
-            found = encoded.get(way.carrier)
+            found = encoded.get(way.codec)
             if found is None:
-                data = way.carrier.encode(packet)
-                found = encoded[way.carrier] = (data, way.digest(packet, data))
+                data = way.codec.encode(packet)
+                found = encoded[way.codec] = (data, way.digest(packet, data))
                 if not is_parcel(data):
                     whole = data
             way.publish(found[0])
@@ -141,7 +159,7 @@ class RosTransport:
         )
         self._ways[connection] = _Way(
             data.handle.publish_raw,
-            message_carrier(kind),
+            message_codec(kind),
             digest_for(kind),
             data.get_subscription_count,
         )
@@ -151,7 +169,7 @@ class RosTransport:
                 self._subscribe(
                     UInt64,
                     f"{connection.topic}/ack",
-                    LATCHED,
+                    _LATCHED,
                     lambda data: inbox.on_acknowledgement(connection, decode_position(data)),
                     is_raw=True,
                 )
@@ -174,7 +192,7 @@ class RosTransport:
         publishers = []
         if connection.is_reliable:
             acknowledge = self._ros_node.create_publisher(
-                UInt64, f"{connection.topic}/ack", LATCHED
+                UInt64, f"{connection.topic}/ack", _LATCHED
             )
             self._acknowledgements[connection] = acknowledge.handle.publish_raw
             publishers.append(acknowledge)
@@ -205,7 +223,7 @@ class RosTransport:
     def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
         """The receiver of a connection is there, and lets us know ``note`` of itself."""
         way = self._ways[connection]
-        way.carrier = self._large.encoder(connection, note, way.count_readers) or way.carrier
+        way.codec = self._large.encoder(connection, note, way.count_readers) or way.codec
         inbox.on_registered(connection)
 
     def _subscribe(
@@ -231,20 +249,11 @@ class RosTransport:
             self._ros_node.destroy_timer(self._timer)
 
 
-def data_qos(connection: Connection) -> QoSProfile:
-    """Deep enough for DDS itself to drop nothing that flow control lets through."""
-    reliable = QoSReliabilityPolicy.RELIABLE
-    best_effort = QoSReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(
-        depth=connection.window, reliability=reliable if connection.is_reliable else best_effort
-    )
-
-
 def _decoding(
-    carrier: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
+    codec: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
 ) -> Callable[[bytes], None]:
-    """What receives bytes: it delivers the packet, unless that was lost on its way."""
-    decode = carrier.decode
+    """A receiver of bytes that delivers the packet, unless that was lost on its way."""
+    decode = codec.decode
 
     def receive(data: bytes) -> None:
         packet = decode(data)
@@ -255,5 +264,117 @@ def _decoding(
     return receive
 
 
-def _call(function: Callable[[Connection], None], connection: Connection) -> Callable[[], None]:
-    return lambda: function(connection)
+class Registration:
+    """One connection, seen from one of its ends, until each end has found the other.
+
+    DDS matches a writer and a reader on each side separately and at different times, and what is
+    sent before both have matched may vanish without a trace. So each end looks at its own
+    endpoints. The receiver announces itself on ``/reg`` once its data reader has matched the
+    sender's writer and its acknowledgement writer the sender's reader. The sender, once its own
+    endpoints have matched and it has heard the announcement, counts the connection as registered
+    and confirms.
+
+    A number of matches says nothing about *who* matched (a recorder and ``ros2 topic echo`` do,
+    too). An end is taken as found when the ROS graph lists an endpoint of that very node, and all
+    compatible endpoints that the graph lists are matched.
+
+    Args:
+        note: what a receiver lets its sender know of itself, one line.
+        on_registered: called once, in the loop's thread, when this end is sure of the other;
+            a sender gets the receiver's note, a receiver an empty one.
+    """
+
+    def __init__(
+        self,
+        ros_node: RosNode,
+        connection: Connection,
+        *,
+        publishers: list[Publisher],
+        subscriptions: list[Subscription],
+        is_sender: bool,
+        note: str = "",
+        on_registered: Callable[[str], None],
+    ) -> None:
+        self.connection = connection
+        self.is_done = False
+        self._ros_node = ros_node
+        self._publishers = publishers
+        self._subscriptions = subscriptions
+        self._is_sender = is_sender
+        self._peer = connection.destination_node if is_sender else connection.source_node
+        self._on_registered = on_registered
+        self._announcement = f"{_READY} {note}"
+        self._peer_is_ready = False
+        self._peer_note = ""
+        topic = f"{connection.topic}/reg"
+        self._reg_publisher = ros_node.create_publisher(String, topic, _LATCHED)
+        self._reg_subscription = ros_node.create_subscription(String, topic, self._receive, _HEARD)
+
+    def advance(self) -> bool:
+        """Look again, announce or confirm where it is time; returns whether all is done."""
+        if self.is_done or not self._has_found_peer():
+            return self.is_done
+        if not self._is_sender:
+            self._reg_publisher.publish(String(data=self._announcement))
+        elif self._peer_is_ready:
+            self._reg_publisher.publish(String(data=_CONFIRMED))
+            self._finish()
+        return self.is_done
+
+    def close(self) -> None:
+        """Give up the endpoints."""
+        self._ros_node.destroy_publisher(self._reg_publisher)
+        self._ros_node.destroy_subscription(self._reg_subscription)
+
+    def _receive(self, message: String) -> None:
+        state, _, note = message.data.partition(" ")
+        if self._is_sender and state == _READY:
+            self._peer_is_ready = True
+            self._peer_note = note
+            if self.is_done:  # the receiver may have subscribed after the confirmation
+                self._reg_publisher.publish(String(data=_CONFIRMED))
+            else:
+                self.advance()
+        elif not self._is_sender and state == _CONFIRMED and not self.is_done:
+            self._finish()
+
+    def _finish(self) -> None:
+        self.is_done = True
+        self._on_registered(self._peer_note)
+
+    def _has_found_peer(self) -> bool:
+        return all(self._reaches_peer(publisher) for publisher in self._publishers) and all(
+            self._hears_peer(subscription) for subscription in self._subscriptions
+        )
+
+    def _reaches_peer(self, publisher: Publisher) -> bool:
+        matched = publisher.get_subscription_count()
+        if not matched:  # asked first: the graph is searched from end to end for each topic
+            return False
+        listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
+        compatible = [e for e in listed if _match(publisher.qos_profile, e.qos_profile)]
+        return self._is_among(compatible, matched)
+
+    def _hears_peer(self, subscription: Subscription) -> bool:
+        matched = subscription.get_publisher_count()
+        if not matched:
+            return False
+        listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
+        compatible = [e for e in listed if _match(e.qos_profile, subscription.qos_profile)]
+        return self._is_among(compatible, matched)
+
+    def _is_among(self, compatible: Sequence[TopicEndpointInfo], matched: int) -> bool:
+        return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)
+
+
+def _match(publisher: QoSProfile, subscription: QoSProfile) -> bool:
+    """Whether DDS matches these two.
+
+    ``rclpy.qos.qos_check_compatible`` takes the "infinite" deadline that the graph reports for one
+    that was asked for, and so refuses all that the graph lists.
+    """
+    is_reliable = publisher.reliability == QoSReliabilityPolicy.RELIABLE
+    is_latched = publisher.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
+    wants_reliable = subscription.reliability == QoSReliabilityPolicy.RELIABLE
+    wants_latched = subscription.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
+    return (is_reliable or not wants_reliable) and (is_latched or not wants_latched)

@@ -1,4 +1,4 @@
-"""The thread in which all nodes of a process run: one queue for ROS's events and the engine's.
+"""The event loop of a process: one thread and one queue for events of ROS and of the engines.
 
 It serves ROS with one of rclpy's executors (see :mod:`neuros.transport.executors`), by default the
 ``EventsExecutor``. Two habits of that shape this module: without a finite timeout it spins hot,
@@ -59,7 +59,7 @@ class _Waker:
 class RosLoop:
     """Runs events of ROS, engines and timers, one at a time, oldest first.
 
-    ``on_failure`` gets whatever an event raises, in the loop's thread.
+    ``on_failure`` gets the errors of events, in the loop's thread.
 
     Attributes:
         has_taken_in: whether all that ROS had waiting when a hook or callback ended is handled.
@@ -148,7 +148,7 @@ class RosLoop:
             self._check_timers()
 
     def guarded(self, receive: Callable[[Any], None]) -> Callable[[Any], None]:
-        """The same for what ROS calls with a message, again and again."""
+        """Wrap a function that ROS calls with a message again and again, as :meth:`guard` does."""
         on_failure, timers = self._on_failure, self._timers
 
         def guarded(message: Any) -> None:
@@ -252,7 +252,7 @@ class RosLoop:
             self._check_timers()
 
     def _fair_turn_ns(self, event_ns: int) -> int:
-        """How long a turn may be with an event that took so long."""
+        """The longest turn with an event that took so long."""
         return _TURN_NS if self._timers else min(_LONGEST_TURN_NS, _EVENTS * event_ns)
 
     def _check_timers(self) -> None:

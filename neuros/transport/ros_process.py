@@ -1,4 +1,4 @@
-"""Everything of ROS that the nodes of one process share: context, loop, and how they are joined."""
+"""The middleware of a process: the ROS context, loop and transports that its nodes share."""
 
 from __future__ import annotations
 
@@ -13,19 +13,24 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.transport.callbacks import Fail, PluginCallbacks
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
+from neuros.transport.lean_node import (
+    Fail,
+    LeanNode,
+    PluginCallbacks,
+    give_up,
+    lean_node,
+    without_spinning,
+)
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
-from neuros.transport.outside import RosOutside
-from neuros.transport.plain_node import PlainNode, plain_node, without_spinning
 from neuros.transport.ros import RosTransport
+from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.sides import SideVoice
-from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 _LINGER_S = 0.05
@@ -75,7 +80,7 @@ class RosProcess:
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
         self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
-        self._ros_nodes: dict[str, PlainNode] = {}
+        self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
@@ -89,26 +94,25 @@ class RosProcess:
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
-        ros_node = plain_node(file, self._context)
+        ros_node = lean_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
         transport: Transport
         if self._hub is None:
             transport = RosTransport(file, ros_node, self._loop)
         else:
-            outside = RosOutside(file, ros_node, self._loop)
             is_asked = self._has_digests or self._is_recorded
             transport = MemoryTransport(
                 file,
                 self._hub,
-                outside,
+                RosGraphBridge(file, ros_node, self._loop),
                 digest_of if is_asked else self._tried_digest,
                 lambda c: not self._is_recorded or self._has_digests or not c.is_reliable,
             )
         self._transports.append(transport)
         return transport
 
-    def ros_node(self, file: NodeFile) -> PlainNode:
+    def ros_node(self, file: NodeFile) -> LeanNode:
         """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
@@ -140,14 +144,14 @@ class RosProcess:
     def encode(self, packet: Any) -> bytes:
         """A packet as ROS serialises it."""
         kind: type = type(packet)
-        return message_carrier(kind).encode(packet)
+        return message_codec(kind).encode(packet)
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
 
     def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
+        """The function that checks packets of a class before they are sent."""
         return checker(kind)
 
     def take_in(self) -> None:

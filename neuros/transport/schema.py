@@ -1,7 +1,8 @@
-"""What a message class consists of: its fields, their types and bounds, found out once per class.
+"""The schema of a message class: its fields, their types and bounds, found out once.
 
-ROS describes the fields of a class that it generates in its ``SLOT_TYPES``. Whatever handles
-messages here (checking, encoding, copying, making, large buffers) goes by this one reading of them.
+ROS describes the fields of a class that it generates in its ``SLOT_TYPES``. All
+modules that handle messages (values, cdr, copying, message_buffers, ownership) use this one
+reading of them.
 It uses the slots of a message, not its properties: these convert what they are given, and may copy.
 """
 
@@ -29,7 +30,7 @@ Path: TypeAlias = "tuple[str, ...]"
 
 
 class Sort(Enum):
-    """What a value is."""
+    """Kinds of values."""
 
     BOOL = "bool"
     INTEGER = "integer"
@@ -45,7 +46,7 @@ NUMBERS = (Sort.INTEGER, Sort.FLOAT)
 
 
 class Shape(Enum):
-    """How many values a field holds, and what Python holds them in."""
+    """Number of values in a field, and their container in Python."""
 
     SINGLE = "single"
     BUFFER = "buffer"  # a sequence of numbers: array.array
@@ -188,7 +189,7 @@ def schema(kind: Any) -> Schema:
 
 
 def getter(paths: Sequence[Path]) -> Callable[[Any], tuple[Any, ...]]:
-    """What gets the values at several places of a message, as a tuple."""
+    """A function that gets the values at several places of a message, as a tuple."""
     names = [".".join(path) for path in paths]
     if not names:
         return lambda message: ()

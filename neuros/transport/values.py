@@ -1,4 +1,4 @@
-"""The values of a message, checked against its definition and made what a receiver will see.
+"""Checks of the values of a message against its definition, with conversion where they fit.
 
 rclpy trusts the types of fields when it serialises: an ``int`` in a ``float64`` arrives as 1e-323,
 300 in a ``uint8`` as 44. So each packet is checked once, when a hook has returned it, before it is
@@ -6,8 +6,8 @@ sent, recorded or digested on any back end. What fits is converted in place: a n
 Python that the field can hold (rounded, for a ``float32``), a tuple to a list, and so on. Nothing
 changes a value afterwards, on any way. All else raises :class:`~neuros.errors.WrongValue`.
 
-Most messages are right as they are. That is found out for all fields together; only otherwise is
-each one looked at, and converted or refused.
+Most messages need no conversion. That is found out for all fields together; only otherwise is each
+one looked at, and converted or refused.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _REPR.maxother = 60
 
 @cache
 def checker(kind: Any) -> Check:
-    """What checks the messages of a class.
+    """The function that checks the messages of a class.
 
     It returns the message, converted in place where need be, or one of that very class in place of
     one of a derived class. It raises :class:`~neuros.errors.WrongValue`.
@@ -71,17 +71,17 @@ class _Mismatch(Exception):
         self.found, self.allowed, self.path = found, allowed, path
 
     def within(self, step: str) -> _Mismatch:
-        """The same, seen from one step further out."""
+        """This error, seen from one step further out."""
         is_first = not self.path or self.path.startswith("[")
         self.path = step + self.path if is_first else f"{step}.{self.path}"
         return self
 
 
-# ---------------------------------------------------------------------- right as they are
+# ---------------------------------------------------------------------- right already
 
 
 class _Exactness(NamedTuple):
-    """What tells whether the fields of a message, or of several, hold what a receiver would see.
+    """Checks whether the fields of a message, or of several, hold what a receiver would see.
 
     A ``float32`` between two that there are is rounded on the way: most are, in simulators.
     """
@@ -530,7 +530,7 @@ def _convert_array(field: Field) -> Convert:
 
 
 def _to_numbers(field: Field) -> Convert:
-    """What makes an array of NumPy of the field's type from many numbers."""
+    """A function that makes an array of NumPy of the field's type from many numbers."""
     of, dtype = field.type, numpy.dtype(field.type.code)
     convert_item = _convert_single(of)
 

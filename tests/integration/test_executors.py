@@ -21,10 +21,9 @@ from std_msgs.msg import Int32
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import choose_domain
 from neuros.transport import ros_loop
-from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
+from neuros.transport.lean_node import LeanNode, PluginCallbacks
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
 
 EVENTS = "rclpy.experimental.events_executor"
@@ -298,7 +297,7 @@ class Hooked:
     """
 
     def __init__(self, loop: RosLoop, context: rclpy.Context) -> None:
-        self.loop, self.node = loop, PlainNode("node", context)
+        self.loop, self.node = loop, LeanNode("node", context)
         self.seen: list[object] = []
         loop.add_node(self.node)
         loop.expect_arrivals()

@@ -18,7 +18,7 @@ from neuros.launch.domain import choose_domain
 from neuros.project.model import NodeFile
 from neuros.testing.transport_bench import SERIES, TransportBench
 from neuros.testing.wiring import wire
-from neuros.transport import large_carriers
+from neuros.transport import large_packets
 
 PROJECT = Path(__file__).parent / "large_packets"
 SHARED_MEMORY = Path("/dev/shm")
@@ -142,7 +142,7 @@ def test_who_does_not_see_the_same_shared_memory_gets_whole_packets(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tokens = iter(["somewhere else", *["here"] * 100])
-    monkeypatch.setattr(large_carriers, "machine_token", lambda: next(tokens))
+    monkeypatch.setattr(large_packets, "machine_token", lambda: next(tokens))
     with TransportBench(network, wire("a.series -> b.series", 0)) as bench:
         bench.meet()
         exchange(bench, 0, 3)

@@ -19,12 +19,10 @@ from std_srvs.srv import Trigger
 from neuros.errors import NodeError
 from neuros.launch.domain import choose_domain
 from neuros.runtime.failures import callback_error
-from neuros.transport.callbacks import PluginCallbacks
 from neuros.transport.executors import EXECUTOR_VARIABLE
+from neuros.transport.lean_node import LeanNode, PluginCallbacks, give_up
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import PlainNode
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.teardown import give_up
 
 LIMIT_S = 20.0
 
@@ -42,7 +40,7 @@ class Plugin:
         self.outside: list[BaseException] = []
         self.entered = 0
         self.loop = RosLoop(context, self._fail_outside)
-        self.ros = PlainNode("plugin", context)
+        self.ros = LeanNode("plugin", context)
         self.loop.add_node(self.ros)
         self.callbacks = PluginCallbacks(self.ros, self.loop, self._enter, self._fail)
 
@@ -199,7 +197,7 @@ def test_nothing_is_called_when_the_node_has_ended(plugin: Plugin) -> None:
 def test_parameters_of_the_project_can_be_declared_again_with_their_value() -> None:
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = PlainNode("node", context, parameters={"gain.p": 1.5, "list": (1, 2)})
+    node = LeanNode("node", context, parameters={"gain.p": 1.5, "list": (1, 2)})
     assert node.get_parameter("gain.p").value == 1.5
     assert node.declare_parameter("gain.p", 0.0).value == 1.5
     assert [p.value for p in node.declare_parameters("gain", [("i", 0.5)])] == [0.5]

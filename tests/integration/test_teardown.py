@@ -19,9 +19,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.launch.domain import choose_domain
-from neuros.transport import teardown
+from neuros.transport import lean_node
+from neuros.transport.lean_node import give_up
 from neuros.transport.messages import message_class
-from neuros.transport.teardown import give_up
 
 String = message_class("std_msgs/msg/String")
 TOPICS = [f"topic_{place}" for place in range(5)]
@@ -48,7 +48,7 @@ def test_a_participant_that_is_given_up_hears_of_nobody_any_more() -> None:
         other_context, other = begin("other", domain.id)
         other.create_subscription(String, "before", print, 1)
         wait_until(lambda: node.count_subscribers("before") == 1)
-        teardown._end_discovery(node)
+        lean_node._end_discovery(node)
         witness_context, witness = begin("witness", domain.id)
         other.create_subscription(String, "after", print, 1)
         wait_until(lambda: witness.count_subscribers("after") == 1)
@@ -60,7 +60,7 @@ def test_a_participant_that_is_given_up_hears_of_nobody_any_more() -> None:
 
 
 def test_another_rmw_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(teardown, "_RMW", "librmw_other.so")
+    monkeypatch.setattr(lean_node, "_RMW", "librmw_other.so")
     with choose_domain(None, {}, False) as domain:
         context, node = begin("node", domain.id)
         give_up(context, [node])

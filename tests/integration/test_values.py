@@ -24,7 +24,7 @@ from neuros.cli.main import main
 from neuros.errors import WrongValue
 from neuros.project.model import Node, Port
 from neuros.testing.packages import provide_messages, workspaces_of
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.messages import message_class
 from neuros.transport.values import checker
@@ -193,13 +193,13 @@ def _arrives_alike(kind: Any) -> None:
     @given(right_messages(kind))
     def check(messages: tuple[Any, Any]) -> None:
         packet, expected = checker(kind)(messages[0]), messages[1]
-        carrier = message_carrier(kind)
+        codec = message_codec(kind)
         ways = (
             packet,
             copy_packet(packet),
-            carrier.decode(carrier.encode(packet)),
-            carrier.decode(serialize_message(packet)),
-            deserialize_message(carrier.encode(packet), kind),
+            codec.decode(codec.encode(packet)),
+            codec.decode(serialize_message(packet)),
+            deserialize_message(codec.encode(packet), kind),
         )
         assert [parts(each) for each in ways] == [parts(expected)] * len(ways)
 

@@ -12,7 +12,7 @@ from rclpy.qos import QoSPresetProfiles
 from neuros.project.load import Loaded, load_project
 from neuros.project.parameters import parameters_of
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos, qos_of, qos_to_json
-from neuros.transport.external import qos_profile
+from neuros.transport.ros_graph import qos_profile
 
 POLICIES = ("reliability", "durability", "depth", "history", "liveliness", "deadline")
 

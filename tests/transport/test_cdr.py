@@ -13,8 +13,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Int32, String
 
-from neuros.transport.carriers import message_carrier
 from neuros.transport.cdr import cdr
+from neuros.transport.codecs import message_codec
 from neuros.transport.messages import message_class
 
 TYPES = (
@@ -49,19 +49,19 @@ def test_what_is_written_and_read_is_what_ros_writes_and_reads(kind: Any) -> Non
 
 def test_senders_of_the_other_byte_order_are_understood() -> None:
     data = b"\0\0\0\0" + struct.pack(">i", 7)
-    assert message_carrier(Int32).decode(data) == Int32(data=7)
+    assert message_codec(Int32).decode(data) == Int32(data=7)
 
 
 @pytest.mark.parametrize("size", [0, 3, 4, 7, 11, 20])
 def test_bytes_that_break_off_are_no_message(size: int) -> None:
     data = serialize_message(Image(data=array("B", range(100))))[:size]
-    carrier = message_carrier(Image)
-    assert outcome(carrier.decode, data) == outcome(lambda d: deserialize_message(d, Image), data)
+    codec = message_codec(Image)
+    assert outcome(codec.decode, data) == outcome(lambda d: deserialize_message(d, Image), data)
 
 
 def test_text_that_is_no_utf_8_is_read_as_ros_reads_it() -> None:
     data = serialize_message(String(data="abcd")).replace(b"bc", b"\xff\xe4")
-    assert message_carrier(String).decode(data) == deserialize_message(data, String)
+    assert message_codec(String).decode(data) == deserialize_message(data, String)
 
 
 def outcome(call: Any, argument: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A copy within one process is what a receiver in another process would get."""
+"""A copy is what a receiver in another process would get; a new message, what its class makes."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from std_msgs.msg import (
     UInt64,
 )
 
-from neuros.transport.copying import copy_packet
+from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.ownership import is_unshared_inside
 from neuros.transport.values import checker
 
 HEADER = Header(stamp=Time(sec=-3, nanosec=999_999_999), frame_id="base")
@@ -65,6 +66,22 @@ UNUSUAL = [
     UInt64(data=True),
     Float64MultiArray(data=[1.0, 2.0]),
     JointState(name=("a", "b")),
+]
+TYPES = [
+    "std_msgs/msg/Empty",
+    "std_msgs/msg/String",
+    "std_msgs/msg/Byte",
+    "std_msgs/msg/ColorRGBA",
+    "std_msgs/msg/Float64MultiArray",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CameraInfo",
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "nav_msgs/msg/Odometry",
+    "nav_msgs/msg/Path",
+    "shape_msgs/msg/Mesh",
+    "shape_msgs/msg/SolidPrimitive",
 ]
 
 
@@ -114,3 +131,27 @@ def test_a_copy_is_filled_like_any_other_message() -> None:
     copy = copy_packet(Point(x=1.0))
     copy.x = 2.0
     assert copy == Point(x=2.0)
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_a_new_message_has_the_values_and_classes_of_the_constructor(
+    type_name: str,
+) -> None:
+    kind = message_class(type_name)
+    made, constructed = make_packet(type_name), kind()
+    assert made == constructed
+    assert repr(made) == repr(constructed)
+    assert classes(made) == classes(constructed)
+
+
+def classes(value: Any) -> list[type]:
+    slots = getattr(value, "__slots__", ())
+    return [type(value), *(kind for slot in slots for kind in classes(getattr(value, slot)))]
+
+
+@pytest.mark.parametrize("type_name", ["sensor_msgs/msg/Imu", "nav_msgs/msg/Path"])
+def test_two_new_messages_share_nothing_that_can_change(type_name: str) -> None:
+    made = make_packet(type_name), make_packet(type_name)
+    assert all(is_unshared_inside(each) for each in made)
+    made[0].header.frame_id = "changed"
+    assert made[1] == message_class(type_name)()

@@ -1,4 +1,4 @@
-"""Which settings of Fast DDS a process of nodes gets."""
+"""Settings of Fast DDS that a process of nodes gets."""
 
 from __future__ import annotations
 

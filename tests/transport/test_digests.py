@@ -10,7 +10,7 @@ import pytest
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.digests import TriedDigest, digest_for, digest_of
 from neuros.transport.large_packets import LargeInput, LargeOutput, is_parcel
 from neuros.transport.message_buffers import message_buffers
@@ -26,7 +26,7 @@ def image(size: int = LARGE, width: int = 0, last: int = 0) -> Image:
 
 def digest(packet: Any) -> int:
     """As a whole message has it."""
-    return digest_for(type(packet))(packet, message_carrier(type(packet)).encode(packet))
+    return digest_for(type(packet))(packet, message_codec(type(packet)).encode(packet))
 
 
 @pytest.mark.parametrize("packet", [String(data="a"), Imu(), image(100), image()])
@@ -51,7 +51,7 @@ def test_packets_that_differ_have_different_digests(one: Any, other: Any) -> Non
 @pytest.mark.parametrize("text", ["", "a", "ab", "abc", "abcd"])
 def test_the_padding_with_which_a_message_arrives_does_not_count(text: str) -> None:
     packet = String(data=text)
-    sent = message_carrier(String).encode(packet)
+    sent = message_codec(String).encode(packet)
     arrived = sent + bytes(-len(sent) % 4)
     assert digest_for(String)(packet, arrived) == digest_for(String)(packet, sent)
 

@@ -1,4 +1,4 @@
-"""Buffers are found in messages, taken out and put back, and a late message is like any other."""
+"""Buffers are found in messages, taken out and put back, and a lazy message is like any other."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_what_is_not_the_array_of_ros_is_not_taken() -> None:
     assert disparity.of(odd) is None
 
 
-def late(packet: Any, folder: Path) -> Any:
+def lazy(packet: Any, folder: Path) -> Any:
     """The message as a receiver gets it: its buffers still in shared memory."""
     buffers = message_buffers(type(packet))
     assert buffers is not None
@@ -121,26 +121,26 @@ def late(packet: Any, folder: Path) -> Any:
 
 
 @pytest.mark.parametrize("packet", MESSAGES, ids=lambda packet: type(packet).__name__)
-class TestLateMessages:
-    """Whatever is done to a late message first, it is the message that was sent."""
+class TestLazyMessages:
+    """Whatever is done to a lazy message first, it is the message that was sent."""
 
     def test_it_is_of_its_class(self, packet: Any, tmp_path: Path) -> None:
-        message = late(packet, tmp_path)
+        message = lazy(packet, tmp_path)
         assert isinstance(message, type(packet))
         assert type(message).__name__ == type(packet).__name__
         assert type(message).__module__ == type(packet).__module__
         assert message.__slots__ == packet.__slots__
 
     def test_it_equals(self, packet: Any, tmp_path: Path) -> None:
-        assert late(packet, tmp_path) == packet
-        assert packet == late(packet, tmp_path)
-        assert late(packet, tmp_path) != type(packet)()
+        assert lazy(packet, tmp_path) == packet
+        assert packet == lazy(packet, tmp_path)
+        assert lazy(packet, tmp_path) != type(packet)()
 
     def test_it_reads_the_same(self, packet: Any, tmp_path: Path) -> None:
-        assert repr(late(packet, tmp_path)) == repr(packet)
+        assert repr(lazy(packet, tmp_path)) == repr(packet)
 
     def test_it_is_serialised(self, packet: Any, tmp_path: Path) -> None:
-        assert travelled(late(packet, tmp_path), type(packet)) == packet
+        assert travelled(lazy(packet, tmp_path), type(packet)) == packet
 
     def test_it_is_copied(self, packet: Any, tmp_path: Path) -> None:
         for made in (
@@ -149,30 +149,30 @@ class TestLateMessages:
             lambda m: copy_packet(checker(type(packet))(m)),
             lambda m: pickle.loads(pickle.dumps(m)),
         ):
-            twin = made(late(packet, tmp_path))
+            twin = made(lazy(packet, tmp_path))
             assert type(twin) is type(packet)
             assert twin == packet
 
     def test_its_buffers_can_be_sent_on(self, packet: Any, tmp_path: Path) -> None:
         buffers = message_buffers(type(packet))
         assert buffers is not None
-        assert buffers.of(late(packet, tmp_path)) == buffers.of(packet)
-        serialize_message(buffers.leave_out(late(packet, tmp_path)))
+        assert buffers.of(lazy(packet, tmp_path)) == buffers.of(packet)
+        serialize_message(buffers.leave_out(lazy(packet, tmp_path)))
 
 
 def test_fields_of_a_late_message_may_be_set(tmp_path: Path) -> None:
-    message = late(_scan(), tmp_path)
+    message = lazy(_scan(), tmp_path)
     message.ranges = array("f", [9.0])
     assert list(message.ranges) == [9.0]
     assert list(message.intensities) == [7.0]
     assert type(message) is LaserScan
-    message = late(_image(), tmp_path)
+    message = lazy(_image(), tmp_path)
     message.height = 7
     assert message.data == _image().data
 
 
 def test_a_buffer_is_an_array_that_may_be_changed_and_stays_the_same_one(tmp_path: Path) -> None:
-    message = late(_image(), tmp_path)
+    message = lazy(_image(), tmp_path)
     message.data[0] = 99
     assert type(message.data) is array
     assert message.data[0] == 99

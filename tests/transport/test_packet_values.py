@@ -22,7 +22,7 @@ from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Bool, Byte, Float32, Float64, Header, Int32, String, UInt8, UInt64
 
 from neuros.errors import WrongValue
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.digests import digest_for, digest_of
 from neuros.transport.ownership import is_unshared_inside
@@ -52,14 +52,12 @@ def refusal(message: Any) -> WrongValue:
 
 
 WAYS: dict[str, Callable[[Any], Any]] = {
-    "between processes": lambda m: message_carrier(type(m)).decode(
-        message_carrier(type(m)).encode(m)
-    ),
+    "between processes": lambda m: message_codec(type(m)).decode(message_codec(type(m)).encode(m)),
     "within a process": copy_packet,
     "by rclpy": lambda m: deserialize_message(serialize_message(m), type(m)),
-    "sent by rclpy, received here": lambda m: message_carrier(type(m)).decode(serialize_message(m)),
+    "sent by rclpy, received here": lambda m: message_codec(type(m)).decode(serialize_message(m)),
     "sent here, received by rclpy": lambda m: deserialize_message(
-        message_carrier(type(m)).encode(m), type(m)
+        message_codec(type(m)).encode(m), type(m)
     ),
 }
 
@@ -76,9 +74,7 @@ class TestEveryMessageClass:
             for way, carry in WAYS.items():
                 assert parts(carry(packet)) == parts(expected), way
             assert checked(packet) is packet
-            assert digest_of(packet) == digest_for(kind)(
-                packet, message_carrier(kind).encode(packet)
-            )
+            assert digest_of(packet) == digest_for(kind)(packet, message_codec(kind).encode(packet))
 
         check()
 

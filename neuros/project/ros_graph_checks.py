@@ -1,4 +1,4 @@
-"""What a project says of the ROS graph around it: whether its names, rules and QoS make sense."""
+"""ROS graph checks of a project: names, remapping rules and QoS of its topics."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def names_to_json(names: Names) -> dict[str, Any]:
     return {key: value for key, value in content.items() if value}
 
 
-def outside_mistakes(draft: Draft) -> Iterator[Problem]:
+def ros_graph_mistakes(draft: Draft) -> Iterator[Problem]:
     """QoS where there is none to choose, rules for nothing, and names that are too long."""
     names = names_of(draft)
     yield from _qos_of_connections(draft)
@@ -41,7 +41,7 @@ def outside_mistakes(draft: Draft) -> Iterator[Problem]:
     yield from _long_names(draft, names)
 
 
-def outside_remarks(draft: Draft) -> Iterator[Problem]:
+def ros_graph_remarks(draft: Draft) -> Iterator[Problem]:
     """QoS that does not do what it seems to."""
     for port, _, _ in _ports(draft):
         qos = port.member("qos")

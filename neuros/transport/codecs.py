@@ -1,7 +1,7 @@
-"""How a packet becomes bytes for the data topic of a connection, and a packet again.
+"""Codecs: a packet to the bytes that its data topic carries, and back.
 
 The transport publishes and receives bytes only. So what is behind them can differ between two
-connections of one output, and a packet is serialised once for all receivers with the same carrier.
+connections of one output, and a packet is serialised once for all receivers with one codec.
 """
 
 from __future__ import annotations
@@ -11,29 +11,28 @@ from typing import Any, Protocol
 
 from rclpy.serialization import deserialize_message, serialize_message
 
-from neuros.transport.cdr import Decode, Encode, cdr
-from neuros.transport.cdr_parts import NOT_OURS
+from neuros.transport.cdr import NOT_OURS, Decode, Encode, cdr
 
 
 class Encoder(Protocol):
-    """The sender's half of a carrier; connections of one output share it where they can."""
+    """The sender's half of a codec; connections of one output share it where they can."""
 
     def encode(self, packet: Any) -> bytes:
-        """What is published for a packet, which may change as soon as this returns."""
+        """Serialise a packet, which may change as soon as this returns."""
 
 
 class Decoder(Protocol):
-    """The receiver's half of a carrier."""
+    """The receiver's half of a codec."""
 
     def decode(self, data: bytes) -> Any:
         """The packet that was published as ``data``; ``None`` if it was lost on its way."""
 
 
-class Carrier(Encoder, Decoder, Protocol):
+class Codec(Encoder, Decoder, Protocol):
     """One way to carry packets."""
 
 
-class MessageCarrier:
+class MessageCodec:
     """Messages as ROS serialises them: what every ROS node understands."""
 
     def __init__(self, kind: type) -> None:
@@ -49,8 +48,8 @@ class MessageCarrier:
         return deserialize_message(data, self._kind)
 
 
-class QuickCarrier(MessageCarrier):
-    """The same, in a fraction of the time where nothing is out of the ordinary."""
+class CdrCodec(MessageCodec):
+    """Messages in plain CDR by NeuROS itself, in a fraction of the time; the rest by rclpy."""
 
     def __init__(self, kind: type, encode: Encode, decode: Decode) -> None:
         super().__init__(kind)
@@ -73,7 +72,7 @@ class QuickCarrier(MessageCarrier):
 
 
 @cache
-def message_carrier(kind: type) -> Carrier:
-    """The plain carrier for a message class."""
+def message_codec(kind: type) -> Codec:
+    """The plain codec for a message class."""
     quick = cdr(kind)
-    return MessageCarrier(kind) if quick is None else QuickCarrier(kind, *quick)
+    return MessageCodec(kind) if quick is None else CdrCodec(kind, *quick)

@@ -1,8 +1,8 @@
-"""The middleware of one node without neighbours: it has a real ROS node, and nobody to talk to.
+"""A middleware that carries nothing, for one node without neighbours, with a real ROS node.
 
-What arrives, and when, is up to whoever plays the neighbours; what is sent goes nowhere. The ROS
-node is one of rclpy, so that plugins find all that they are used to, but callbacks that a plugin
-registers there are not served.
+The caller plays the neighbours: it decides which packets arrive, and when. Packets that the node
+sends go nowhere. The ROS node is one of rclpy, so that plugins find its whole interface, but
+callbacks that a plugin registers there are not served.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.carriers import message_carrier
+from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet, make_packet
+from neuros.transport.lean_node import give_up, lean_node, without_spinning
 from neuros.transport.messages import message_class
-from neuros.transport.plain_node import plain_node, without_spinning
-from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 Event = Callable[[], None]
@@ -57,11 +56,11 @@ class HeldLoop:
         """Nothing has arrived meanwhile."""
 
     def post_from_thread(self, event: Event) -> None:
-        """Keep an event for whoever takes it."""
+        """Keep an event until the caller takes it."""
         self.from_threads.put(event)
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
-        """Timers are up to whoever plays the neighbours."""
+        """Timers are up to the caller."""
 
     def run(self) -> None:
         """There is nothing to run."""
@@ -70,7 +69,7 @@ class HeldLoop:
         """There is nothing to stop."""
 
 
-class _Nowhere:
+class _NullTransport:
     """A transport that carries nothing (:class:`neuros.ports.Transport`)."""
 
     digests: Mapping[Connection, array[int]] = {}
@@ -96,7 +95,7 @@ class _Nowhere:
         return make_packet(type_name)
 
 
-class Alone:
+class NullMiddleware:
     """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
 
     def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
@@ -107,13 +106,13 @@ class Alone:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._ros_node = plain_node(file, self._context)
+        self._ros_node = lean_node(file, self._context)
         self._no_spinning = contextlib.ExitStack()
         self._no_spinning.enter_context(without_spinning())
 
-    def transport(self, file: NodeFile) -> _Nowhere:
+    def transport(self, file: NodeFile) -> _NullTransport:
         """One that carries nothing."""
-        return _Nowhere()
+        return _NullTransport()
 
     def ros_node(self, file: NodeFile) -> Any:
         """The ROS node."""
@@ -144,14 +143,14 @@ class Alone:
     def encode(self, packet: Any) -> bytes:
         """A packet as ROS serialises it."""
         kind: type = type(packet)
-        return message_carrier(kind).encode(packet)
+        return message_codec(kind).encode(packet)
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation."""
         return message_class(type_name)
 
     def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
+        """The function that checks packets of a class before they are sent."""
         return checker(kind)
 
     def take_in(self) -> None:

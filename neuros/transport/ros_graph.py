@@ -1,0 +1,329 @@
+"""The ROS graph around a node: its external topics, checks of them, and the ROS graph bridge.
+
+External topics are plain ROS topics, with the QoS that the project asks for. A registration proves
+each connection between nodes. An external topic has no other end that could confirm, so ROS graph
+checks look for two mistakes that nothing else would tell: QoS that does not fit, and silence. The
+bridge gives nodes of one process their place in the ROS graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node as RosNode
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSPresetProfiles,
+    QoSProfile,
+    QoSReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from neuros.ports import Inbox
+from neuros.project.model import Connection, NodeFile, Port
+from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
+from neuros.transport.codecs import message_codec
+from neuros.transport.copying import make_packet
+from neuros.transport.messages import message_class
+from neuros.transport.ros_loop import RosLoop
+
+_QOS_LOOK_S = 0.3
+_MOST_QOS_LOOKS = 20
+"""The graph lists an endpoint a moment after DDS reports it, or seconds later under load."""
+
+_ADVICE = 'give both the same, with "qos" in the project'
+
+_SILENCE_LOOK_S = 5.0
+"""By then, programs that are there have been found."""
+
+_LISTENERS_LOOK_S = 0.25
+
+
+class ExternalTopics:
+    """Publishers and subscriptions of the ports with an external topic."""
+
+    def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
+        self._file = file
+        self._ros_node = ros_node
+        self._loop = loop
+        self._publishers: dict[str, Publisher] = {}
+        self._is_open = False
+
+    def open(self, inbox: Inbox) -> None:
+        """Create the endpoints, and watch whether others can be connected to them."""
+        self._is_open = True
+        for port in self._file.node.outputs:
+            if port.external_topic is not None:
+                self._publishers[port.name] = self._publisher(port, port.external_topic)
+        heard = {
+            port: self._subscription(port, port.external_topic, inbox)
+            for port in self._file.node.inputs
+            if port.external_topic is not None
+        }
+        if heard:
+            self._loop.expect_arrivals()
+            _check_silence(self._ros_node, heard, self._loop)
+
+    def send(self, port: Port, packet: Any) -> None:
+        """Publish on the external topic of an output."""
+        if self._is_open:
+            self._publishers[port.name].publish(packet)
+
+    def close(self) -> None:
+        """Publish and receive nothing any more; the endpoints go with their ROS node."""
+        self._is_open = False
+
+    def _publisher(self, port: Port, topic: str) -> Publisher:
+        profile = qos_profile(port.qos or OFFERED)
+        check = QosCheck(self._ros_node, self._loop, port, self._full(topic), profile)
+        return self._ros_node.create_publisher(
+            message_class(port.type),
+            topic,
+            profile,
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=check.on_subscription),
+        )
+
+    def _subscription(self, port: Port, topic: str, inbox: Inbox) -> Subscription:
+        kind = message_class(port.type)
+        profile = qos_profile(port.qos or ASKED)
+        check = QosCheck(self._ros_node, self._loop, port, self._full(topic), profile)
+        return self._ros_node.create_subscription(
+            kind,
+            topic,
+            self._loop.guarded(self._receiver(kind, partial(inbox.on_external_packet, port))),
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check.on_publisher),
+            raw=True,
+        )
+
+    def _receiver(self, kind: type, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
+        decode = message_codec(kind).decode
+
+        def receive(data: bytes) -> None:
+            if self._is_open:
+                deliver(decode(data))
+
+        return receive
+
+    def _full(self, topic: str) -> str:
+        return self._file.names.resolve(topic, self._file.node.name)
+
+
+class RosGraphBridge:
+    """External topics and data topics of one node whose connections stay within the process.
+
+    External topics go through DDS as always. A data topic is published while it has subscriptions.
+
+    Attributes:
+        heard: the connections with subscriptions in ROS; looked up four times per second.
+    """
+
+    def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
+        self._external = ExternalTopics(file, ros_node, loop)
+        self._file = file
+        self._ros_node = ros_node
+        self._loop = loop
+        self._publishers: dict[Connection, Publisher] = {}
+        self.heard: frozenset[Connection] = frozenset()
+
+    def open(self, inbox: Inbox) -> None:
+        """Create the endpoints."""
+        self._external.open(inbox)
+        for connection in self._file.connections:
+            if connection.source_node == self._file.node.name:
+                self._publishers[connection] = self._ros_node.create_publisher(
+                    message_class(self._file.node.output(connection.source_output).type),
+                    f"{connection.topic}/data",
+                    data_qos(connection),
+                )
+        if self._publishers:
+            self._loop.every(self._ros_node, _LISTENERS_LOOK_S, self._look)
+
+    def show(self, connections: Sequence[Connection], packet: Any) -> None:
+        """Publish a packet on data topics that have subscriptions."""
+        for connection in connections:
+            if connection in self.heard:
+                self._publishers[connection].publish(packet)
+
+    def send_external(self, port: Port, packet: Any) -> None:
+        """Publish on the external topic of an output."""
+        self._external.send(port, packet)
+
+    def make_packet(self, type_name: str) -> Any:
+        """A new message with default values."""
+        return make_packet(type_name)
+
+    def close(self) -> None:
+        """Publish and receive nothing any more."""
+        self.heard = frozenset()
+        self._external.close()
+
+    def _look(self) -> None:
+        self.heard = frozenset(
+            connection
+            for connection, publisher in self._publishers.items()
+            if publisher.get_subscription_count()
+        )
+
+
+def qos_profile(qos: Qos) -> QoSProfile:
+    """The profile of rclpy for what a project file says."""
+    for name in ("system_default", "best_available"):
+        if qos == PRESETS[name]:
+            preset: QoSProfile = QoSPresetProfiles.get_from_short_key(name)
+            return preset
+    return QoSProfile(
+        history=QoSHistoryPolicy.KEEP_LAST,
+        depth=qos.depth,
+        reliability=QoSReliabilityPolicy.get_from_short_key(qos.reliability),
+        durability=QoSDurabilityPolicy.get_from_short_key(qos.durability),
+    )
+
+
+def data_qos(connection: Connection) -> QoSProfile:
+    """Deep enough for DDS itself to drop nothing that flow control lets through."""
+    reliable = QoSReliabilityPolicy.RELIABLE
+    best_effort = QoSReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(
+        depth=connection.window, reliability=reliable if connection.is_reliable else best_effort
+    )
+
+
+# ---------------------------------------------------------------------- ROS graph checks
+
+
+class QosCheck:
+    """Warns of endpoints with QoS that keeps DDS from connecting them to a port, once each.
+
+    A subscription gets nothing from a publisher that offers less than it asks for (OMG DDS 1.4,
+    2.2.3). DDS tells both ends that there is such a pair; the ROS graph knows the other's QoS.
+
+    Args:
+        topic: its full name.
+        own: what the port offers or asks for.
+    """
+
+    def __init__(
+        self, ros_node: RosNode, loop: RosLoop, port: Port, topic: str, own: QoSProfile
+    ) -> None:
+        self._ros_node = ros_node
+        self._loop = loop
+        self._port = port
+        self._topic = topic
+        self._own = own
+        self._named: set[bytes] = set()
+
+    def on_publisher(self, event: Any) -> None:
+        """DDS has found a publisher that offers less than this input asks for."""
+        self._look_later(event, is_input=True)
+
+    def on_subscription(self, event: Any) -> None:
+        """DDS has found a subscription that asks for more than this output offers."""
+        self._look_later(event, is_input=False)
+
+    def _look_later(self, event: Any, *, is_input: bool) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        total, looks = event.total_count, 0
+
+        def look() -> None:
+            nonlocal looks
+            looks += 1
+            self._look(is_input=is_input)
+            if len(self._named) >= total or looks == _MOST_QOS_LOOKS:
+                self._ros_node.destroy_timer(timer)
+                if not self._named:
+                    self._warn_of_unknown("input" if is_input else "output", policy)
+
+        timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
+
+    def _look(self, *, is_input: bool) -> None:
+        if is_input:
+            side, list_others = "input", self._ros_node.get_publishers_info_by_topic
+        else:
+            side, list_others = "output", self._ros_node.get_subscriptions_info_by_topic
+        for other in list_others(self._port.external_topic):  # by the name that rules apply to
+            offered, asked = (
+                (other.qos_profile, self._own) if is_input else (self._own, other.qos_profile)
+            )
+            lacking = list(qos_differences(offered, asked))
+            if lacking:
+                self._warn(side, other, lacking)
+
+    def _warn_of_unknown(self, side: str, policy: str) -> None:
+        self._ros_node.get_logger().warning(
+            f"{side} '{self._port.name}': somebody on {self._topic} cannot be connected: the"
+            f" {policy} that one side offers is not what the other asks for"
+        )
+
+    def _warn(self, side: str, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
+        gid = bytes(other.endpoint_gid)
+        if gid in self._named:
+            return
+        self._named.add(gid)
+        name = f"{other.node_namespace.rstrip('/')}/{other.node_name}"
+        offered = " and ".join(each for each, _ in lacking)
+        asked = " and ".join(each for _, each in lacking)
+        if side == "input":
+            text = f"{name} offers {offered}, and this input asks for {asked}: it hears nothing"
+            text += " of that"
+        else:
+            text = f"{name} asks for {asked}, and this output offers {offered}: it is not heard"
+            text += " there"
+        self._ros_node.get_logger().warning(
+            f"{side} '{self._port.name}': on {self._topic} {text}; {_ADVICE}"
+        )
+
+
+def qos_differences(offered: QoSProfile, asked: QoSProfile) -> Iterator[tuple[str, str]]:
+    """Policies, ``(offered, asked)``, by which a publisher offers less than a subscription asks."""
+    reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
+    if (offered.reliability, asked.reliability) == (best_effort, reliable):
+        yield "best_effort", "reliable"
+    latched, volatile = QoSDurabilityPolicy.TRANSIENT_LOCAL, QoSDurabilityPolicy.VOLATILE
+    if (offered.durability, asked.durability) == (volatile, latched):
+        yield "volatile", "transient_local"
+
+
+def _check_silence(ros_node: RosNode, heard: Mapping[Port, Subscription], loop: RosLoop) -> None:
+    """Warn in the node's log of external inputs without a publisher, 5 s from now.
+
+    Those whose QoS does not fit are left to :class:`QosCheck`.
+
+    Args:
+        heard: the inputs with an external topic, and their subscriptions.
+    """
+
+    def look() -> None:
+        ros_node.destroy_timer(timer)
+        for port, subscription in heard.items():
+            if subscription.get_publisher_count():
+                continue
+            reason = _reason(ros_node, port, subscription)
+            if reason:
+                ros_node.get_logger().warning(f"input '{port.name}': {reason}")
+
+    timer = loop.every(ros_node, _SILENCE_LOOK_S, look)
+
+
+def _reason(ros_node: RosNode, port: Port, subscription: Subscription) -> str:
+    topic = subscription.topic_name
+    listed = ros_node.get_publishers_info_by_topic(port.external_topic)
+    types = {each.topic_type for each in listed}
+    if types - {port.type}:
+        return f"{topic} is published as {' and '.join(sorted(types))}, not as {port.type}"
+    if types:
+        if all(any(qos_differences(each.qos_profile, subscription.qos_profile)) for each in listed):
+            return ""
+        names = " and ".join(sorted({each.node_name for each in listed}))
+        return f"{names} publishes on {topic}, but DDS has not connected the two"
+    return (
+        f"nobody publishes on {topic}, or nobody that can be seen from here: another ROS domain, "
+        "network or machine, a container with a network of its own, DDS without UDP"
+    )
