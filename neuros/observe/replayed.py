@@ -48,7 +48,7 @@ class RecordedNode:
     """The packets of one node, from the bag of a run.
 
     Attributes:
-        journal: what happened to its engine (:mod:`neuros.core.journal`).
+        journal: what happened to its engine (:mod:`neuros.core.event_log`).
         plan: what was recorded.
 
     Raises:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.journal import is_whole
+from neuros.core.event_log import is_whole
 from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.hook import PacketType
+from neuros.core.node_ports import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, Tap, Way

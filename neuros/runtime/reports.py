@@ -8,7 +8,7 @@ from typing import Any
 
 from neuros.core.engine import Engine
 from neuros.core.explain import explain
-from neuros.core.ledger import snapshot
+from neuros.core.snapshot import snapshot
 from neuros.ports import Logger, Middleware, Transport
 from neuros.project.model import NodeFile
 from neuros.runtime.effects import NodeEffects
@@ -55,10 +55,10 @@ class NodeReports:
         self._books = PacketBooks(engine, self._transport.digests, folder)
         for hook in engine.free_running_hooks():
             logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
-        for inlet in engine.untaken_inlets():
+        for subscription in engine.untaken_subscriptions():
             logger.warning(
-                f"no hook takes input '{inlet.input_name}': packets on {inlet.name} are"
-                " acknowledged on arrival and dropped"
+                f"no hook takes input '{subscription.input_name}': packets on"
+                f" {subscription.name} are acknowledged on arrival and dropped"
             )
 
     def write_books(self) -> None:

@@ -24,7 +24,7 @@ The rules by name, as :class:`Violation` has them:
 ``awake``          a node does not rest while one of its hooks is ready
 ``age``            the age of a packet of a free input is bounded by an execution of each hook
 ``tick``           one execution per due time, never before it
-``counts``         ``run.json`` says what was observed, and its ledger closes
+``counts``         ``run.json`` says what was observed, and its counters add up
 ``end``            the exit code is right, the end comes in time, and nothing is left
 ``killed``         every node ends by itself, within the time that it has for that
 ``drain``          after the end was asked for, nothing that sends unasked starts any more
@@ -420,7 +420,7 @@ class Judge:
         return self.busy_elsewhere[node].within(from_ns, to_ns)
 
     def _waiting_since(self, c: Connection, intake: _Intake, position: int) -> int:
-        """When the packet was sent that ended the mailbox's emptiness; ``_NEVER``: unknown."""
+        """When the packet was sent that ended the input queue's emptiness; ``_NEVER``: unknown."""
         sent = self.sent_ns[c.origin]
         number = position + 1 if self._lost(c) == 0 else intake.after(position)
         return sent[number - 1] if number is not None and number <= len(sent) else _NEVER
@@ -701,7 +701,7 @@ class Judge:
         if sent != seen and not (last and sent == seen - (c.source_output in last[0].sent)):
             yield f"{seen} packets were sent, run.json says {sent}"
         if sent != received + lost or received != consumed + discarded + unread:
-            yield f"the ledger does not close: {dict(books)}"
+            yield f"the counters do not add up: {dict(books)}"
         if lost and c.is_reliable and self.seen.exit_code != 130:
             yield f"lost {lost} on a reliable connection"
         if discarded and c.discard_limit == 0:
