@@ -53,7 +53,7 @@ signal  do what Ctrl+C does (``neuros stop``)
 kind    sent to onlookers                                fields
 ======= ================================================ =================
 glimpse what a node does, for the one that asked         node, ...
-phase   where the run is in its life                     phase, is_paused
+phase   phase of the run                                 phase, is_paused
 log     what the launcher itself tells the user          severity, text
 ended   all nodes have ended; their last reports         exit_code, reason, ...
 ======= ================================================ =================

@@ -32,7 +32,7 @@ class Effects(Protocol):
     def has_taken_in(self) -> bool:
         """Whether all that had reached the node has become an event, so that a hook may start.
 
-        Where it says no, a loop-back comes after that.
+        After a False, a loop-back comes.
         """
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
@@ -54,7 +54,7 @@ class Effects(Protocol):
         """Have the loop-back handled after all events that already wait, outside ones too."""
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
-        """What the node gets on a connection to itself: it shares nothing with this packet."""
+        """A copy for a connection of the node to itself; it shares nothing with this packet."""
 
 
 class Engine:
@@ -132,7 +132,7 @@ class Engine:
         subscription.put(self._arrivals, packet)
         if not subscription.queues:
             self._acknowledge(subscription)
-        del packet  # whatever a hook sends on of it would be shared while this holds it
+        del packet  # a hook that sends it on would share it while this holds it
         self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
@@ -294,7 +294,7 @@ class Engine:
         return [s for s in self.subscriptions.values() if not s.queues]
 
     def rest(self) -> Rest:
-        """What the node does now, and why."""
+        """The state of the node now, and its cause."""
         executing = self.executing  # read once: other threads ask, too
         if executing is not None:
             return Rest(State.EXECUTING, executing.name)
@@ -395,7 +395,7 @@ class Engine:
         return arguments
 
     def _retire(self, hook: Hook) -> None:
-        """Count no longer on a hook that took inputs and will never run again."""
+        """Remove the input queues of a hook that will never run again."""
         for hook_input in hook.inputs:
             for queue in hook_input.queues:
                 queue.subscription.remove(queue)

@@ -40,7 +40,7 @@ def _explain(engine: Engine, now_ns: int) -> list[str]:
     reasons = [
         reason for hook in engine.hooks() if hook.is_enabled for reason in _reasons(hook, now_ns)
     ]
-    # Two hooks may be held up by the same thing; that is said once.
+    # Two hooks may have one reason; that is said once.
     return list(dict.fromkeys(reasons)) or ["has no hook that could run any more"]
 
 

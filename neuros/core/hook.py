@@ -167,7 +167,7 @@ class Hook:
             self.ticks.skip(duration_ns)
 
     def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
-        """What the hook returned: the packets as they are sent, each with its output.
+        """The packets that a hook returned, as they are sent, each with its output.
 
         Raises:
             HookError: if the count, a type, a missing packet, or a value in one is not as declared.

@@ -24,7 +24,7 @@ class Lifecycle:
         has_begun: whether the node was started and every receiver has been found.
         is_running: whether every initialise hook has run.
         last_round: while draining, the hooks that may start once more and no more.
-        tick_start_ns: when that was, on the clock; ticks are counted from then.
+        tick_start_ns: the end of initialisation, on the clock; ticks are counted from then.
     """
 
     def __init__(

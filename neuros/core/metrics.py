@@ -19,7 +19,7 @@ _MOST_BINS = 20_000
 
 
 class State(str, Enum):
-    """What a node does at a moment."""
+    """The state of a node at a moment."""
 
     REGISTERING = "registering"
     EXECUTING = "executing"
@@ -29,11 +29,11 @@ class State(str, Enum):
     SCHEDULING = "scheduling"
     PAUSED = "paused"
 
-    __hash__ = str.__hash__  # time is booked at every event, and Enum's own is ten times slower
+    __hash__ = str.__hash__  # time is counted at every event, and Enum's own is ten times slower
 
 
 class Rest(NamedTuple):
-    """Why a node does nothing: a state, and the input or connection behind it."""
+    """The state of a node, and the hook, input or connection that causes it."""
 
     state: State
     cause: str = ""
@@ -95,7 +95,7 @@ class TickIntervals:
         self._bins[min(interval_ns // _BIN_NS, _MOST_BINS)] += 1
 
     def skip(self, duration_ns: int) -> None:
-        """A time has passed that is no part of an interval."""
+        """Leave a time out of the current interval."""
         if self._last_ns is not None:
             self._last_ns += duration_ns
 

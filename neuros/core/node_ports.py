@@ -14,7 +14,7 @@ from neuros.project.qos import DEPTH
 
 
 class PacketType(NamedTuple):
-    """What a hook must return for an output.
+    """The type that a hook must return for an output.
 
     Attributes:
         kind: the message class.
@@ -28,7 +28,7 @@ class PacketType(NamedTuple):
 class Output:
     """One output of the node and the connections that it feeds.
 
-    ``packet_type`` says what a hook must return for it, ``None`` if anything will do.
+    ``packet_type`` is ``None`` if a hook may return anything for it.
     """
 
     __slots__ = ("elsewhere", "packet_type", "port", "to_itself", "windows")
@@ -115,7 +115,7 @@ class NodePorts:
 
 
 def undeclared(side: str, name: str, known: Iterable[str], node: Node) -> str:
-    """What is wrong with a port that a node has not."""
+    """The message for a port that a node does not have."""
     has = ", ".join(sorted(known)) or "none"
     return f"node '{node.name}' declares no {side} '{name}' (it has {has})"
 

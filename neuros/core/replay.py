@@ -75,7 +75,7 @@ class Script:
         self.loop_back: Callable[[], None] | None = None
 
     def clock(self) -> int:
-        """What the clock said at this point; at least what it said last."""
+        """The reading of the clock at this point, or else the last one."""
         self._now_ns = next(self._readings, self._now_ns)
         return self._now_ns
 

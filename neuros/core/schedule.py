@@ -20,7 +20,7 @@ _MANY = 2**62
 """More hooks and executions than there will be."""
 
 MOST_EXECUTIONS = 10_000
-"""240 kB, which are given away as soon as they are written."""
+"""240 kB, which are freed as soon as they are written."""
 
 
 class Schedule:
@@ -58,7 +58,7 @@ class Schedule:
     def one_pass(self) -> Iterator[Hook]:
         """The candidates in the order of priority that holds now, each looked for at its turn.
 
-        Whatever runs in between may add and remove candidates. One comes up if it has not been
+        A hook that runs in between may add and remove candidates. One comes up if it has not been
         passed by then: its turn is one that was given before the pass began, up to ``last`` to
         hooks that have been executed, below ``first_new`` to the others.
         """

@@ -26,7 +26,7 @@ class Sender(Protocol):
 
 
 class SendWindow:
-    """How many packets may be sent on one connection.
+    """The send window of one connection: it blocks its hooks while it is full.
 
     Attributes:
         is_blocked: whether nothing may be sent on it now.

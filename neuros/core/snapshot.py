@@ -22,7 +22,7 @@ _ATTEMPTS = 10
 
 
 def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
-    """What a node has sent, received and done so far; JSON-serialisable. Any thread.
+    """The metrics of a node so far; JSON-serialisable. Any thread.
 
     Args:
         now_ns: the time now, on the engine's clock.
@@ -31,7 +31,7 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``state``: what it does now, ``{"state", "cause"}``.
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
-        ``incoming``: the same; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
+        ``incoming``: likewise; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
         is ready to start on the oldest unread packet.
         ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
         those that initialise, how many of the seconds that took.

@@ -28,7 +28,7 @@ from neuros.runtime.simulated_time import SimulatedTime
 
 
 class NodeRuntime:
-    """Joins plugin, engine and transport of one node, and takes it through its life.
+    """Joins plugin, engine and transport of one node, and takes it through its lifecycle.
 
     It is the inbox of the transport; :class:`NodeEffects` are those of the engine, and
     :class:`NodeHost` stands behind ``node``.
@@ -134,7 +134,7 @@ class NodeRuntime:
         """Those that wait until packets that they have offered are sent."""
         return self._host.waiting_threads
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ lifecycle
 
     def load(self) -> None:
         """Open the transport (others may look for it from now on) and import the plugin.

@@ -69,25 +69,25 @@ class NodeReports:
     def state(self) -> dict[str, Any]:
         """State and counters. Any thread."""
         now_ns, engine = self._clock(), self._engine
-        ledger = None if engine is None else snapshot(engine, now_ns)
+        metrics = None if engine is None else snapshot(engine, now_ns)
         return {
             "node": self._file.node.name,
             "has_run": self._effects.has_run,
             "waiting_for": [str(each) for each in self._transport.waiting_for()],
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
-            "ledger": ledger,
-            "stack": self._stack(ledger),
+            "metrics": metrics,
+            "stack": self._stack(metrics),
             "fault": None if self._books is None else self._books.failure,
             "is_driving": engine is not None and engine.is_driving,
         }
 
-    def _stack(self, ledger: Mapping[str, Any] | None) -> Stack | None:
+    def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
         """Where the plugin stands, if its hook runs for long, or the node is to end."""
         engine = self._engine
-        if engine is None or ledger is None or threading.current_thread() is _MAIN:
+        if engine is None or metrics is None or threading.current_thread() is _MAIN:
             return None
-        executing = ledger["executing"]
+        executing = metrics["executing"]
         if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
             return stack_in(self._file.node.name, self._file.node.plugin)
         return None

@@ -307,7 +307,7 @@ class Judge:
     def _complain(self, rule: str, each: Execution, text: str) -> None:
         self._found.append(Violation(rule, f"{each.node}.{each.hook}: {text}"))
 
-    # ------------------------------------------------------------------ order, life
+    # ------------------------------------------------------------------ order, lifecycle
 
     def _overlaps(self) -> Iterator[Violation]:
         if self.is_one_process:
@@ -681,10 +681,10 @@ class Judge:
                     text = f"{node.name}.{hook.name} ran {seen} times, run.json says {said}"
                     yield Violation("counts", text)
         for c in self.project.connections:
-            for text in self._ledger(c):
+            for text in self._sums(c):
                 yield Violation("counts", f"{c}: {text}")
 
-    def _ledger(self, c: Connection) -> Iterator[str]:
+    def _sums(self, c: Connection) -> Iterator[str]:
         books = self.seen.connection(str(c))
         if books is None:
             yield "is not in run.json"

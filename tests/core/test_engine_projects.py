@@ -137,7 +137,7 @@ def taken_positions(network: Network, c: Connection) -> dict[str, list[int]]:
 @settings(max_examples=120, deadline=None)
 @given(project=projects(), delays_ns=delays | slow_and_fast)
 def test_on_every_connection_of_every_project(project, delays_ns):
-    """Windows hold, ledgers close, nothing runs too early, and no hook misses too many in a row."""
+    """Windows hold, counters add up, nothing runs too early, no hook misses too many in a row."""
 
     def check(network: Network) -> None:
         check_connections(network)

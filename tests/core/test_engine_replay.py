@@ -156,7 +156,7 @@ def some_run() -> tuple[Run, array[int]]:
     return run, event_log
 
 
-def test_where_a_journal_was_cut_off_the_replay_is_over() -> None:
+def test_where_an_event_log_was_cut_off_the_replay_is_over() -> None:
     run, event_log = some_run()
     assert not is_whole(event_log)
     last_start = max(place for place in range(len(event_log)) if [*starts_of(event_log[place:])])
