@@ -92,13 +92,13 @@ class NodePorts:
             HookError: if the node has no such port, or a required input has no source.
         """
         inputs = [port.name for port in self._node.inputs]
-        for side, ports, known in (
+        for kind, ports, known in (
             ("input", spec.inputs, inputs),
             ("output", spec.outputs, [*self.outputs]),
         ):
             for port in ports:
                 if port.name not in known:
-                    text = undeclared(side, port.name, known, self._node)
+                    text = undeclared(kind, port.name, known, self._node)
                     raise HookError(text, hook=spec.name, where=spec.where)
         return [self._hook_input(spec, port) for port in spec.inputs]
 
@@ -114,10 +114,10 @@ class NodePorts:
         return HookInput(port, subscriptions)
 
 
-def undeclared(side: str, name: str, known: Iterable[str], node: Node) -> str:
+def undeclared(kind: str, name: str, known: Iterable[str], node: Node) -> str:
     """The message for a port that a node does not have."""
     has = ", ".join(sorted(known)) or "none"
-    return f"node '{node.name}' declares no {side} '{name}' (it has {has})"
+    return f"node '{node.name}' declares no {kind} '{name}' (it has {has})"
 
 
 def _subscription(connection: Connection) -> Subscription:
