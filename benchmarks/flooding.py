@@ -32,7 +32,7 @@ def neuros(
     connection: dict[str, Any],
     options: Sequence[str] = (),
 ) -> dict[str, float]:
-    """From hook to hook, :data:`QUEUE_SIZE` packets in the mailbox.
+    """From hook to hook, :data:`QUEUE_SIZE` packets in the input queue.
 
     Where the run is recorded, ``behind_s`` is how long after its last packet the bag was complete.
     """

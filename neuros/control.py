@@ -49,15 +49,7 @@ end     end the run, drained, with exit code 0           reason
 signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 
-=========== ================================================ =================
-kind        sent to onlookers                                fields
-=========== ================================================ =================
-node_status what a node does, for the one that asked         node, ...
-phase       where the run is in its life                     phase, is_paused
-log         what the launcher itself tells the user          severity, text
-ended       all nodes have ended; their last reports         exit_code, reason, ...
-=========== ================================================ =================
-"""
+=========== ================================================ =========="""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ def test_an_import_that_breaks_the_table_is_named_with_its_line(
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("neuros.core.engine", "from neuros.core import flow\nfrom .inputs import Mailbox"),
+        ("neuros.core.engine", "from neuros.core import hook\nfrom .metrics import Rest"),
         ("neuros.core.engine", "from neuros import errors, hooks\nimport heapq"),
         ("neuros.project.validate", "import jsonschema\nfrom neuros.project.model import Node"),
         ("neuros.cli.launch", "from neuros.transport.ros import x\nfrom neuros import __version__"),

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.reproduce.tables import Ours
-from neuros.core.ticks import WITHIN_MS, TickBook
+from neuros.core.metrics import WITHIN_MS, TickIntervals
 
 BIN_MS = 0.1
 INTERVAL_COLUMNS = (
@@ -21,7 +21,7 @@ INTERVAL_COLUMNS = (
 
 def intervals_of(moments_ns: Sequence[int], period_s: float) -> dict[str, Any] | None:
     """What ``run.json`` says of a timed hook, of any moments; ``None`` of fewer than two."""
-    book = TickBook(round(period_s * 1e9))
+    book = TickIntervals(round(period_s * 1e9))
     for moment_ns in moments_ns:
         book.note(moment_ns)
     return book.figures()

@@ -15,8 +15,8 @@ from typing import Any
 from benchmarks.launching import PLUGINS, launch, project_of_plugins
 from benchmarks.measure import Case, Figure, Group, Subject
 from neuros.core.engine import Engine
+from neuros.core.event_log import LoggedEngine
 from neuros.core.hook import Hook
-from neuros.core.journal import JournalledEngine
 from neuros.hooks import hook_specs_of, neuros_function
 from neuros.project.model import Connection, Node, Port
 
@@ -30,7 +30,7 @@ def subject(is_quick: bool) -> Subject:
     candidates = {
         "engine alone, loop-back": functools.partial(loop_back_us, count),
         RELAY: functools.partial(relay_us, count),
-        JOURNALLED: functools.partial(relay_us, count, JournalledEngine),
+        JOURNALLED: functools.partial(relay_us, count, LoggedEngine),
         "in process": functools.partial(real_run_us, "in-process", count),
         "process": functools.partial(real_run_us, "process", count),
     }

@@ -48,9 +48,8 @@ def nothing(*_: Any) -> None:
 def without_ledger() -> dict[Place, Any]:
     """Times of packets, digests, the accounts of wall time, the timeline."""
     from neuros.core.engine import Engine
-    from neuros.core.exchange import Exchange
-    from neuros.core.flow import Outlet
-    from neuros.core.inputs import Inlet
+    from neuros.core.input_queue import Subscription
+    from neuros.core.send_window import SendWindow
     from neuros.runtime.simulated_time import SimulatedTime
     from neuros.transport import digests
     from neuros.transport.memory import MemoryTransport
@@ -58,14 +57,14 @@ def without_ledger() -> dict[Place, Any]:
     no_clock = {"self._clock()": "self.since_ns"}
     return {
         (Engine, "_wake"): rewritten(
-            Engine._wake, {**no_clock, "self._spent_ns[": "", "self.since_ns = now_ns": "pass"}
+            Engine._wake, {**no_clock, "self.spent_ns[": "", "self.since_ns = now_ns": "pass"}
         ),
         (Engine, "_run"): rewritten(
-            Engine._run, {**no_clock, "self._spent_ns[": "", "hook.busy_ns +=": ""}
+            Engine._run, {**no_clock, "self.spent_ns[": "", "hook.busy_ns +=": ""}
         ),
-        (Exchange, "take"): rewritten(Exchange.take, {"inlet.taken_ns.append": ""}),
-        (Inlet, "take"): rewritten(Inlet.take, {"self.taken.append": ""}),
-        (Outlet, "spend"): rewritten(Outlet.spend, {"self.sent_ns.append": ""}),
+        (Engine, "_take"): rewritten(Engine._take, {"subscription.taken_ns.append": ""}),
+        (Subscription, "take"): rewritten(Subscription.take, {"self.taken.append": ""}),
+        (SendWindow, "spend"): rewritten(SendWindow.spend, {"self.sent_ns.append": ""}),
         (SimulatedTime, "look"): rewritten(SimulatedTime.look, {"self._timeline.note": ""}),
         (MemoryTransport, "_note_digest"): nothing,
         (digests, "_whole"): lambda _: 0,
@@ -73,14 +72,14 @@ def without_ledger() -> dict[Place, Any]:
 
 
 def without_recording() -> dict[Place, Any]:
-    """The journal of the engine, and the packets that are kept."""
+    """The event log of the engine, and the packets that are kept."""
     from neuros.core.engine import Engine
-    from neuros.core.journal import JournalledEngine
+    from neuros.core.event_log import LoggedEngine
     from neuros.runtime.effects import NodeRecorder
 
-    events = [name for name in vars(JournalledEngine) if name in vars(Engine)]
+    events = [name for name in vars(LoggedEngine) if name in vars(Engine)]
     kept = {"__init__", "__doc__", "__module__", "stop_hooks"}
-    plain = {(JournalledEngine, name): getattr(Engine, name) for name in events if name not in kept}
+    plain = {(LoggedEngine, name): getattr(Engine, name) for name in events if name not in kept}
     return {**plain, (NodeRecorder, "keep"): nothing}
 
 

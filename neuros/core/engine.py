@@ -6,36 +6,55 @@ once, least recently executed first, and runs if it is ready at its turn. If one
 afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
 Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
 the loop-back goes on when that has been taken in. So no hook starts on a backlog.
-All that leaves the engine goes through :class:`~neuros.core.effects.Effects`.
+All that leaves the engine goes through :class:`Effects`.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
-from neuros.core.accounting import (
-    IDLE,
-    PAUSED,
-    REGISTERING,
-    SCHEDULING,
-    Accounts,
-    Rest,
-    State,
-    cause_of_rest,
-)
-from neuros.core.effects import Effects
-from neuros.core.exchange import Exchange
-from neuros.core.gate import Gate, drives
-from neuros.core.hook import Hook, PacketType, Source
-from neuros.core.inputs import Inlet
-from neuros.core.life import Life
-from neuros.core.node_ports import NodePorts, undeclared
-from neuros.core.schedule import Schedule
-from neuros.core.trace import Trace
+from neuros.core.hook import Hook, Source
+from neuros.core.input_queue import Subscription
+from neuros.core.lifecycle import Lifecycle, Pause, drives
+from neuros.core.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
+from neuros.core.node_ports import NodePorts, Output, PacketType, undeclared
+from neuros.core.schedule import ExecutionLog, Schedule
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
-from neuros.project.model import Connection, Node
+from neuros.project.model import Connection, Node, Port
+
+
+class Effects(Protocol):
+    """The only way out of an engine: its calls are all that the engine does to the world."""
+
+    def has_taken_in(self) -> bool:
+        """Whether all that had reached the node has become an event, so that a hook may start.
+
+        After a False, a loop-back comes.
+        """
+
+    def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
+        """Run a hook of the plugin; raises ``HookError``."""
+
+    def send(self, connections: Sequence[Connection], packet: Any) -> None:
+        """Send on these connections, which lead to other nodes."""
+
+    def send_external(self, port: Port, packet: Any) -> None:
+        """Publish on an external topic."""
+
+    def acknowledge(self, connection: Connection, position: int) -> None:
+        """Tell the sender of a connection from another node."""
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Have a delivery to the node itself handled after all events that already wait."""
+
+    def post_loop_back(self, event: Callable[[], None]) -> None:
+        """Have the loop-back handled after all events that already wait, outside ones too."""
+
+    def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
+        """A copy for a connection of the node to itself; it shares nothing with this packet."""
 
 
 class Engine:
@@ -51,8 +70,9 @@ class Engine:
     Attributes:
         all_hooks: in the order of declaration, those that will not run again, too.
         executing: the hook that runs now.
-        since_ns: when that started, or else up to when the time is booked.
-        trace: the first executions.
+        since_ns: when that started, or else up to when the time is counted.
+        spent_ns: wall time by cause; that of executions is counted by each hook.
+        execution_log: the first executions.
 
     Raises:
         HookError: if a hook names a port that the node has not, or needs an input without source.
@@ -72,22 +92,27 @@ class Engine:
         self._has_taken_in = effects.has_taken_in
         self._clock = clock
         ports = NodePorts(node, connections, packet_types or {})
-        self.inlets, self.outlets, self.outputs = ports.inlets, ports.outlets, ports.outputs
-        self._exchange = Exchange(node, ports, effects, clock, self.on_packet)
+        self.subscriptions, self.send_windows = ports.subscriptions, ports.send_windows
+        self.outputs = ports.outputs
+        self._arrivals = 0
+        self._to_itself = 0  # packets of the node for itself that are on their way
         self._schedule = Schedule()
-        self.all_hooks = [ports.hook(s) for s in specs if s.kind is not HookKind.FINALISE]
+        self.all_hooks = [
+            Hook(spec, ports.inputs_of(spec), self.outputs)
+            for spec in specs
+            if spec.kind is not HookKind.FINALISE
+        ]
         for hook in self.all_hooks:
             self._schedule.add(hook)
-        self._life = Life(self._schedule, self.outlets, clock)
+        self._lifecycle = Lifecycle(self._schedule, self.send_windows, clock)
         self._sources: dict[tuple[str, ...], Source] = {}
         self._ticks = [h for h in self.all_hooks if h.spec.kind is HookKind.TICK]
-        self._gate = Gate(self._life, self._ticks)
+        self._pause = Pause(self._lifecycle, self._ticks)
         self._has_posted_loop_back = False
         self._is_passing = False
         self.executing: Hook | None = None
-        self.accounts = Accounts()
-        self._spent_ns = self.accounts.totals_ns
-        self.trace = Trace()
+        self.spent_ns: Counter[Rest] = Counter()
+        self.execution_log = ExecutionLog()
         self._cause = REGISTERING
         self.created_ns = self.since_ns = clock()
 
@@ -96,28 +121,32 @@ class Engine:
     def start(self) -> None:
         """Begin: run hooks from now on, as soon as every receiver is there."""
         self._wake()
-        self._life.start()
+        self._lifecycle.start()
         self._pass()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
         """A packet has arrived on a connection, or on the external topic of the input ``key``."""
         self._wake()
-        self._exchange.receive(key, packet)
-        del packet  # whatever a hook sends on of it would be shared while this holds it
+        subscription = self.subscriptions[key]
+        self._arrivals += 1
+        subscription.put(self._arrivals, packet)
+        if not subscription.queues:
+            self._acknowledge(subscription)
+        del packet  # a hook that sends it on would share it while this holds it
         self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """All takers at the far end have started on the packets up to ``position``."""
         now_ns = self._wake()
-        self.outlets[connection].credit(position, now_ns)
-        if not self.trace.is_full:
-            self.trace.note_credit(connection, position, now_ns)
+        self.send_windows[connection].credit(position, now_ns)
+        if not self.execution_log.is_full:
+            self.execution_log.note_credit(connection, position, now_ns)
         self._pass()
 
     def on_registered(self, connection: Connection) -> None:
         """The receiver of one of the outputs' connections is there."""
         self._wake()
-        self._life.register(connection)
+        self._lifecycle.register(connection)
         self._pass()
 
     def on_timer(self) -> None:
@@ -155,7 +184,7 @@ class Engine:
                 loop waits for the one before): they start at most once more.
         """
         self._wake()
-        self._life.drain(self.all_hooks[place] for place in last_round)
+        self._lifecycle.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
         self.resume()
 
@@ -165,51 +194,51 @@ class Engine:
         Where draining has begun it has no effect.
         """
         now_ns = self._wake()
-        if not self._life.is_draining:
-            self._gate.close(now_ns)
+        if not self._lifecycle.is_draining:
+            self._pause.begin(now_ns)
         self._cause = self.rest()
 
     def resume(self) -> None:
         """Go on after a pause; without one it has no effect."""
-        if self._gate.is_closed:
-            self._gate.open(self._wake())
+        if self._pause.is_on:
+            self._pause.end(self._wake())
             self._pass()
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.
 
         The others answer what they receive; where nothing drives the project (``is_driven`` is
-        false), each hook starts so many times. See :mod:`neuros.core.gate`.
+        false), each hook starts so many times. See :class:`~neuros.core.lifecycle.Pause`.
         """
         self._wake()
-        self._gate.grant(count, is_driven=is_driven)
+        self._pause.grant(count, is_driven=is_driven)
         self._pass()
 
     def stop_hooks(self) -> None:
         """Start no further hook, ever (what the running one returns is still sent). Any thread."""
-        self._life.is_stopped = True
+        self._lifecycle.is_stopped = True
 
     # ------------------------------------------------------------------ questions
 
     @property
     def is_started(self) -> bool:
         """Whether :meth:`start` was called."""
-        return self._life.is_started
+        return self._lifecycle.is_started
 
     @property
     def is_running(self) -> bool:
         """Whether every initialise hook has run."""
-        return self._life.is_running
+        return self._lifecycle.is_running
 
     @property
     def is_stopped(self) -> bool:
         """Whether no further hook starts."""
-        return self._life.is_stopped
+        return self._lifecycle.is_stopped
 
     @property
     def is_paused(self) -> bool:
         """Whether hooks stand still, but for steps."""
-        return self._gate.is_closed
+        return self._pause.is_on
 
     @property
     def is_driving(self) -> bool:
@@ -219,12 +248,12 @@ class Engine:
     @property
     def tick_start_ns(self) -> int:
         """The end of initialisation, from which ticks are counted; pauses move it on."""
-        return self._life.tick_start_ns
+        return self._lifecycle.tick_start_ns
 
     @property
     def next_due_ns(self) -> int | None:
         """When :meth:`on_timer` is wanted next, on the clock that was given; ``None``: never."""
-        if self._gate.is_closed:
+        if self._pause.is_on:
             return None
         return min(
             (hook.due_ns for hook in self._ticks if hook.is_enabled and not hook.is_due),
@@ -250,7 +279,7 @@ class Engine:
         """
         if self.is_stopped:
             return False
-        return not self._life.has_begun or self._schedule.is_wakeable()
+        return not self._lifecycle.has_begun or self._schedule.is_wakeable()
 
     def hooks(self) -> Sequence[Hook]:
         """The hooks that may still run, least recently executed first."""
@@ -260,64 +289,64 @@ class Engine:
         """Hooks that nothing but blocked outputs ever holds up: the node's main loops."""
         return self._schedule.free_running_hooks()
 
-    def untaken_inlets(self) -> Sequence[Inlet]:
+    def untaken_subscriptions(self) -> Sequence[Subscription]:
         """Connections to inputs that no hook takes."""
-        return [inlet for inlet in self.inlets.values() if not inlet.mailboxes]
+        return [s for s in self.subscriptions.values() if not s.queues]
 
     def rest(self) -> Rest:
-        """What the node does now, and why."""
+        """The state of the node now, and its cause."""
         executing = self.executing  # read once: other threads ask, too
         if executing is not None:
             return Rest(State.EXECUTING, executing.name)
-        if not self._life.has_begun:
+        if not self._lifecycle.has_begun:
             return REGISTERING
-        if self._gate.is_closed:
+        if self._pause.is_on:
             return PAUSED
-        cause = cause_of_rest(self._schedule.order)
+        cause = self._schedule.rest()
         return IDLE if self.is_stopped and cause is SCHEDULING else cause
 
     # ------------------------------------------------------------------ inside
 
     def _wake(self) -> int:
-        """Book the time since the last event, and note the ticks due by now; returns the time."""
+        """Count the time since the last event, and note the ticks due by now; returns the time."""
         now_ns = self._clock()
-        if self._ticks and not self._gate.is_closed:
+        if self._ticks and not self._pause.is_on:
             for hook in self._ticks:
                 if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
                     hook.is_due = True
-        if self.executing is None:  # else it is the hook's, and booked when that ends
-            self._spent_ns[self._cause] += now_ns - self.since_ns
+        if self.executing is None:  # else it is the hook's, and counted when that ends
+            self.spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns
         return now_ns
 
     def _pass(self, *, may_start: bool = False) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
-        life, gate, exchange = self._life, self._gate, self._exchange
-        if not life.has_begun:
+        lifecycle, pause = self._lifecycle, self._pause
+        if not lifecycle.has_begun:
             return
         if self._schedule.candidates:
             self._is_passing = True
             try:
                 for hook in self._schedule.one_pass():
-                    if life.is_stopped:
+                    if lifecycle.is_stopped:
                         break
-                    if gate.is_closed and not gate.lets(hook):
+                    if pause.is_on and not pause.allows(hook):
                         continue
                     if not hook.blocked or hook.can_send():
-                        if not may_start and (exchange.to_itself or not self._has_taken_in()):
+                        if not may_start and (self._to_itself or not self._has_taken_in()):
                             break
                         may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False
-        if life.is_stopped:
+        if lifecycle.is_stopped:
             self._cause = self.rest()
-        elif gate.is_closed:
-            self._cause = gate.cause_of_rest(self._schedule.candidates)
+        elif pause.is_on:
+            self._cause = pause.cause_of_rest(self._schedule.candidates)
         else:
             self._cause = self._schedule.cause_of_rest()
-        if self._cause is SCHEDULING and not (self._has_posted_loop_back or life.is_stopped):
+        if self._cause is SCHEDULING and not (self._has_posted_loop_back or lifecycle.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
 
@@ -325,36 +354,87 @@ class Engine:
         """Start a hook: move it to the end of the order, take its packets, send what it returns."""
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
-        if self._gate.is_closed:
-            self._gate.note(hook)
+        if self._pause.is_on:
+            self._pause.note_start(hook)
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
-            hook.set_due(self._life.tick_start_ns, start_ns)
-        if self._life.last_round and hook in self._life.last_round:
-            self._life.finish_round(hook)
-        self._spent_ns[SCHEDULING] += start_ns - self.since_ns
+            hook.set_due(self._lifecycle.tick_start_ns, start_ns)
+        if self._lifecycle.last_round and hook in self._lifecycle.last_round:
+            self._lifecycle.finish_round(hook)
+        self.spent_ns[SCHEDULING] += start_ns - self.since_ns
         self.since_ns = start_ns
         self.executing = hook
         try:
             if isinstance(hook, Source):
                 result: Any = hook.take()
             else:
-                result = self._effects.call(hook, self._exchange.take(hook, start_ns))
+                result = self._effects.call(hook, self._take(hook, start_ns))
         finally:
             self.executing = None
             end_ns = self._clock()
             hook.executions += 1
             hook.busy_ns += end_ns - start_ns
             self.since_ns = end_ns
-            if not self.trace.is_full:
-                self.trace.note_execution(hook, start_ns, end_ns)
+            if not self.execution_log.is_full:
+                self.execution_log.note_execution(hook, start_ns, end_ns)
         for output, packet in hook.packets_of(result):
-            self._exchange.send(output, packet, self.since_ns)
+            self._send(output, packet, self.since_ns)
         if isinstance(hook, Source):
             hook.accept()
         elif hook.spec.kind is HookKind.INITIALISE:
-            self._exchange.retire(hook)
-            self._life.finish_initialiser(hook)
+            self._retire(hook)
+            self._lifecycle.finish_initialiser(hook)
+
+    def _take(self, hook: Hook, now_ns: int) -> list[Any]:
+        """The arguments of a hook that starts now; acknowledges the packets."""
+        touched: list[Subscription] = []
+        arguments = [hook_input.take(touched) for hook_input in hook.inputs]
+        for subscription in touched:
+            subscription.taken_ns.append(now_ns)
+            self._acknowledge(subscription)
+        return arguments
+
+    def _retire(self, hook: Hook) -> None:
+        """Remove the input queues of a hook that will never run again."""
+        for hook_input in hook.inputs:
+            for queue in hook_input.queues:
+                queue.subscription.remove(queue)
+                self._acknowledge(queue.subscription)
+
+    def _send(self, output: Output, packet: Any, now_ns: int) -> None:
+        """Send a packet now on all connections of an output, or on its external topic."""
+        if output.port.external_topic is not None:
+            self._effects.send_external(output.port, packet)
+            return
+        for window in output.windows:
+            window.spend(now_ns)
+        for connection in output.to_itself:
+            self._send_to_itself(connection, packet)
+        if output.elsewhere:
+            self._effects.send(output.elsewhere, packet)
+
+    def _send_to_itself(self, connection: Connection, packet: Any) -> None:
+        own = self._effects.copy_to_itself(connection, packet)
+        self._to_itself += 1
+
+        def arrive() -> None:
+            self._to_itself -= 1
+            self.on_packet(connection, own)
+
+        self._effects.post(arrive)
+
+    def _acknowledge(self, subscription: Subscription) -> None:
+        if not subscription.is_acknowledged:
+            return
+        position = subscription.position_if_taken()
+        if position <= subscription.acknowledged:
+            return
+        subscription.acknowledged = position
+        connection: Any = subscription.key  # external topics are not acknowledged
+        if connection.source_node == self.node.name:
+            self.send_windows[connection].credit(position, self._clock())
+        else:
+            self._effects.acknowledge(connection, position)
 
     def _add_source(self, names: tuple[str, ...]) -> Source:
         for name in names:
@@ -362,6 +442,6 @@ class Engine:
                 text = undeclared("output", name, self.outputs, self.node)
                 raise HookError(text, hook="submit", where=str(self.node.plugin))
         source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
-        self._life.add_source(source)
+        self._lifecycle.add_source(source)
         self.all_hooks.append(source)
         return source

@@ -1,58 +1,27 @@
-"""One hook of a running node: what it waits for, and what it has done."""
+"""One hook of a running node: its readiness, its counters and the check of its results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from neuros.core.flow import Outlet
-from neuros.core.inputs import InputSlot, Mailbox
-from neuros.core.ticks import TickBook
+from neuros.core.input_queue import HookInput, InputQueue
+from neuros.core.metrics import TickIntervals
+from neuros.core.node_ports import Output
+from neuros.core.send_window import SendWindow
 from neuros.errors import HookError, WrongValue
 from neuros.hooks import HookKind, HookSpec, OutputSpec
-from neuros.project.model import Port
 
 _SEVERAL = (tuple, list)  # as a union it would be made anew at each use
-
-
-class PacketType(NamedTuple):
-    """What a hook must return for an output.
-
-    Attributes:
-        kind: the message class.
-        check: returns a packet with the values that are sent, or raises ``WrongValue``.
-    """
-
-    kind: type
-    check: Callable[[Any], Any]
-
-
-class Output:
-    """One output of the node and the connections that it feeds.
-
-    ``packet_type`` says what a hook must return for it, ``None`` if anything will do.
-    """
-
-    __slots__ = ("elsewhere", "outlets", "packet_type", "port", "to_itself")
-
-    def __init__(
-        self, port: Port, outlets: Sequence[Outlet], packet_type: PacketType | None
-    ) -> None:
-        self.port = port
-        self.outlets = tuple(outlets)
-        connections = [outlet.connection for outlet in outlets]
-        self.to_itself = tuple(c for c in connections if c.destination_node == c.source_node)
-        self.elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
-        self.packet_type = packet_type
 
 
 class Hook:
     """A hook and its state; readiness is kept up to date by counting, not by looking.
 
     Attributes:
-        blocked: number of its outlets that are blocked now.
+        blocked: number of its send windows that are blocked now.
         is_due: False only for a tick between two due times, and for a source with nothing to send.
-        is_enabled: whether the node's phase of life lets it run at all.
+        is_enabled: whether the phase of the node's lifecycle lets it run at all.
         turn: grows in the order of priority: least recently executed first.
         candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
             keeps itself in there, so that no event has to look at all the others.
@@ -64,51 +33,51 @@ class Hook:
         "_is_due",
         "_is_enabled",
         "_lacking",
-        "_outlets",
         "_results",
+        "_windows",
         "blocked",
         "busy_ns",
         "candidates",
         "due_ns",
         "executions",
+        "inputs",
         "loops",
         "missed_ticks",
         "name",
         "outputs",
         "period_ns",
-        "slots",
         "spec",
         "ticks",
         "turn",
     )
 
     def __init__(
-        self, spec: HookSpec, slots: Sequence[InputSlot], outputs: Mapping[str, Output]
+        self, spec: HookSpec, inputs: Sequence[HookInput], outputs: Mapping[str, Output]
     ) -> None:
         self.spec = spec
         self.name = spec.name
-        self.slots = tuple(slots)
+        self.inputs = tuple(inputs)
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
-        self._outlets = tuple(outlet for output in self.outputs for outlet in output.outlets)
+        self._windows = tuple(window for output in self.outputs for window in output.windows)
         self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
         self.blocked = 0
         self.turn = 0
         self.candidates: set[Hook] = set()
         self._is_due = spec.period_s is None
         self._is_enabled = False
-        self._lacking = sum(slot.missing > 0 for slot in self.slots)
-        for slot in self.slots:
-            slot.hook = self
+        self._lacking = sum(hook_input.missing > 0 for hook_input in self.inputs)
+        for hook_input in self.inputs:
+            hook_input.hook = self
         self.executions = 0
         self.busy_ns = 0
         self.due_ns = 0
         self.missed_ticks = 0
         self.period_ns = 0 if spec.period_s is None else max(1, round(spec.period_s * 1e9))
-        self.ticks = TickBook(self.period_ns) if self.period_ns else None
+        self.ticks = TickIntervals(self.period_ns) if self.period_ns else None
         self.loops = tuple(self._loops())
-        for outlet in self._outlets:
-            outlet.hooks.append(self)
-            self.blocked += outlet.is_blocked
+        for window in self._windows:
+            window.hooks.append(self)
+            self.blocked += window.is_blocked
 
     @property
     def is_due(self) -> bool:
@@ -122,7 +91,7 @@ class Hook:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether the phase of life lets it run."""
+        """Whether the phase of the node lets it run."""
         return self._is_enabled
 
     @is_enabled.setter
@@ -130,58 +99,58 @@ class Hook:
         self._is_enabled = is_enabled
         self._note()
 
-    def on_slot_complete(self) -> None:
+    def on_input_complete(self) -> None:
         """One of its inputs has now what it needs."""
         self._lacking -= 1
         if not self._lacking and self._is_enabled and self._is_due:
             self.candidates.add(self)
 
-    def on_slot_incomplete(self) -> None:
+    def on_input_incomplete(self) -> None:
         """One of its inputs lacks something now."""
         self._lacking += 1
         self.candidates.discard(self)
 
-    def outlets(self) -> list[Outlet]:
+    def windows(self) -> list[SendWindow]:
         """Every connection that the hook may send on."""
-        return list(self._outlets)
+        return list(self._windows)
 
     def is_ready(self) -> bool:
         """Whether it may start now: input, output and timer condition, and the node's phase."""
-        if not (self.is_enabled and self.is_due) or self.missing_slot() is not None:
+        if not (self.is_enabled and self.is_due) or self.missing_input() is not None:
             return False
         return not self.blocked or self.can_send()
 
     def can_send(self) -> bool:
-        """Whether none of its outlets is blocked, but for packets that its own start would take."""
+        """Whether no send window is blocked, but for packets that its own start would take."""
         if not self.blocked:
             return True
-        return bool(self.loops) and len(self._freed_outlets()) == self.blocked
+        return bool(self.loops) and len(self._freed_windows()) == self.blocked
 
-    def awaited_slot(self) -> InputSlot | None:
+    def awaited_input(self) -> HookInput | None:
         """The first of its required inputs that has no packet, if that is all it waits for."""
-        return self.missing_slot() if self._lacking and self._is_enabled and self._is_due else None
+        return self.missing_input() if self._lacking and self._is_enabled and self._is_due else None
 
-    def missing_slot(self) -> InputSlot | None:
+    def missing_input(self) -> HookInput | None:
         """The first of its required inputs that has no packet."""
-        for slot in self.slots:  # a loop, since next() over a generator takes thrice as long
-            if slot.missing:
-                return slot
+        for hook_input in self.inputs:  # a loop, since next() over a generator takes thrice as long
+            if hook_input.missing:
+                return hook_input
         return None
 
     def is_blocked(self) -> bool:
         """Whether it has all inputs, and only its receivers hold it up."""
         return (
-            self.is_enabled and self.is_due and self.missing_slot() is None and not self.can_send()
+            self.is_enabled and self.is_due and self.missing_input() is None and not self.can_send()
         )
 
-    def blocking_outlets(self) -> list[Outlet]:
-        """The outlets that hold it up."""
-        freed = self._freed_outlets() if self.loops else ()
-        return [outlet for outlet in self._outlets if outlet.is_blocked and outlet not in freed]
+    def blocking_windows(self) -> list[SendWindow]:
+        """The send windows that hold it up."""
+        freed = self._freed_windows() if self.loops else ()
+        return [window for window in self._windows if window.is_blocked and window not in freed]
 
     def has_reliable_packet(self) -> bool:
         """Whether a packet that must not be lost waits for it."""
-        return any(slot.has_reliable_packet() for slot in self.slots)
+        return any(hook_input.has_reliable_packet() for hook_input in self.inputs)
 
     def set_due(self, start_ns: int, now_ns: int) -> None:
         """Set the next due time, ``start + k * period`` after now; passed ones coalesce."""
@@ -198,7 +167,7 @@ class Hook:
             self.ticks.skip(duration_ns)
 
     def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
-        """What the hook returned: the packets as they are sent, each with its output.
+        """The packets that a hook returned, as they are sent, each with its output.
 
         Raises:
             HookError: if the count, a type, a missing packet, or a value in one is not as declared.
@@ -260,24 +229,24 @@ class Hook:
         else:
             self.candidates.discard(self)
 
-    def _loops(self) -> list[tuple[Outlet, InputSlot, Mailbox]]:
+    def _loops(self) -> list[tuple[SendWindow, HookInput, InputQueue]]:
         """Connections from this hook to itself."""
         return [
-            (outlet, slot, mailbox)
-            for outlet in self._outlets
-            for slot in self.slots
-            for mailbox in slot.mailboxes
-            if mailbox.inlet.key is outlet.connection
+            (window, hook_input, queue)
+            for window in self._windows
+            for hook_input in self.inputs
+            for queue in hook_input.queues
+            if queue.subscription.key is window.connection
         ]
 
-    def _freed_outlets(self) -> list[Outlet]:
-        """The blocked ones of its outlets whose packets its own start would acknowledge."""
+    def _freed_windows(self) -> list[SendWindow]:
+        """The blocked ones of its send windows whose packets its own start would acknowledge."""
         return [
-            outlet
-            for outlet, slot, mailbox in self.loops
-            if outlet.is_blocked
-            and slot.would_take(mailbox)
-            and outlet.frees(mailbox.inlet.position_if_taken(mailbox))
+            window
+            for window, hook_input, queue in self.loops
+            if window.is_blocked
+            and hook_input.would_take(queue)
+            and window.frees(queue.subscription.position_if_taken(queue))
         ]
 
 
@@ -295,7 +264,7 @@ class Source(Hook):
         self.name = f"submit({', '.join(names)})"
         self._where = where
         self._offers: dict[object, tuple[Sequence[Any], Callable[[], None]]] = {}
-        self._accepted: Callable[[], None] = _nobody
+        self._accepted: Callable[[], None] = _nothing
         self.is_due = False
 
     def offer(self, packets: Sequence[Any], accepted: Callable[[], None]) -> Callable[[], None]:
@@ -317,8 +286,8 @@ class Source(Hook):
         return packets
 
     def accept(self) -> None:
-        """Tell who made the offer taken last that it has been sent."""
-        accepted, self._accepted = self._accepted, _nobody
+        """Report that the offer taken last has been sent."""
+        accepted, self._accepted = self._accepted, _nothing
         accepted()
 
     def error(self, text: str) -> HookError:
@@ -330,8 +299,8 @@ def _offer() -> None:
     """Stands for the function of a :class:`Source`."""
 
 
-def _nobody() -> None:
-    """Nobody to tell."""
+def _nothing() -> None:
+    """The callback of no offer."""
 
 
 def _kind(value: object) -> str:

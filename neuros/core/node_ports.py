@@ -1,28 +1,59 @@
-"""From a node's declaration to what its engine works on: inlets, outlets, outputs and hooks."""
+"""The ports of a node in its engine: subscriptions, send windows, outputs and inputs of hooks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
-from neuros.core.flow import Outlet
-from neuros.core.hook import Hook, Output, PacketType
-from neuros.core.inputs import Inlet, InputSlot
+from neuros.core.input_queue import HookInput, Subscription
+from neuros.core.send_window import SendWindow
 from neuros.errors import HookError
 from neuros.hooks import HookSpec, InputSpec
-from neuros.project.model import Connection, Node
+from neuros.project.model import Connection, Node, Port
 from neuros.project.qos import DEPTH
 
 
+class PacketType(NamedTuple):
+    """The type that a hook must return for an output.
+
+    Attributes:
+        kind: the message class.
+        check: returns a packet with the values that are sent, or raises ``WrongValue``.
+    """
+
+    kind: type
+    check: Callable[[Any], Any]
+
+
+class Output:
+    """One output of the node and the connections that it feeds.
+
+    ``packet_type`` is ``None`` if a hook may return anything for it.
+    """
+
+    __slots__ = ("elsewhere", "packet_type", "port", "to_itself", "windows")
+
+    def __init__(
+        self, port: Port, windows: Sequence[SendWindow], packet_type: PacketType | None
+    ) -> None:
+        self.port = port
+        self.windows = tuple(windows)
+        connections = [window.connection for window in windows]
+        self.to_itself = tuple(c for c in connections if c.destination_node == c.source_node)
+        self.elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
+        self.packet_type = packet_type
+
+
 class NodePorts:
-    """Both sides of a node.
+    """The ports of one node, joined to its connections.
 
     Args:
         connections: all that begin or end at the node, in the project's order.
         packet_types: per output name; hooks may return anything where there is none.
 
     Attributes:
-        inlets: by connection, and by the name of the input for external topics, which come last.
-        outlets: by connection; one to the node itself is registered from the start.
+        subscriptions: by connection; those of external topics come last, by the name of the input.
+        send_windows: by connection; one to the node itself is registered from the start.
         outputs: by name.
     """
 
@@ -33,62 +64,64 @@ class NodePorts:
         packet_types: Mapping[str, PacketType],
     ) -> None:
         self._node = node
-        self.inlets: dict[Connection | str, Inlet] = {
-            c: _inlet(c) for c in connections if c.destination_node == node.name
+        self.subscriptions: dict[Connection | str, Subscription] = {
+            c: _subscription(c) for c in connections if c.destination_node == node.name
         }
         for port in node.inputs:
             if port.external_topic is not None:
                 depth = DEPTH if port.qos is None else port.qos.depth or DEPTH
-                self.inlets[port.name] = Inlet(port.name, port.external_topic, port.name, depth)
-        self.outlets = {c: Outlet(c) for c in connections if c.source_node == node.name}
-        for connection, outlet in self.outlets.items():
-            outlet.is_registered = connection.destination_node == node.name
+                self.subscriptions[port.name] = Subscription(
+                    port.name, port.external_topic, port.name, depth
+                )
+        self.send_windows = {c: SendWindow(c) for c in connections if c.source_node == node.name}
+        for connection, window in self.send_windows.items():
+            window.is_registered = connection.destination_node == node.name
         self.outputs = {
             port.name: Output(
                 port,
-                [o for c, o in self.outlets.items() if c.source_output == port.name],
+                [o for c, o in self.send_windows.items() if c.source_output == port.name],
                 packet_types.get(port.name),
             )
             for port in node.outputs
         }
 
-    def hook(self, spec: HookSpec) -> Hook:
-        """A hook, joined to the ports that it names.
+    def inputs_of(self, spec: HookSpec) -> list[HookInput]:
+        """The inputs of a hook, after a check of all ports that it names.
 
         Raises:
             HookError: if the node has no such port, or a required input has no source.
         """
         inputs = [port.name for port in self._node.inputs]
-        for side, ports, known in (
+        for kind, ports, known in (
             ("input", spec.inputs, inputs),
             ("output", spec.outputs, [*self.outputs]),
         ):
             for port in ports:
                 if port.name not in known:
-                    text = undeclared(side, port.name, known, self._node)
+                    text = undeclared(kind, port.name, known, self._node)
                     raise HookError(text, hook=spec.name, where=spec.where)
-        return Hook(spec, [self._slot(spec, port) for port in spec.inputs], self.outputs)
+        return [self._hook_input(spec, port) for port in spec.inputs]
 
-    def _slot(self, spec: HookSpec, port: InputSpec) -> InputSlot:
-        inlets = [inlet for inlet in self.inlets.values() if inlet.input_name == port.name]
-        if not inlets and not port.is_optional:
+    def _hook_input(self, spec: HookSpec, port: InputSpec) -> HookInput:
+        subscriptions = [s for s in self.subscriptions.values() if s.input_name == port.name]
+        if not subscriptions and not port.is_optional:
             raise HookError(
                 f"needs input '{port.name}', but nothing is connected to"
                 f" {self._node.name}.{port.name}: connect it, or declare it Optional",
                 hook=spec.name,
                 where=spec.where,
             )
-        return InputSlot(port, inlets)
+        return HookInput(port, subscriptions)
 
 
-def undeclared(side: str, name: str, known: Iterable[str], node: Node) -> str:
-    """What is wrong with a port that a node has not."""
+def undeclared(kind: str, name: str, known: Iterable[str], node: Node) -> str:
+    """The message for a port that a node does not have."""
     has = ", ".join(sorted(known)) or "none"
-    return f"node '{node.name}' declares no {side} '{name}' (it has {has})"
+    return f"node '{node.name}' declares no {kind} '{name}' (it has {has})"
 
 
-def _inlet(connection: Connection) -> Inlet:
-    return Inlet(
+def _subscription(connection: Connection) -> Subscription:
+    return Subscription(
         connection,
         str(connection),
         connection.destination_input,

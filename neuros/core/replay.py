@@ -1,7 +1,7 @@
-"""An engine that goes through what is in a journal: the same events, in their order.
+"""Replays an event log: an engine gets the events of a recorded run again, in their order.
 
-Neighbours, timers and the wall clock are the journal's. What the plugin does is new, so it may
-differ from what the journal expects: then it is told where, and nothing is guessed.
+Neighbours, timers and the wall clock are those of the log. The plugin runs anew, so it may differ
+from the log: then the replay says where, and guesses nothing.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from neuros.core.engine import Engine
+from neuros.core.event_log import Event, EventKind, events_of, starts_of
 from neuros.core.hook import Hook
-from neuros.core.journal import Event, What, events_of, starts_of
 from neuros.project.model import Connection
 
 _NO_START = -1
 
 
 class ReplayOver(Exception):
-    """A hook would start after the last one of the journal."""
+    """A hook would start after the last one of the log."""
 
 
 class ReplayParted(Exception):
@@ -28,7 +28,7 @@ class ReplayParted(Exception):
 
 
 class Source(Protocol):
-    """Where packets come from that are not in the journal itself."""
+    """The packets of a recorded run, which the event log does not hold."""
 
     def packet(self, key: Connection | str, number: int) -> Any:
         """The packet that arrived as the ``number``-th (from 1) there; raises ``ReplayOver``."""
@@ -38,7 +38,7 @@ class Source(Protocol):
 
 
 class Inbox(Protocol):
-    """What the events go through on their way to the engine."""
+    """The node that takes the events to its engine."""
 
     def start(self) -> None: ...
     def on_packet(self, connection: Connection, packet: Any) -> None: ...
@@ -54,7 +54,7 @@ class Inbox(Protocol):
 
 
 class Script:
-    """A journal that is gone through.
+    """The position of a replay in its event log.
 
     Attributes:
         started: how many hooks have started.
@@ -62,9 +62,9 @@ class Script:
         loop_back: the one that is on its way, if any.
     """
 
-    def __init__(self, journal: array[int]) -> None:
-        self._events = events_of(journal)
-        self._starts = starts_of(journal)
+    def __init__(self, event_log: array[int]) -> None:
+        self._events = events_of(event_log)
+        self._starts = starts_of(event_log)
         self._next = next(self._starts, _NO_START)
         self._readings: Iterator[int] = iter(next(self._events).readings)
         self._now_ns = 0
@@ -75,7 +75,7 @@ class Script:
         self.loop_back: Callable[[], None] | None = None
 
     def clock(self) -> int:
-        """What the clock said at this point; at least what it said last."""
+        """The reading of the clock at this point, or else the last one."""
         self._now_ns = next(self._readings, self._now_ns)
         return self._now_ns
 
@@ -96,11 +96,11 @@ class Script:
 
     @property
     def expects_start(self) -> bool:
-        """Whether the journal has further starts of hooks."""
+        """Whether the log has further starts of hooks."""
         return self._next != _NO_START
 
     def check_start(self, place: int, names: Mapping[int, str]) -> None:
-        """A hook is about to start: whether it did in the journal, too.
+        """A hook is about to start: whether it did in the log, too.
 
         Raises:
             ReplayOver, ReplayParted: if not.
@@ -118,7 +118,7 @@ class Script:
 
 
 class ReplayedEngine(Engine):
-    """Starts hooks where the journal has them start, and nowhere else."""
+    """Starts hooks where the log has them start, and nowhere else."""
 
     def __init__(self, script: Script, *arguments: Any) -> None:
         node, connections, specs, effects, _, types = arguments
@@ -148,7 +148,7 @@ class Player:
         self._script, self._engine, self._inbox, self._source = script, engine, inbox, source
         self._arrived: dict[Connection | str, int] = {}
         self._last_round: list[int] = []
-        ends = [*engine.inlets, *engine.outlets]
+        ends = [*engine.subscriptions, *engine.send_windows]
         self._connections = {key.index: key for key in ends if isinstance(key, Connection)}
 
     def play(self, event: Event) -> None:
@@ -157,40 +157,40 @@ class Player:
         Raises:
             ReplayOver, ReplayParted: if the replay ends with it.
         """
-        what = event.what
-        if what is What.PACKET:
+        kind = event.kind
+        if kind is EventKind.PACKET:
             self._packet(self._connections[event.place])
-        elif what is What.ACKNOWLEDGEMENT:
+        elif kind is EventKind.ACKNOWLEDGEMENT:
             connection = self._connections[event.place]
             # A plugin that was changed may have sent less.
-            position = min(event.position, self._engine.outlets[connection].sent)
+            position = min(event.position, self._engine.send_windows[connection].sent)
             self._inbox.on_acknowledgement(connection, position)
-        elif what is What.HEARD:
+        elif kind is EventKind.HEARD:
             port = self._engine.node.inputs[event.place]
             self._inbox.on_external_packet(port, self._arriving(port.name))
-        elif what is What.REGISTERED:
+        elif kind is EventKind.REGISTERED:
             self._inbox.on_registered(self._connections[event.place])
-        elif what is What.LOOP_BACK:
+        elif kind is EventKind.LOOP_BACK:
             loop_back, self._script.loop_back = self._script.loop_back, None
             if loop_back is not None:
                 loop_back()
-        elif what is What.OFFER:
+        elif kind is EventKind.OFFER:
             self._source.offer()
-        elif what is What.STEP:
+        elif kind is EventKind.STEP:
             self._inbox.step(event.position, is_driven=bool(event.place))
-        elif what is What.LAST_ROUND:
+        elif kind is EventKind.LAST_ROUND:
             if event.place < len(self._engine.all_hooks):  # a plugin that was changed may have less
                 self._last_round.append(event.place)
-        elif what is What.DRAIN:
+        elif kind is EventKind.DRAIN:
             self._inbox.drain(self._last_round)
         else:
             {
-                What.START: self._inbox.start,
-                What.TIMER: self._inbox.on_timer,
-                What.PAUSE: self._inbox.pause,
-                What.RESUME: self._inbox.resume,
-                What.STOP: self._inbox.stop,
-            }[what]()
+                EventKind.START: self._inbox.start,
+                EventKind.TIMER: self._inbox.on_timer,
+                EventKind.PAUSE: self._inbox.pause,
+                EventKind.RESUME: self._inbox.resume,
+                EventKind.STOP: self._inbox.stop,
+            }[kind]()
 
     def _packet(self, connection: Connection) -> None:
         if connection.source_node != connection.destination_node:

@@ -184,7 +184,7 @@ class Figures:
         self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
         ends: dict[str, dict[str, int]] = {}
         for name, report in reports.items():
-            books = report["ledger"]
+            books = report["metrics"]
             if books is None:
                 continue
             self._end_node(name, books, running_s)

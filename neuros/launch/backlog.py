@@ -37,13 +37,13 @@ class Backlog:
 
     def report(self, report: Mapping[str, Any], now_s: float) -> None:
         """Take a report of a node."""
-        ledger = report["ledger"]
-        if ledger is None:
+        metrics = report["metrics"]
+        if metrics is None:
             return
-        for key, counts in ledger["outgoing"].items():
+        for key, counts in metrics["outgoing"].items():
             if key in self._sent and counts["is_reliable"]:
                 self._sent[key].append((now_s, counts["sent"]))
-        for key, counts in ledger["incoming"].items():
+        for key, counts in metrics["incoming"].items():
             if key not in self._received:
                 continue
             self._counted[key] = counts["received"]

@@ -27,7 +27,7 @@ class Output(Protocol):
 
 
 class Phase(Enum):
-    """Where a run is in its life."""
+    """The phase of a run."""
 
     RUNNING = "running"
     DRAINING = "draining"

@@ -120,7 +120,7 @@ class Probing:
     def _judge(self) -> None:
         probes, connections = self._probes, self._connections
         self._answers = probes
-        if any(probe["ledger"] is None for probe in probes.values()):
+        if any(probe["metrics"] is None for probe in probes.values()):
             return
         if self._is_draining:
             this_round: tuple[Any, ...] = quiescence.reliable_counters(probes, connections)

@@ -106,12 +106,12 @@ class Progress:
             return None
         reports = self._outcome.reports.values()
         times = [r["sim_time"] for r in reports if r["sim_time"] is not None]
-        ledgers = [r["ledger"] for r in reports if r["ledger"] is not None]
+        all_metrics = [r["metrics"] for r in reports if r["metrics"] is not None]
         reading = _Reading(
             self._clock() - self._outcome.paused_s,
             max(times, default=None),
-            sum(c["sent"] for ledger in ledgers for c in ledger["outgoing"].values()),
-            sum(c["discarded"] for ledger in ledgers for c in ledger["incoming"].values()),
+            sum(c["sent"] for metrics in all_metrics for c in metrics["outgoing"].values()),
+            sum(c["discarded"] for metrics in all_metrics for c in metrics["incoming"].values()),
         )
         if not self._readings or self._readings[-1][1:] != reading[1:]:
             self._readings.append(reading)

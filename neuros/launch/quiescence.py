@@ -26,14 +26,14 @@ def counters(probes: Probes) -> tuple[Any, ...]:
             name,
             tuple(
                 (key, c["sent"], c["acknowledged"])
-                for key, c in sorted(probe["ledger"]["outgoing"].items())
+                for key, c in sorted(probe["metrics"]["outgoing"].items())
             ),
             tuple(
                 (key, c["received"], c["acknowledged"])
-                for key, c in sorted(probe["ledger"]["incoming"].items())
+                for key, c in sorted(probe["metrics"]["incoming"].items())
             ),
             tuple(
-                (key, hook["executions"]) for key, hook in sorted(probe["ledger"]["hooks"].items())
+                (key, hook["executions"]) for key, hook in sorted(probe["metrics"]["hooks"].items())
             ),
         )
         for name, probe in sorted(probes.items())
@@ -83,9 +83,9 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
         sender, receiver = connection.source_node, connection.destination_node
         if sender not in probes or receiver not in probes:
             continue
-        state = probes[receiver]["ledger"]["state"]
+        state = probes[receiver]["metrics"]["state"]
         is_waiting = state["state"] == "waiting"
-        outgoing = probes[sender]["ledger"]["outgoing"][key]
+        outgoing = probes[sender]["metrics"]["outgoing"][key]
         # A packet to itself stays unread for as long as the node waits for another input: then
         # it is that input that it lacks.
         if outgoing["is_blocked"] and not (sender == receiver and is_waiting):
@@ -94,7 +94,7 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
                 receiver, f"is blocked on `{key}` ({outstanding} outstanding)"
             )
         is_cause = is_waiting and state["cause"] == connection.destination_input
-        if is_cause and not probes[receiver]["ledger"]["incoming"][key]["unread"]:
+        if is_cause and not probes[receiver]["metrics"]["incoming"][key]["unread"]:
             result[receiver][sender] = f"waits for `{connection.destination_input}` from {sender}"
     return result
 
@@ -134,4 +134,8 @@ def _reliable(
         receiver = probes.get(connection.destination_node)
         if connection.is_reliable and sender and receiver:
             key = str(connection)
-            yield connection, sender["ledger"]["outgoing"][key], receiver["ledger"]["incoming"][key]
+            yield (
+                connection,
+                sender["metrics"]["outgoing"][key],
+                receiver["metrics"]["incoming"][key],
+            )

@@ -153,7 +153,7 @@ class Sides:
     def books(self) -> Mapping[str, Mapping[str, Any]]:
         """What nodes elsewhere have counted on connections to here, of sides that are over."""
         over = [word for word in self._others.values() if word.phase == OVER]
-        return {node: ledger for word in over for node, ledger in word.books.items()}
+        return {node: metrics for word in over for node, metrics in word.books.items()}
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """What to tell the user now, as ``(severity, text)``."""

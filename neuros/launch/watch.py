@@ -56,10 +56,10 @@ class Watch:
             self._named_as_held.remove(name)
             if hook := self._executing(name):
                 self._named_hooks.add((name, hook["name"], hook["executions"]))
-        ledger = report["ledger"]
-        moved = ledger and (
-            [hook["executions"] for hook in ledger["hooks"].values()],
-            [c["received"] for c in ledger["incoming"].values()],
+        metrics = report["metrics"]
+        moved = metrics and (
+            [hook["executions"] for hook in metrics["hooks"].values()],
+            [c["received"] for c in metrics["incoming"].values()],
         )
         if self._moved.get(name) != moved:
             self._moved[name] = moved
@@ -73,7 +73,7 @@ class Watch:
     def is_loaded(self, name: str) -> bool:
         """Whether a node has come as far as having an engine that may run hooks."""
         report = self._reports.get(name)
-        return report is not None and report["ledger"] is not None
+        return report is not None and report["metrics"] is not None
 
     @property
     def is_complete(self) -> bool:
@@ -193,8 +193,8 @@ class Watch:
         return sorted({key for report in self._reports.values() for key in report["waiting_for"]})
 
     def _executing(self, name: str) -> Mapping[str, Any] | None:
-        ledger = self._reports[name]["ledger"]
-        return ledger["executing"] if ledger else None
+        metrics = self._reports[name]["metrics"]
+        return metrics["executing"] if metrics else None
 
 
 def with_stack(text: str, stack: Stack | None) -> str:

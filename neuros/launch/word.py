@@ -10,7 +10,7 @@ from typing import Any
 from neuros.project.model import Connection
 
 Books = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
-"""``books[node]["outgoing" or "incoming"][connection]``: counters, as in a node's ledger."""
+"""``books[node]["outgoing" or "incoming"][connection]``: counters, as in a node's metrics."""
 
 RUNNING, DRAINING, DRAINED, STOPPING, OVER = "running", "draining", "drained", "stopping", "over"
 _BEGUN = (RUNNING, DRAINING, DRAINED)
@@ -69,11 +69,11 @@ def books_of(reports: Mapping[str, Mapping[str, Any]], crossing: Sequence[Connec
     keys = {str(connection) for connection in crossing}
     return {
         name: {
-            part: {key: dict(c) for key, c in report["ledger"][part].items() if key in keys}
+            part: {key: dict(c) for key, c in report["metrics"][part].items() if key in keys}
             for part in ("outgoing", "incoming")
         }
         for name, report in reports.items()
-        if report["ledger"] is not None
+        if report["metrics"] is not None
     }
 
 

@@ -32,7 +32,7 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         names = ", ".join(run.record["nodes"])
         raise UsageError(f"replay: {run_folder} has no node '{name}'; it has {names}")
     load_plan(run_folder)
-    if not _journal_of(run_folder, name).is_file():
+    if not _event_log_of(run_folder, name).is_file():
         raise UsageError(
             f"replay: {run_folder} does not tell in which order '{name}' received its packets:"
             f" {_RECORD}"
@@ -48,7 +48,7 @@ class RecordedNode:
     """The packets of one node, from the bag of a run.
 
     Attributes:
-        journal: what happened to its engine (:mod:`neuros.core.journal`).
+        event_log: what happened to its engine (:mod:`neuros.core.event_log`).
         plan: what was recorded.
 
     Raises:
@@ -61,9 +61,9 @@ class RecordedNode:
         self._name = file.node.name
         self.plan: RecordingPlan = load_plan(run.folder)
         self._bag: Bag = open_bag(run.folder)
-        self.journal: array[int] = array("q")
-        data = _journal_of(run.folder, self._name).read_bytes()
-        self.journal.frombytes(data[: len(data) // 8 * 8])
+        self.event_log: array[int] = array("q")
+        data = _event_log_of(run.folder, self._name).read_bytes()
+        self.event_log.frombytes(data[: len(data) // 8 * 8])
         self._arrivals: dict[Connection | str, _Arrivals] = {}
         self._check_inputs()
 
@@ -184,5 +184,5 @@ class _Arrivals:
         return data
 
 
-def _journal_of(run_folder: Path, name: str) -> Path:
+def _event_log_of(run_folder: Path, name: str) -> Path:
     return run_folder / name / FOLDER / "event_log"

@@ -47,7 +47,7 @@ def run_record(
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
     sim_s, all_ran_s = max(sim_times, default=None), ended.running_s
-    ledgers = {**ended.elsewhere, **{n: r["ledger"] or {} for n, r in ended.reports.items()}}
+    all_metrics = {**ended.elsewhere, **{n: r["metrics"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
         "project": project.name,
@@ -65,7 +65,7 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, ledgers, all_ran_s, run_folder, _cut_off(ended))
+            _connection(c, all_metrics, all_ran_s, run_folder, _cut_off(ended))
             for c in _connections(files)
         ],
         "nodes": {
@@ -126,7 +126,7 @@ def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[floa
 
 def _connection(
     connection: Connection,
-    ledgers: Mapping[str, Mapping[str, Any]],
+    all_metrics: Mapping[str, Mapping[str, Any]],
     running_s: float | None,
     run_folder: Path,
     cut_off: Collection[str],
@@ -134,8 +134,8 @@ def _connection(
     from neuros.observe.packets import packet_figures, read_packets
 
     key = str(connection)
-    outgoing = ledgers.get(connection.source_node, {}).get("outgoing", {}).get(key, {})
-    incoming = ledgers.get(connection.destination_node, {}).get("incoming", {}).get(key, {})
+    outgoing = all_metrics.get(connection.source_node, {}).get("outgoing", {}).get(key, {})
+    incoming = all_metrics.get(connection.destination_node, {}).get("incoming", {}).get(key, {})
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
     # Counts that a node has last reported before it was killed are older than those of the other.
@@ -163,14 +163,14 @@ def _cut_off(ended: Ended) -> list[str]:
 
 def _node(name: str, ended: Ended) -> dict[str, Any]:
     report = ended.reports.get(name)
-    if report is None or report["ledger"] is None:
+    if report is None or report["metrics"] is None:
         return {"report": None}
     is_final = bool(report.get("is_final"))
     age_s = ended.ended_s - ended.report_times_s[name]
-    ledger = report["ledger"]
+    metrics = report["metrics"]
     return {
-        "accounting": ledger["accounting"],
-        "hooks": ledger["hooks"],
+        "accounting": metrics["accounting"],
+        "hooks": metrics["hooks"],
         "sim_time": report["sim_time"],
         "report": "final" if is_final else f"last report {age_s:.1f} s before the end",
     }

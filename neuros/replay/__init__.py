@@ -1,1 +1,1 @@
-"""One node of a recorded run, once more."""
+"""Replays of one node of a recorded run."""

@@ -1,4 +1,4 @@
-"""A node that ran in a container is replayed as a process of this machine, with what that has."""
+"""Paths, versions and errors of a node that ran in a container and is replayed without one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def ran_in_container(run: PastRun) -> bool:
 
 
 def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path, messages: Path) -> NodeFile:
-    """The node with the paths of this machine; ``file`` is what it was told in its container.
+    """The node with the paths of this machine; ``file`` is the one from its container.
 
     Args:
         messages: the folder with built message packages.
@@ -32,7 +32,7 @@ def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path, messages: 
 
 
 def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
-    """What to raise where this machine lacks something that a node had in its container."""
+    """The error for something that a node had in its container and this machine lacks."""
     return EnvironmentFault(
         f"replay: in {run.folder} '{name}' ran in a container, a replay is a process of this"
         f" machine, and here it lacks something: {cause}"
@@ -40,7 +40,7 @@ def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
 
 
 def missing_module(failure: NeurosError | None) -> str:
-    """What to tell of a failure if the node lacks a module, else an empty text."""
+    """The advice for a failure if the node lacks a module, else an empty text."""
     cause = None if failure is None else failure.__cause__
     if not isinstance(cause, ModuleNotFoundError):
         return ""
@@ -51,7 +51,7 @@ def missing_module(failure: NeurosError | None) -> str:
 
 
 def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
-    """What a node had in its image and has in another version here; empty if nothing.
+    """The packages of which the image of a node had another version; empty if there are none.
 
     Args:
         here: as from :func:`neuros.observe.provenance.python_versions`.

@@ -1,23 +1,25 @@
-"""Runs the real plugin on the real engine, on what a run has recorded of it."""
+"""Replays one node of a recorded run: the real plugin on the real engine, with recorded packets."""
 
 from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.core.engine import Engine
-from neuros.core.journal import is_whole
+from neuros.core.event_log import is_whole
 from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec
+from neuros.observe.difference import differing_fields
 from neuros.observe.replayed import RecordedNode
+from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
-from neuros.replay.comparison import Comparison
 from neuros.replay.debugging import is_quit
 from neuros.runtime.context import ContextSwitch
 from neuros.runtime.node import NodeRuntime
@@ -26,23 +28,119 @@ from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
 _LOOK_S = 0.1
 
+SIDES = ("the run", "the replay")
+
+Topics: TypeAlias = "Mapping[tuple[Way, str], Sequence[tuple[str, str, Sequence[Any]]]]"
+"""By way and port or connection: the name, type and packets of each topic."""
+
 Around = Callable[[Callable[[], None], Sequence[HookSpec]], None]
 """Runs an action, given the hooks of the plugin."""
+
+
+@dataclass
+class _Stream:
+    """The packets of one output or input; each of ``topics`` carries all of them."""
+
+    topics: Sequence[tuple[str, str, Sequence[Any]]]
+    sent: int = 0
+
+
+class Comparison:
+    """Compares a replayed packet with that of the run (:class:`neuros.ports.PacketRecorder`).
+
+    Args:
+        message: makes a message from bytes and the name of its type.
+        lacking: topics of which not all packets were recorded.
+
+    Attributes:
+        difference: the first one, in a sentence; ``None`` so far.
+    """
+
+    def __init__(
+        self,
+        topics: Topics,
+        message: Callable[[bytes, str], Any],
+        lacking: Collection[str] = (),
+    ) -> None:
+        self._streams = [_Stream(each) for each in topics.values()]
+        self._numbers = {key: number for number, key in enumerate(topics)}
+        self._message = message
+        self._lacking = lacking
+        self.difference: str | None = None
+
+    @property
+    def packets(self) -> int:
+        """Packets that were compared, once for each connection."""
+        return sum(
+            min(stream.sent, len(packets))
+            for stream in self._streams
+            for _, _, packets in stream.topics
+        )
+
+    @property
+    def connections(self) -> int:
+        """Connections, and external topics, that there are."""
+        return sum(len(stream.topics) for stream in self._streams)
+
+    def stream(self, way: Way, name: str) -> int | None:
+        """The number of such packets; ``None`` if the run has not recorded them."""
+        return self._numbers.get((way, name))
+
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+        """A packet was sent."""
+        if self.difference is not None:
+            return
+        passed = self._streams[stream]
+        passed.sent += 1
+        for topic, type_name, packets in passed.topics:
+            if passed.sent > len(packets) and topic in self._lacking:
+                continue
+            if passed.sent > len(packets):
+                self.difference = (
+                    f"{topic}: packet {passed.sent} is sent in the replay, and was not in the run"
+                )
+            elif packets[passed.sent - 1].data != data:
+                self._compare(topic, type_name, passed.sent, packets[passed.sent - 1].data, data)
+            if self.difference is not None:
+                passed.sent -= 1
+                return
+
+    def find_missing(self) -> None:
+        """The node will send nothing more."""
+        for stream in self._streams:
+            for topic, _, packets in stream.topics:
+                if self.difference is None and stream.sent < len(packets):
+                    self.difference = (
+                        f"{topic}: the replay ends after packet {stream.sent}, the run has"
+                        f" {len(packets)}"
+                    )
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def _compare(
+        self, topic: str, type_name: str, number: int, recorded: bytes, data: bytes
+    ) -> None:
+        """Bytes may differ where nothing but padding does."""
+        pair = self._message(recorded, type_name), self._message(data, type_name)
+        field = next(differing_fields(*pair, sides=SIDES), None)
+        if field is not None:
+            self.difference = f"{topic}: packet {number} differs in {field}"
 
 
 class ReplayedNode:
     """One node of a run.
 
     Attributes:
-        comparison: of what it sends.
-        failure: what has ended it, ``None`` so far.
-        notes: what the user should know.
-        difference: where it has left the way of the run, in a sentence; ``None`` so far.
+        comparison: of the packets that it sends.
+        failure: the error that ended it, ``None`` so far.
+        notes: sentences for the user.
+        difference: the first difference from the run, in a sentence; ``None`` so far.
     """
 
     def __init__(self, file: NodeFile, recorded: RecordedNode) -> None:
         self._file, self._recorded = file, recorded
-        self._script = Script(recorded.journal)
+        self._script = Script(recorded.event_log)
         self._loop = HeldLoop(self._script.deliveries.append, self._note_loop_back)
         self._middleware = NullMiddleware(file, self._loop)
         lacking = recorded.lacking()
@@ -82,7 +180,7 @@ class ReplayedNode:
 
     @property
     def has_outputs(self) -> bool:
-        """Whether the node can send anything to anybody."""
+        """Whether the node has a connection or external topic to send on."""
         name = self._file.node.name
         is_sender = any(c.source_node == name for c in self._file.connections)
         return is_sender or any(port.external_topic for port in self._file.node.outputs)
@@ -154,8 +252,8 @@ class ReplayedNode:
             self.difference = self.comparison.difference
 
     def _end(self) -> None:
-        """The journal is at its end."""
-        if not is_whole(self._recorded.journal):
+        """The event log is at its end."""
+        if not is_whole(self._recorded.event_log):
             self.notes.append(
                 f"the run's list of what happened to the node ends after {self.starts} starts of"
                 " hooks (it was killed, or ran for very long): what it sent later is not compared"

@@ -19,7 +19,7 @@ from neuros.runtime.simulated_time import SimulatedTime
 
 
 class NodeEffects:
-    """The :class:`~neuros.core.effects.Effects` of one running node.
+    """The :class:`~neuros.core.engine.Effects` of one running node.
 
     Args:
         enter: puts the context of the node in place.

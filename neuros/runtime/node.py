@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.hook import PacketType
+from neuros.core.node_ports import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, PacketRecorder, Way
@@ -26,7 +26,7 @@ from neuros.runtime.simulated_time import SimulatedTime
 
 
 class NodeRuntime:
-    """Joins plugin, engine and transport of one node, and takes it through its life.
+    """Joins plugin, engine and transport of one node, and takes it through its lifecycle.
 
     It is the inbox of the transport; :class:`NodeEffects` are those of the engine, and
     :class:`PluginServices` those of ``node``.
@@ -134,7 +134,7 @@ class NodeRuntime:
         """Threads that wait until the packets that they have offered are sent."""
         return self._services.waiting_threads
 
-    # ------------------------------------------------------------------ life
+    # ------------------------------------------------------------------ lifecycle
 
     def load(self) -> None:
         """Open the transport (others may look for it from now on) and import the plugin.

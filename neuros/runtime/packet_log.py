@@ -15,7 +15,7 @@ taken_ns  when that was
 the connection, position, time): three 8-byte numbers each.
 
 Where packets are recorded, ``event_log`` has what happened to the engine (see
-:mod:`neuros.core.journal`), so that the node can be replayed.
+:mod:`neuros.core.event_log`), so that the node can be replayed.
 
 An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
 out once per second.
@@ -31,11 +31,11 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.journal import JournalledEngine
+from neuros.core.event_log import LoggedEngine
 from neuros.project.model import Connection
 
 FOLDER = "packets"
-JOURNAL = "event_log"
+EVENT_LOG = "event_log"
 
 MOST_ENTRIES = 8_000_000
 """Of a file, 64 MB; what comes later is counted and not listed."""
@@ -73,23 +73,23 @@ class PacketLog:
                 del entries[:count]
                 if data and name and self.failure is None:
                     self._append(name, data)
-            hooks = self._engine.trace.hooks[:]
+            hooks = self._engine.execution_log.hooks[:]
             if len(hooks) > self._hooks_written and self.failure is None:
                 self._hooks_written = len(hooks)
                 self._write_hooks(hooks)
 
     def _all(self) -> Iterator[tuple[str, array[Any]]]:
-        for connection, outlet in self._engine.outlets.items():
-            yield f"{connection.index}.sent_ns", outlet.sent_ns
-        for key, inlet in self._engine.inlets.items():
+        for connection, window in self._engine.send_windows.items():
+            yield f"{connection.index}.sent_ns", window.sent_ns
+        for key, subscription in self._engine.subscriptions.items():
             # The sending time of a packet of an external topic is unknown: only room is made.
             name = f"{key.index}." if isinstance(key, Connection) else ""
-            yield name and f"{name}taken", inlet.taken
-            yield name and f"{name}taken_ns", inlet.taken_ns
-        yield "executions", self._engine.trace.executions
-        yield "credits", self._engine.trace.credits
-        if isinstance(self._engine, JournalledEngine):
-            yield JOURNAL, self._engine.journal
+            yield name and f"{name}taken", subscription.taken
+            yield name and f"{name}taken_ns", subscription.taken_ns
+        yield "executions", self._engine.execution_log.executions
+        yield "credits", self._engine.execution_log.credits
+        if isinstance(self._engine, LoggedEngine):
+            yield EVENT_LOG, self._engine.event_log
         for connection, digests in self._digests.items():
             yield f"{connection.index}.digests", digests
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from neuros.control import Lines, connect
 from neuros.core.engine import Engine
-from neuros.core.journal import JournalledEngine
+from neuros.core.event_log import LoggedEngine
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.ports import Middleware, PacketRecorder
@@ -223,7 +223,7 @@ class NodeProcess:
                 tell=self._tell,
                 fail=self._fail,
                 recorder=None if self._open_recorder is None else self._open_recorder(file),
-                make_engine=Engine if self._open_recorder is None else JournalledEngine,
+                make_engine=Engine if self._open_recorder is None else LoggedEngine,
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
                 on_initialised=_keep_for_good,

@@ -8,7 +8,7 @@ from typing import Any
 
 from neuros.core.engine import Engine
 from neuros.core.explain import explain
-from neuros.core.ledger import snapshot, steadily
+from neuros.core.snapshot import snapshot, steadily
 from neuros.ports import Logger, Middleware, Transport
 from neuros.project.model import Connection, NodeFile
 from neuros.runtime.effects import NodeEffects
@@ -55,10 +55,10 @@ class NodeReports:
         self._packet_log = PacketLog(engine, self._transport.digests, folder)
         for hook in engine.free_running_hooks():
             logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
-        for inlet in engine.untaken_inlets():
+        for subscription in engine.untaken_subscriptions():
             logger.warning(
-                f"no hook takes input '{inlet.input_name}': packets on {inlet.name} are"
-                " acknowledged on arrival and dropped"
+                f"no hook takes input '{subscription.input_name}': packets on"
+                f" {subscription.name} are acknowledged on arrival and dropped"
             )
 
     def write_packet_log(self) -> None:
@@ -69,25 +69,25 @@ class NodeReports:
     def state(self) -> dict[str, Any]:
         """State and counters. Any thread."""
         now_ns, engine = self._clock(), self._engine
-        ledger = None if engine is None else snapshot(engine, now_ns)
+        metrics = None if engine is None else snapshot(engine, now_ns)
         return {
             "node": self._file.node.name,
             "has_run": self._effects.has_run,
             "waiting_for": [str(each) for each in self._transport.waiting_for()],
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
-            "ledger": ledger,
-            "stack": self._stack(ledger),
+            "metrics": metrics,
+            "stack": self._stack(metrics),
             "fault": None if self._packet_log is None else self._packet_log.failure,
             "is_driving": engine is not None and engine.is_driving,
         }
 
-    def _stack(self, ledger: Mapping[str, Any] | None) -> Stack | None:
+    def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
         """The stack of the plugin, if its hook runs for long, or the node is to end."""
         engine = self._engine
-        if engine is None or ledger is None or threading.current_thread() is _MAIN:
+        if engine is None or metrics is None or threading.current_thread() is _MAIN:
             return None
-        executing = ledger["executing"]
+        executing = metrics["executing"]
         if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
             return stack_in(self._file.node.name, self._file.node.plugin)
         return None
@@ -131,7 +131,7 @@ class NodeReports:
 def node_status(engine: Engine, now_ns: int) -> dict[str, Any]:
     """Counters, state and latest times, short enough to be sent often. Any thread.
 
-    Besides what :func:`neuros.core.ledger.snapshot` tells: ``now_s``, the time of the status;
+    Besides what :func:`neuros.core.snapshot.snapshot` tells: ``now_s``, the time of the status;
     ``sent_ns``, by connection the position of the last packet sent and when the last few were;
     ``taken_ns``, the position of the packet that a hook has started on last, and when that was.
     Both lack the connections whose packet log has just been written out.
@@ -152,16 +152,16 @@ def node_status(engine: Engine, now_ns: int) -> dict[str, Any]:
 
 def _sent(engine: Engine) -> dict[str, list[Any]]:
     return {
-        str(outlet.connection): [outlet.sent, outlet.sent_ns[-_LAST_SENT:].tolist()]
-        for outlet in engine.outlets.values()
-        if outlet.is_reliable and outlet.sent_ns
+        str(window.connection): [window.sent, window.sent_ns[-_LAST_SENT:].tolist()]
+        for window in engine.send_windows.values()
+        if window.is_reliable and window.sent_ns
     }
 
 
 def _taken(engine: Engine) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {}
-    for key, inlet in engine.inlets.items():
-        count = min(len(inlet.taken), len(inlet.taken_ns))
+    for key, subscription in engine.subscriptions.items():
+        count = min(len(subscription.taken), len(subscription.taken_ns))
         if isinstance(key, Connection) and count:
-            found[str(key)] = [inlet.taken[count - 1], inlet.taken_ns[count - 1]]
+            found[str(key)] = [subscription.taken[count - 1], subscription.taken_ns[count - 1]]
     return found

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neuros.core.engine import Engine
-from neuros.core.ledger import snapshot
+from neuros.core.snapshot import snapshot
 from neuros.errors import NeurosError, NodeError
 from neuros.project.model import NodeFile
 from neuros.runtime.context import ContextSwitch

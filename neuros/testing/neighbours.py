@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from neuros.core.flow import Outlet
+from neuros.core.send_window import SendWindow
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.memory import MemoryHub
 from neuros.transport.messages import decode, encode
@@ -24,7 +24,7 @@ class Neighbours:
         name = file.node.name
         self.incoming = [c for c in file.connections if c.destination_node == name != c.source_node]
         self.outgoing = [c for c in file.connections if c.source_node == name != c.destination_node]
-        self._outlets = {connection: Outlet(connection) for connection in self.incoming}
+        self._windows = {connection: SendWindow(connection) for connection in self.incoming}
         self._waiting: dict[Connection, deque[Any]] = {c: deque() for c in self.incoming}
         self.received: dict[Connection, list[Any]] = {c: [] for c in self.outgoing}
         self._started: dict[Connection, int] = dict.fromkeys(self.outgoing, 0)
@@ -67,15 +67,15 @@ class Neighbours:
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The node has started on packets: more may be sent."""
-        self._outlets[connection].credit(position, 0)
+        self._windows[connection].credit(position, 0)
         self._send_waiting(connection)
 
     def on_registered(self, connection: Connection) -> None:
         """The node is always there."""
 
     def _send_waiting(self, connection: Connection) -> None:
-        outlet, waiting = self._outlets[connection], self._waiting[connection]
-        while waiting and not outlet.is_blocked:
-            outlet.spend(0)
+        window, waiting = self._windows[connection], self._waiting[connection]
+        while waiting and not window.is_blocked:
+            window.spend(0)
             node = self._hub.inboxes[connection.destination_node]
             self._hub.post(partial(node.on_packet, connection, waiting.popleft()))

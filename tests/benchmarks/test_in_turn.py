@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks import in_turn
 from neuros.core.engine import Engine
-from neuros.core.flow import Outlet
-from neuros.core.journal import JournalledEngine
+from neuros.core.event_log import LoggedEngine
+from neuros.core.send_window import SendWindow
 from neuros.project.model import Connection
 from neuros.runtime.effects import NodeRecorder
 
@@ -24,23 +24,23 @@ def switch() -> Any:
 
 def test_without_its_books_a_connection_counts_and_notes_no_times(switch: Any) -> None:
     taken_out = switch.without_ledger()
-    outlet: Any = Outlet(Connection("a", "out", "b", "in_", 0))
-    outlet.spend(5)
-    taken_out[Outlet, "spend"](outlet, 6)
-    assert outlet.sent == 2
-    assert outlet.sent_ns.tolist() == [5]
+    window: Any = SendWindow(Connection("a", "out", "b", "in_", 0))
+    window.spend(5)
+    taken_out[SendWindow, "spend"](window, 6)
+    assert window.sent == 2
+    assert window.sent_ns.tolist() == [5]
 
 
 def test_without_the_recording_neither_packets_nor_events_are_kept(switch: Any) -> None:
     taken_out = switch.without_recording()
     assert (NodeRecorder, "keep") in taken_out
     for event in ("on_packet", "on_acknowledgement", "_run"):
-        assert taken_out[JournalledEngine, event] is getattr(Engine, event)
+        assert taken_out[LoggedEngine, event] is getattr(Engine, event)
 
 
 def test_code_that_is_no_longer_there_to_be_taken_out_is_an_error(switch: Any) -> None:
     with pytest.raises(AssertionError, match=r"spend has no 'self\.gone'"):
-        switch.rewritten(Outlet.spend, {"self.gone": ""})
+        switch.rewritten(SendWindow.spend, {"self.gone": ""})
 
 
 def test_slices_are_compared_in_pairs_and_half_pairs_are_left_out() -> None:

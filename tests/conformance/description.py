@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 EXTERNAL_DEPTH = 10
-"""What an external topic's mailbox holds where its ``qos`` says nothing."""
+"""What an external topic's input queue holds where its ``qos`` says nothing."""
 
 TYPES = {
     "byte": "std_msgs/msg/UInt8",

@@ -24,7 +24,7 @@ The rules by name, as :class:`Violation` has them:
 ``awake``          a node does not rest while one of its hooks is ready
 ``age``            the age of a packet of a free input is bounded by an execution of each hook
 ``tick``           one execution per due time, never before it
-``counts``         ``run.json`` says what was observed, and its ledger closes
+``counts``         ``run.json`` says what was observed, and its counters add up
 ``end``            the exit code is right, the end comes in time, and nothing is left
 ``killed``         every node ends by itself, within the time that it has for that
 ``drain``          after the end was asked for, nothing that sends unasked starts any more
@@ -307,7 +307,7 @@ class Judge:
     def _complain(self, rule: str, each: Execution, text: str) -> None:
         self._found.append(Violation(rule, f"{each.node}.{each.hook}: {text}"))
 
-    # ------------------------------------------------------------------ order, life
+    # ------------------------------------------------------------------ order, lifecycle
 
     def _overlaps(self) -> Iterator[Violation]:
         if self.is_one_process:
@@ -420,7 +420,7 @@ class Judge:
         return self.busy_elsewhere[node].within(from_ns, to_ns)
 
     def _waiting_since(self, c: Connection, intake: _Intake, position: int) -> int:
-        """When the packet was sent that ended the mailbox's emptiness; ``_NEVER``: unknown."""
+        """When the packet was sent that ended the input queue's emptiness; ``_NEVER``: unknown."""
         sent = self.sent_ns[c.origin]
         number = position + 1 if self._lost(c) == 0 else intake.after(position)
         return sent[number - 1] if number is not None and number <= len(sent) else _NEVER
@@ -681,10 +681,10 @@ class Judge:
                     text = f"{node.name}.{hook.name} ran {seen} times, run.json says {said}"
                     yield Violation("counts", text)
         for c in self.project.connections:
-            for text in self._ledger(c):
+            for text in self._sums(c):
                 yield Violation("counts", f"{c}: {text}")
 
-    def _ledger(self, c: Connection) -> Iterator[str]:
+    def _sums(self, c: Connection) -> Iterator[str]:
         books = self.seen.connection(str(c))
         if books is None:
             yield "is not in run.json"
@@ -701,7 +701,7 @@ class Judge:
         if sent != seen and not (last and sent == seen - (c.source_output in last[0].sent)):
             yield f"{seen} packets were sent, run.json says {sent}"
         if sent != received + lost or received != consumed + discarded + unread:
-            yield f"the ledger does not close: {dict(books)}"
+            yield f"the counters do not add up: {dict(books)}"
         if lost and c.is_reliable and self.seen.exit_code != 130:
             yield f"lost {lost} on a reliable connection"
         if discarded and c.discard_limit == 0:

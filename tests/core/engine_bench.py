@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from neuros.core.engine import Engine
-from neuros.core.hook import Hook, PacketType
+from neuros.core.hook import Hook
+from neuros.core.node_ports import PacketType
 from neuros.hooks import (
     HookSpec,
     Optional,
@@ -139,7 +140,7 @@ class Bench:
         types = {name: PacketType(kind, check) for name, kind in (packet_types or {}).items()}
         self.engine = make_engine(node, connections, specs, self, self.clock, types)
         if is_registered:
-            for connection in self.engine.outlets:
+            for connection in self.engine.send_windows:
                 self.engine.on_registered(connection)
         if is_started:
             self.engine.start()

@@ -119,7 +119,7 @@ class Network:
         self.nodes = {name: NetworkNode(self, name, specs) for name, specs in plugins.items()}
         for node in self.nodes.values():
             self.deliver(node, node, ("start", node.name), node.engine.start)
-            for c in node.engine.outlets:
+            for c in node.engine.send_windows:
                 receiver = self.nodes[c.destination_node]
                 self.deliver(
                     receiver, node, ("reg", c), functools.partial(node.engine.on_registered, c)
@@ -164,10 +164,10 @@ class Network:
         return [arguments for name, arguments in self.nodes[node].runs if name == hook]
 
     def sender(self, c: Connection) -> Any:
-        return self.nodes[c.source_node].engine.outlets[c]
+        return self.nodes[c.source_node].engine.send_windows[c]
 
     def receiver(self, c: Connection) -> Any:
-        return self.nodes[c.destination_node].engine.inlets[c]
+        return self.nodes[c.destination_node].engine.subscriptions[c]
 
     @property
     def is_wakeable(self) -> bool:

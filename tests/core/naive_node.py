@@ -24,12 +24,12 @@ class NaiveHook:
         self.last_turn = 0
         self.executions = 0
         self.last_run_ns = 0
-        self.mailbox: dict[Connection, list[tuple[int, int, Any]]] = {
+        self.queue: dict[Connection, list[tuple[int, int, Any]]] = {
             c: [] for port in spec.inputs for c in sources.get(port.name, [])
         }
-        self.position = dict.fromkeys(self.mailbox, 0)
-        self.lost: dict[Connection, set[int]] = {c: set() for c in self.mailbox}
-        self.started: dict[Connection, set[int]] = {c: set() for c in self.mailbox}
+        self.position = dict.fromkeys(self.queue, 0)
+        self.lost: dict[Connection, set[int]] = {c: set() for c in self.queue}
+        self.started: dict[Connection, set[int]] = {c: set() for c in self.queue}
 
 
 class NaiveNode:
@@ -81,12 +81,12 @@ class NaiveNode:
         self.arrivals += 1
         self.arrived[c] += 1
         for hook in self.hooks:
-            if c in hook.mailbox:
-                mailbox = hook.mailbox[c]
-                if len(mailbox) == c.queue_size:  # full: the oldest unread one is discarded
+            if c in hook.queue:
+                queue = hook.queue[c]
+                if len(queue) == c.queue_size:  # full: the oldest unread one is discarded
                     assert c.discard_limit != 0
-                    hook.lost[c].add(mailbox.pop(0)[1])
-                mailbox.append((self.arrivals, self.arrived[c], packet))
+                    hook.lost[c].add(queue.pop(0)[1])
+                queue.append((self.arrivals, self.arrived[c], packet))
         if not self.takers(c):
             self.acknowledge(c, self.arrived[c])
         self.one_pass()
@@ -134,7 +134,7 @@ class NaiveNode:
         )
 
     def has_input(self, hook: NaiveHook, port: InputSpec) -> bool:
-        filled = [bool(hook.mailbox[c]) for c in self.sources.get(port.name, [])]
+        filled = [bool(hook.queue[c]) for c in self.sources.get(port.name, [])]
         return port.is_optional or (all(filled) if port.is_all else any(filled))
 
     def is_due(self, hook: NaiveHook) -> bool:
@@ -149,11 +149,11 @@ class NaiveNode:
     def would_take(self, hook: NaiveHook) -> list[Connection]:
         taken = []
         for port in hook.spec.inputs:
-            filled = [c for c in self.sources.get(port.name, []) if hook.mailbox[c]]
+            filled = [c for c in self.sources.get(port.name, []) if hook.queue[c]]
             if port.is_all:
                 taken += filled
             elif filled:  # whose oldest packet has waited longest
-                taken.append(min(filled, key=lambda c: hook.mailbox[c][0][0]))
+                taken.append(min(filled, key=lambda c: hook.queue[c][0][0]))
         return taken
 
     def is_blocked(self, hook: NaiveHook, c: Connection) -> bool:
@@ -161,12 +161,12 @@ class NaiveNode:
             return False
         acknowledged = self.acknowledged_by_receiver[c]
         if c.destination_node == self.name and c in self.would_take(hook):
-            positions = [h.mailbox[c][0][1] if h is hook else h.position[c] for h in self.takers(c)]
+            positions = [h.queue[c][0][1] if h is hook else h.position[c] for h in self.takers(c)]
             acknowledged = max(acknowledged, min(positions))
         return self.sent[c] - acknowledged >= c.queue_size + c.discard_limit
 
     def takers(self, c: Connection) -> list[NaiveHook]:
-        return [hook for hook in self.hooks if c in hook.mailbox]
+        return [hook for hook in self.hooks if c in hook.queue]
 
     def acknowledge(self, c: Connection, position: int) -> None:
         if c.discard_limit is None or position <= self.acknowledged[c]:
@@ -183,7 +183,7 @@ class NaiveNode:
         hook.last_run_ns = self.now_ns()
         taken = {}
         for c in self.would_take(hook):
-            _, hook.position[c], taken[c] = hook.mailbox[c].pop(0)
+            _, hook.position[c], taken[c] = hook.queue[c].pop(0)
             hook.started[c].add(hook.position[c])
         arguments = []
         for port in hook.spec.inputs:
@@ -210,6 +210,6 @@ class NaiveNode:
                         self.log.append(("send", str(c), packet))
         if hook.spec.kind is HookKind.INITIALISE:
             self.hooks.remove(hook)
-            for c in hook.mailbox:
+            for c in hook.queue:
                 takers = self.takers(c)
                 self.acknowledge(c, min((h.position[c] for h in takers), default=self.arrived[c]))

@@ -151,9 +151,12 @@ def test_every_project_that_sends_what_it_may_comes_to_its_end(
     assert sent(network) == at_rest
     assert not any(node.engine.has_startable_packet for node in network.nodes.values())
     for c in connections:
-        inlet = network.receiver(c)
-        assert network.sender(c).sent == inlet.received
-        assert inlet.received == inlet.consumed + inlet.discarded + inlet.unread
+        subscription = network.receiver(c)
+        assert network.sender(c).sent == subscription.received
+        assert (
+            subscription.received
+            == subscription.consumed + subscription.discarded + subscription.unread
+        )
 
 
 @settings(max_examples=100, deadline=None)

@@ -158,27 +158,30 @@ class Pair:
         assert [kind for kind, _ in self.effects.events] == [e[0] for e in self.naive.events]
         naive_ready = any(self.naive.is_ready(hook) for hook in self.naive.hooks)
         assert self.engine.has_ready_hook == naive_ready
-        for c, outlet in self.engine.outlets.items():
-            assert outlet.sent == self.naive.sent[c]
-            assert outlet.acknowledged == self.naive.acknowledged_by_receiver[c]
+        for c, window in self.engine.send_windows.items():
+            assert window.sent == self.naive.sent[c]
+            assert window.acknowledged == self.naive.acknowledged_by_receiver[c]
         for c in self.naive.incoming:
             self._compare_books(c)
 
     def _compare_books(self, c: Connection) -> None:
-        inlet = self.engine.inlets[c]
-        assert inlet.received == self.naive.arrived[c]
-        assert inlet.received == inlet.consumed + inlet.discarded + inlet.unread
+        subscription = self.engine.subscriptions[c]
+        assert subscription.received == self.naive.arrived[c]
+        assert (
+            subscription.received
+            == subscription.consumed + subscription.discarded + subscription.unread
+        )
         takers = self.naive.takers(c)
         if len(takers) != sum(
             c.destination_input in {port.name for port in spec.spec.inputs}
             for spec in self.engine.all_hooks
         ):
             return  # an initialise hook has gone; what it took does not count any more
-        everything = range(1, inlet.received + 1)
+        everything = range(1, subscription.received + 1)
         lost = {n for n in everything if any(n in taker.lost[c] for taker in takers)}
         consumed = {n for n in everything if all(n in taker.started[c] for taker in takers)}
-        assert inlet.discarded == len(lost)
-        assert inlet.consumed == len(consumed)
+        assert subscription.discarded == len(lost)
+        assert subscription.consumed == len(consumed)
         assert not lost & consumed
 
 

@@ -1,11 +1,11 @@
-"""Discard limits: windows, mailboxes, acknowledgements, connections from a node to itself."""
+"""Discard limits, send windows, input queues, acknowledgements, and a node connected to itself."""
 
 from __future__ import annotations
 
 import pytest
 from engine_bench import Bench, function, initialise, wire
 
-from neuros.core.flow import Outlet
+from neuros.core.send_window import SendWindow
 from neuros.errors import ProtocolError
 from neuros.hooks import All, Optional
 
@@ -72,8 +72,8 @@ def test_each_connection_of_an_output_has_its_own_window():
         connections=[wire(OUT, 2), wire("node.o -> c.x", 0), wire("node.o -> d.x")],
     )
     bench.settle()
-    assert bench.engine.outlets[bench.by_name["node.o -> c.x"]].is_blocked
-    assert not bench.engine.outlets[bench.by_name[OUT]].is_blocked
+    assert bench.engine.send_windows[bench.by_name["node.o -> c.x"]].is_blocked
+    assert not bench.engine.send_windows[bench.by_name[OUT]].is_blocked
     assert bench.ran == ["f"]
 
 
@@ -99,18 +99,18 @@ def test_an_external_output_never_blocks():
 
 
 def test_outstanding_is_sent_minus_acknowledged():
-    outlet = Outlet(wire(OUT, 3))
+    window = SendWindow(wire(OUT, 3))
     for _ in range(3):
-        outlet.spend(0)
-    outlet.credit(2, now_ns=0)
-    assert outlet.outstanding == 1
+        window.spend(0)
+    window.credit(2, now_ns=0)
+    assert window.outstanding == 1
 
 
-# ------------------------------------------------------------------ the mailbox
+# ---------------------------------------------------------{10} the input queue
 
 
 @pytest.mark.parametrize("queue_size", [1, 3])
-def test_a_full_mailbox_discards_the_oldest_unread_packet_and_counts_it(queue_size):
+def test_a_full_input_queue_discards_the_oldest_unread_packet_and_counts_it(queue_size):
     bench = Bench(
         function("f", ["x", "go"]), connections=[wire(A, 9, queue_size), wire("c.o -> node.go")]
     )
@@ -118,18 +118,18 @@ def test_a_full_mailbox_discards_the_oldest_unread_packet_and_counts_it(queue_si
         bench.packet(A, number)
     bench.packet("c.o -> node.go")
     assert bench.calls[0][1][0] == 5 - queue_size
-    inlet = bench.engine.inlets[bench.by_name[A]]
-    assert inlet.discarded == inlet.longest_discard == 5 - queue_size
+    subscription = bench.engine.subscriptions[bench.by_name[A]]
+    assert subscription.discarded == subscription.longest_discard == 5 - queue_size
 
 
-def test_with_limit_0_a_full_mailbox_fails_loudly():
+def test_with_limit_0_a_full_input_queue_fails_loudly():
     bench = Bench(function("f", ["x", "go"]), connections=[wire(A, 0), wire("c.o -> node.go")])
     bench.packet(A)
     with pytest.raises(ProtocolError, match=f"{A} is lossless, yet packet 2 arrived"):
         bench.packet(A)
 
 
-def test_the_mailbox_of_an_external_topic_holds_ten():
+def test_the_input_queue_of_an_external_topic_holds_ten():
     bench = Bench(
         function("f", ["x", "go"]), connections=[wire("c.o -> node.go")], external_inputs=["x"]
     )
@@ -137,7 +137,7 @@ def test_the_mailbox_of_an_external_topic_holds_ten():
         bench.packet("x", number)
     bench.packet("c.o -> node.go")
     assert bench.calls[0][1][0] == 2
-    assert bench.engine.inlets["x"].discarded == 2
+    assert bench.engine.subscriptions["x"].discarded == 2
 
 
 def test_nothing_is_acknowledged_on_an_external_topic():
@@ -216,7 +216,7 @@ def test_an_input_that_no_hook_takes_is_acknowledged_on_arrival():
     bench.packet(A)
     bench.packet(A)
     assert bench.acknowledged == [(A, 1), (A, 2)]
-    assert [str(inlet.key) for inlet in bench.engine.untaken_inlets()] == [A]
+    assert [str(subscription.key) for subscription in bench.engine.untaken_subscriptions()] == [A]
 
 
 def test_even_before_the_node_starts_and_after_it_has_stopped():

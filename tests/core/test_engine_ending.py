@@ -124,8 +124,8 @@ def test_a_hook_of_the_last_round_starts_once_more_and_keeps_what_comes_after():
     bench.engine.drain(last_round=[0])
     assert bench.packet(IN) == ["f"]
     assert bench.packet(IN) == []
-    (inlet,) = bench.engine.inlets.values()
-    assert (inlet.received, inlet.consumed, inlet.unread) == (3, 2, 1)
+    (subscription,) = bench.engine.subscriptions.values()
+    assert (subscription.received, subscription.consumed, subscription.unread) == (3, 2, 1)
     assert not bench.engine.has_startable_packet
     assert not bench.engine.has_ready_hook
 

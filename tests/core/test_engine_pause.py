@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from engine_bench import SECOND, Bench, function, initialise, tick, wire
 
-from neuros.core.accounting import PAUSED
 from neuros.core.explain import explain
-from neuros.core.ledger import snapshot
+from neuros.core.metrics import PAUSED
+from neuros.core.snapshot import snapshot
 from neuros.hooks import Optional
 
 IN, OUT = "a.o -> node.x", "node.o -> b.x"

@@ -1,4 +1,4 @@
-"""A journal makes an engine do again what it has done."""
+"""An event log makes an engine do again what it has done."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from engine_bench import Bench, function, initialise, tick, wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.core.journal import JournalledEngine, What, events_of, is_whole, starts_of
+from neuros.core.event_log import EventKind, LoggedEngine, events_of, is_whole, starts_of
 from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
 from neuros.hooks import HookSpec, Optional
 from neuros.project.model import Connection
@@ -52,7 +52,7 @@ class Run:
     """A node, and neighbours that keep the rules but for when they do something."""
 
     def __init__(self) -> None:
-        self.bench = whole_bench(JournalledEngine, hooks())
+        self.bench = whole_bench(LoggedEngine, hooks())
         self.arrived: dict[Connection | str, list[Any]] = {c: [] for c in INCOMING} | {"topic": []}
         engine = self.bench.engine
         for connection in (*OUTGOING, CONNECTIONS[3]):
@@ -65,16 +65,16 @@ class Run:
         bench.clock.now_ns += advance_ns
         if what < 3:
             key = [*self.arrived][what]
-            inlet = bench.engine.inlets[key]
+            subscription = bench.engine.subscriptions[key]
             window = key.window if isinstance(key, Connection) and key.is_reliable else 99
-            if inlet.received - inlet.acknowledged < window:
+            if subscription.received - subscription.acknowledged < window:
                 packet = len(self.arrived[key]) + 10 * what
                 self.arrived[key].append(packet)
                 bench.engine.on_packet(key, packet)
         elif what < 5:
-            outlet = bench.engine.outlets[OUTGOING[what - 3]]
-            if outlet.acknowledged < outlet.sent:
-                bench.engine.on_acknowledgement(OUTGOING[what - 3], outlet.acknowledged + 1)
+            window = bench.engine.send_windows[OUTGOING[what - 3]]
+            if window.acknowledged < window.sent:
+                bench.engine.on_acknowledgement(OUTGOING[what - 3], window.acknowledged + 1)
         elif what == 5:
             due_ns = bench.engine.next_due_ns
             if due_ns is not None and due_ns <= bench.clock.now_ns:
@@ -94,11 +94,11 @@ class Run:
 
 
 class Again:
-    """The same node, on a journal (``Inbox`` and ``Source`` of the player)."""
+    """The same node, on an event log (``Inbox`` and ``Source`` of the player)."""
 
-    def __init__(self, run: Run, journal: array[int], specs: list[HookSpec]) -> None:
+    def __init__(self, run: Run, event_log: array[int], specs: list[HookSpec]) -> None:
         self._arrived = run.arrived
-        self.script = Script(journal)
+        self.script = Script(event_log)
         self.bench = whole_bench(partial(ReplayedEngine, self.script), specs)
         self.bench.post = self.script.deliveries.append  # type: ignore[method-assign]
         self.bench.post_loop_back = self._post_loop_back  # type: ignore[method-assign]
@@ -137,30 +137,30 @@ def test_a_node_does_again_what_it_did(given_steps: list[tuple[int, int]]) -> No
     for what, advance_ns in given_steps:
         run.step(what, advance_ns)
     run.bench.engine.stop_hooks()
-    journal: Any = run.bench.engine.journal  # type: ignore[attr-defined]
-    again = Again(run, journal, hooks())
+    event_log: Any = run.bench.engine.event_log  # type: ignore[attr-defined]
+    again = Again(run, event_log, hooks())
     again.play()
     assert again.bench.log == run.bench.log
     assert again.bench.calls == run.bench.calls
     assert again.bench.sent == run.bench.sent
     assert not again.script.expects_start
-    assert is_whole(journal)
-    assert len(list(starts_of(journal))) == len(run.bench.calls)
+    assert is_whole(event_log)
+    assert len(list(starts_of(event_log))) == len(run.bench.calls)
 
 
 def some_run() -> tuple[Run, array[int]]:
     run = Run()
     for what in (6, 0, 3, 4, 6, 1, 6, 5, 6, 1, 3, 4, 6):
         run.step(what, 10_000_000)
-    journal: Any = run.bench.engine.journal  # type: ignore[attr-defined]
-    return run, journal
+    event_log: Any = run.bench.engine.event_log  # type: ignore[attr-defined]
+    return run, event_log
 
 
-def test_where_a_journal_was_cut_off_the_replay_is_over() -> None:
-    run, journal = some_run()
-    assert not is_whole(journal)
-    last_start = max(place for place in range(len(journal)) if [*starts_of(journal[place:])])
-    again = Again(run, journal[:last_start], hooks())
+def test_where_an_event_log_was_cut_off_the_replay_is_over() -> None:
+    run, event_log = some_run()
+    assert not is_whole(event_log)
+    last_start = max(place for place in range(len(event_log)) if [*starts_of(event_log[place:])])
+    again = Again(run, event_log[:last_start], hooks())
     with pytest.raises(ReplayOver):
         again.play()
     assert again.bench.calls == run.bench.calls[: len(again.bench.calls)]
@@ -168,19 +168,19 @@ def test_where_a_journal_was_cut_off_the_replay_is_over() -> None:
 
 
 def test_a_plugin_whose_hooks_have_changed_is_told() -> None:
-    run, journal = some_run()
+    run, event_log = some_run()
     begin, loop, *others = hooks()
-    again = Again(run, journal, [begin, function("other", "y"), loop, *others])
+    again = Again(run, event_log, [begin, function("other", "y"), loop, *others])
     with pytest.raises(ReplayParted, match="start 2 of a hook is of 'loop', and was of 'other'"):
         again.play()
 
 
 def test_a_changed_plugin_that_sends_less_is_told_where_it_parts() -> None:
     """The acknowledgements of what it no longer sends are no error."""
-    run, journal = some_run()
+    run, event_log = some_run()
     specs = hooks()
     specs[1] = function("loop", Optional("x"), Optional("p"))
-    again = Again(run, journal, specs)
+    again = Again(run, event_log, specs)
     with pytest.raises(ReplayParted, match="is of 'loop', and was of 'joined'"):
         again.play()
     assert not again.bench.sent
@@ -188,8 +188,8 @@ def test_a_changed_plugin_that_sends_less_is_told_where_it_parts() -> None:
 
 
 def test_events_carry_their_place_and_position() -> None:
-    _, journal = some_run()
-    found = [(event.what, event.place, event.position) for event in events_of(journal)]
-    assert found[0] == (What.BEGIN, 0, 0)
-    assert (What.ACKNOWLEDGEMENT, 2, 1) in found
-    assert (What.REGISTERED, 4, 0) in found
+    _, event_log = some_run()
+    found = [(event.kind, event.place, event.position) for event in events_of(event_log)]
+    assert found[0] == (EventKind.BEGIN, 0, 0)
+    assert (EventKind.ACKNOWLEDGEMENT, 2, 1) in found
+    assert (EventKind.REGISTERED, 4, 0) in found

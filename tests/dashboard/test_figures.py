@@ -167,7 +167,7 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     reports = {
         name: {
             "is_final": True,
-            "ledger": {
+            "metrics": {
                 "outgoing": out,
                 "incoming": into,
                 "accounting": nothing | spent,

@@ -127,9 +127,9 @@ def test_a_plugin_that_is_gone(own: Recorded) -> None:
     assert f"the plugin of 'mixer' is gone: {own.project / 'mixer.py'}" in done.stderr
 
 
-def test_a_journal_that_was_cut_off_is_replayed_as_far_as_it_goes(own: Recorded) -> None:
-    journal = own.run / "mixer/packets/event_log"
-    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
+def test_an_event_log_that_was_cut_off_is_replayed_as_far_as_it_goes(own: Recorded) -> None:
+    event_log = own.run / "mixer/packets/event_log"
+    event_log.write_bytes(event_log.read_bytes()[: event_log.stat().st_size // 2])
     done = replay(own.run, "mixer")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "what it sent later is not compared" in done.stdout

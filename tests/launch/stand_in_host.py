@@ -36,8 +36,8 @@ class Host:
     def report(self, **fields: Any) -> None:
         """A report of a node that has been loaded."""
         for name in NAMES:
-            ledger = {"hooks": {}, "executing": None, "state": {"state": "idle", "cause": ""}}
-            common = {"waiting_for": [], "sim_time": None, "ledger": ledger | self.connections}
+            metrics = {"hooks": {}, "executing": None, "state": {"state": "idle", "cause": ""}}
+            common = {"waiting_for": [], "sim_time": None, "metrics": metrics | self.connections}
             self.tell("report", **{**common, "node": name, **fields})
 
     def up(self) -> None:

@@ -21,7 +21,7 @@ def report(
     """Of the sender or of the receiver."""
     incoming = {"received": received, "unread": unread, "taker": taker if unread else None}
     return {
-        "ledger": {
+        "metrics": {
             "outgoing": {} if sent is None else {KEY: {"sent": sent, "is_reliable": True}},
             "incoming": {} if received is None else {KEY: incoming},
         }

@@ -20,11 +20,11 @@ class Clock:
 def report(
     sim_s: float | None, sent: int, discarded: int = 0, expected: float | None = None
 ) -> Mapping[str, Any]:
-    ledger = {
+    metrics = {
         "outgoing": {"a.o -> b.i": {"sent": sent}},
         "incoming": {"b.o -> a.i": {"discarded": discarded}},
     }
-    return {"sim_time": sim_s, "expected_end_s": expected, "ledger": ledger}
+    return {"sim_time": sim_s, "expected_end_s": expected, "metrics": metrics}
 
 
 def run(clock: Clock, reports: list[Mapping[str, Any]], **end: float) -> Progress:

@@ -36,9 +36,9 @@ LOSSY = wire("a.p -> b.y", None, index=2)
 
 def probe(**changes: Any) -> dict[str, Any]:
     """A probe of a node that waits for nothing, without connections."""
-    ledger = {"outgoing": {}, "incoming": {}, "hooks": {}, "state": {"state": "idle", "cause": ""}}
+    metrics = {"outgoing": {}, "incoming": {}, "hooks": {}, "state": {"state": "idle", "cause": ""}}
     return {
-        "ledger": ledger | changes.pop("ledger", {}),
+        "metrics": metrics | changes.pop("metrics", {}),
         "is_startable": False,
         "is_wakeable": False,
         "is_running": True,
@@ -54,14 +54,14 @@ def sender(connection: Connection, sent: int, acknowledged: int, **changes: Any)
         "outstanding": sent - acknowledged,
         "is_blocked": sent - acknowledged >= connection.window,
     }
-    return probe(ledger={"outgoing": {str(connection): book}}, **changes)
+    return probe(metrics={"outgoing": {str(connection): book}}, **changes)
 
 
 def receiver(
     connection: Connection, received: int, acknowledged: int, **changes: Any
 ) -> dict[str, Any]:
     book = {"received": received, "acknowledged": acknowledged}
-    return probe(ledger={"incoming": {str(connection): book}}, **changes)
+    return probe(metrics={"incoming": {str(connection): book}}, **changes)
 
 
 # ------------------------------------------------------------------ drained
@@ -125,7 +125,7 @@ def test_every_count_tells_whether_something_has_happened() -> None:
     assert before != counters({"a": sender(AB, 1, 1), "b": receiver(AB, 1, 0)})
     assert before != counters({"a": sender(AB, 1, 0), "b": receiver(AB, 1, 1)})
     busier = sender(AB, 1, 0)
-    busier["ledger"]["hooks"] = {"step": {"executions": 1}}
+    busier["metrics"]["hooks"] = {"step": {"executions": 1}}
     assert before != counters({"a": busier, "b": receiver(AB, 1, 0)})
 
 
@@ -134,8 +134,8 @@ def test_every_count_tells_whether_something_has_happened() -> None:
 
 def test_a_ring_of_full_connections_is_named_with_its_connections() -> None:
     a, b = sender(AB, 1, 0), sender(BA, 1, 0)
-    a["ledger"]["incoming"][str(BA)] = {"received": 1, "acknowledged": 0}
-    b["ledger"]["incoming"][str(AB)] = {"received": 1, "acknowledged": 0}
+    a["metrics"]["incoming"][str(BA)] = {"received": 1, "acknowledged": 0}
+    b["metrics"]["incoming"][str(AB)] = {"received": 1, "acknowledged": 0}
     assert cycle(waits({"a": a, "b": b}, [AB, BA])) == [
         ("a", "is blocked on `a.o -> b.x` (1 outstanding)"),
         ("b", "is blocked on `b.o -> a.x` (1 outstanding)"),
@@ -145,8 +145,8 @@ def test_a_ring_of_full_connections_is_named_with_its_connections() -> None:
 def test_a_ring_of_missing_inputs_is_named_with_the_inputs() -> None:
     a, b = sender(AB, 0, 0), sender(BA, 0, 0)
     for node, source in ((a, BA), (b, AB)):
-        node["ledger"]["incoming"][str(source)] = {"received": 0, "acknowledged": 0, "unread": 0}
-        node["ledger"]["state"] = {"state": "waiting", "cause": "x"}
+        node["metrics"]["incoming"][str(source)] = {"received": 0, "acknowledged": 0, "unread": 0}
+        node["metrics"]["state"] = {"state": "waiting", "cause": "x"}
     assert cycle(waits({"a": a, "b": b}, [AB, BA])) == [
         ("a", "waits for `x` from b"),
         ("b", "waits for `x` from a"),
@@ -161,20 +161,20 @@ def test_who_has_delivered_is_not_waited_for_nor_a_packet_to_itself() -> None:
     free = {"sent": 1, "acknowledged": 1, "outstanding": 0, "is_blocked": False}
     unread, none = {"unread": 1}, {"unread": 0}
     a = probe(
-        ledger={
+        metrics={
             "outgoing": {str(own): full, str(missing): free},
             "incoming": {str(own): unread, str(from_b): unread, str(from_c): none},
             "state": {"state": "waiting", "cause": "x"},
         }
     )
     b = probe(
-        ledger={
+        metrics={
             "outgoing": {str(from_b): full},
             "incoming": {str(to_b): unread, str(missing): none},
             "state": {"state": "waiting", "cause": "z"},
         }
     )
-    c = probe(ledger={"outgoing": {str(from_c): free, str(to_b): full}})
+    c = probe(metrics={"outgoing": {str(from_c): free, str(to_b): full}})
     graph = waits({"a": a, "b": b, "c": c}, [own, from_b, from_c, to_b, missing])
     assert cycle(graph) == [
         ("a", "waits for `x` from c"),
@@ -271,10 +271,10 @@ class World:
             key = str(c)
             if c.source_node == name:
                 book = {"sent": self.sent.get(key, 0), "acknowledged": self.heard.get(key, 0)}
-                answer["ledger"]["outgoing"][key] = book
+                answer["metrics"]["outgoing"][key] = book
             if c.destination_node == name:
                 book = {"received": self.received.get(key, 0)}
-                answer["ledger"]["incoming"][key] = book | {"acknowledged": self.taken.get(key, 0)}
+                answer["metrics"]["incoming"][key] = book | {"acknowledged": self.taken.get(key, 0)}
                 answer["is_startable"] |= self.unread(c) > 0
         return answer
 

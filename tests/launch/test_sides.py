@@ -58,7 +58,7 @@ def side() -> Side:
 def sent(number: int, acknowledged: int | None = None) -> dict[str, Any]:
     """A report of ``a``."""
     counters = {"sent": number, "acknowledged": number if acknowledged is None else acknowledged}
-    return {"a": {"ledger": {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}}}
+    return {"a": {"metrics": {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}}}
 
 
 def received(number: int) -> dict[str, Any]:

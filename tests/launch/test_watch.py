@@ -20,7 +20,7 @@ def report(
 ) -> dict[str, Any]:
     return {
         "waiting_for": list(waiting_for),
-        "ledger": {
+        "metrics": {
             "hooks": {"step": {"executions": executions}},
             "incoming": {"b.o -> a.x": {"received": received}},
             "executing": executing,
@@ -28,7 +28,7 @@ def report(
     }
 
 
-LOADING = {"waiting_for": [], "ledger": None}
+LOADING = {"waiting_for": [], "metrics": None}
 
 
 def executing(for_s: float, executions: int = 7) -> dict[str, Any]:

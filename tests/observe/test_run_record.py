@@ -22,9 +22,9 @@ ROWS = {
 
 
 def report(name: str, *, is_final: bool) -> dict[str, Any]:
-    ledger = {"accounting": {}, "hooks": {}, **ROWS[name]}
+    metrics = {"accounting": {}, "hooks": {}, **ROWS[name]}
     return {
-        "ledger": ledger,
+        "metrics": metrics,
         "is_final": is_final,
         "sim_time": None,
         "running_since_s": None,

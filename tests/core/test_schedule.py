@@ -1,10 +1,10 @@
-"""What a node notes of its first executions."""
+"""The log of a node's first executions."""
 
 from __future__ import annotations
 
 from engine_bench import Bench, function, initialise, wire
 
-from neuros.core.trace import Trace
+from neuros.core.schedule import ExecutionLog
 
 
 def relay() -> Bench:
@@ -24,19 +24,19 @@ def test_executions_have_their_hook_and_times_and_acknowledgements_theirs() -> N
     bench.clock.advance(0.5)
     leaving = bench.by_name["node.out -> after.in"]
     bench.engine.on_acknowledgement(leaving, 1)
-    trace = bench.engine.trace
-    assert trace.hooks == [("wake", "initialise"), ("relay", "function")]
-    assert trace.executions.tolist()[3:] == [1, start_ns, start_ns]
-    assert trace.credits.tolist() == [7, 1, start_ns + 500_000_000]
+    log = bench.engine.execution_log
+    assert log.hooks == [("wake", "initialise"), ("relay", "function")]
+    assert log.executions.tolist()[3:] == [1, start_ns, start_ns]
+    assert log.credits.tolist() == [7, 1, start_ns + 500_000_000]
 
 
 def test_what_comes_after_the_first_ones_is_not_noted() -> None:
     bench = relay()
-    bench.engine.trace = trace = Trace(most=2)
+    bench.engine.execution_log = log = ExecutionLog(most=2)
     leaving = bench.by_name["node.out -> after.in"]
     for position in (1, 2, 3):
         bench.packet("before.out -> node.in", position)
         bench.engine.on_acknowledgement(leaving, position)
-    assert trace.is_full
-    assert len(trace.executions) == 3 * 2
-    assert [*trace.credits[1::3]] == [1]
+    assert log.is_full
+    assert len(log.executions) == 3 * 2
+    assert [*log.credits[1::3]] == [1]

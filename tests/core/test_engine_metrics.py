@@ -10,8 +10,8 @@ from engine_bench import Bench, function, initialise, tick, wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.core.accounting import Rest, State
-from neuros.core.ledger import snapshot, steadily
+from neuros.core.metrics import Rest, State
+from neuros.core.snapshot import snapshot, steadily
 from neuros.hooks import Optional
 
 IN, OUT, OWN = "a.o -> node.x", "node.o -> b.x", "node.o -> node.x"
@@ -166,16 +166,18 @@ def test_the_whole_wall_time_is_booked_and_nothing_is_negative(events):
         bench.hook_s = hook_ms / 1000
         event_of = {
             "p": lambda: bench.packet(IN),
-            "a": lambda: bench.engine.on_acknowledgement(free, bench.engine.outlets[free].sent),
+            "a": lambda: bench.engine.on_acknowledgement(
+                free, bench.engine.send_windows[free].sent
+            ),
             "t": bench.engine.on_timer,
-            "r": lambda: [bench.register(str(c)) for c in bench.engine.outlets],
+            "r": lambda: [bench.register(str(c)) for c in bench.engine.send_windows],
             "o": lambda: bench.engine.offer({"o": 1}, lambda: None),
             "d": bench.engine.drain,
             "e": lambda: bench.settle(1),
             "s": bench.engine.stop_hooks,
         }
         event_of[kind]()
-        spent = bench.engine.accounts.totals_ns
+        spent = bench.engine.spent_ns
         busy_ns = sum(hook.busy_ns for hook in bench.engine.all_hooks)
         assert all(duration_ns >= 0 for duration_ns in spent.values())
         # What is not booked yet is what has passed since the engine's last entry.

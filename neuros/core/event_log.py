@@ -1,4 +1,4 @@
-"""What happened to an engine, as a row of numbers: enough to make it happen once more.
+"""The event log of an engine: a row of numbers, from which a replay makes the events again.
 
 An engine decides by its events, and, where hooks have a period, by what its clock says. So both
 are noted, in their order, and each start of a hook besides, to check against. A number below zero
@@ -22,7 +22,7 @@ _KIND_BITS, _PLACE_BITS = 5, 20
 _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
 
 
-class What(IntEnum):
+class EventKind(IntEnum):
     """The kinds of entries; ``place`` and ``position`` where they have one."""
 
     BEGIN = 0  # never written: what comes before the first event
@@ -35,7 +35,7 @@ class What(IntEnum):
     LOOP_BACK = 7
     OFFER = 8
     DRAIN = 9
-    STOP = 10  # no further hook starts: the journal is whole
+    STOP = 10  # no further hook starts: the log is whole
     HOOK = 11  # place: of the hook that starts, in the order of declaration
     PAUSE = 12
     RESUME = 13
@@ -50,40 +50,41 @@ class Event(NamedTuple):
     ``limit``: after so many starts its pass ended, for what had arrived; ``None``: it did not.
     """
 
-    what: What
+    kind: EventKind
     place: int
     position: int
     readings: list[int]
     limit: int | None = None
 
 
-class JournalledEngine(Engine):
-    """Notes what happens to it in :attr:`journal`, until somebody takes the entries away.
+class LoggedEngine(Engine):
+    """Notes its events in :attr:`event_log`, until the packet log takes the entries away.
 
     Its arguments are those of :class:`Engine`.
     """
 
     def __init__(self, *arguments: Any) -> None:
         node, connections, specs, effects, clock, types = arguments
-        self.journal = array("q")
-        self._note = self.journal.append
+        self.event_log = array("q")
+        self._note = self.event_log.append
         has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
         own_clock = self._noting(clock) if has_ticks else clock
         super().__init__(node, connections, specs, effects, own_clock, types)
         self._has_taken_in = self._noting_deferral(effects.has_taken_in)
         self._starts = 0
         self._hook_entries = {
-            hook: _entry(What.HOOK, place) for place, hook in enumerate(self.all_hooks)
+            hook: _entry(EventKind.HOOK, place) for place, hook in enumerate(self.all_hooks)
         }
         self._packet_entries: dict[Connection | str, int] = {
-            connection: _entry(What.PACKET, connection.index) for connection in connections
-        } | {port.name: _entry(What.HEARD, place) for place, port in enumerate(node.inputs)}
+            connection: _entry(EventKind.PACKET, connection.index) for connection in connections
+        } | {port.name: _entry(EventKind.HEARD, place) for place, port in enumerate(node.inputs)}
         self._acknowledgement_entries = {
-            connection: _entry(What.ACKNOWLEDGEMENT, connection.index) for connection in connections
+            connection: _entry(EventKind.ACKNOWLEDGEMENT, connection.index)
+            for connection in connections
         }
 
     def start(self) -> None:
-        self._note(_entry(What.START))
+        self._note(_entry(EventKind.START))
         super().start()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
@@ -95,7 +96,7 @@ class JournalledEngine(Engine):
         super().on_acknowledgement(connection, position)
 
     def on_registered(self, connection: Connection) -> None:
-        self._note(_entry(What.REGISTERED, connection.index))
+        self._note(_entry(EventKind.REGISTERED, connection.index))
         super().on_registered(connection)
 
     def on_timer(self) -> None:
@@ -112,26 +113,26 @@ class JournalledEngine(Engine):
 
     def drain(self, last_round: Sequence[int] = ()) -> None:
         for place in last_round:
-            self._note(_entry(What.LAST_ROUND, place))
-        self._note(_entry(What.DRAIN))
+            self._note(_entry(EventKind.LAST_ROUND, place))
+        self._note(_entry(EventKind.DRAIN))
         super().drain(last_round)
 
     def pause(self) -> None:
-        self._note(_entry(What.PAUSE))
+        self._note(_entry(EventKind.PAUSE))
         super().pause()
 
     def resume(self) -> None:
-        if not self._life.is_draining:  # a drain resumes by itself, here and in the replay
-            self._note(_entry(What.RESUME))
+        if not self._lifecycle.is_draining:  # a drain resumes by itself, here and in the replay
+            self._note(_entry(EventKind.RESUME))
         super().resume()
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        self._note(_entry(What.STEP, int(is_driven), count))
+        self._note(_entry(EventKind.STEP, int(is_driven), count))
         super().step(count, is_driven=is_driven)
 
     def stop_hooks(self) -> None:
         super().stop_hooks()
-        self._note(_entry(What.STOP))
+        self._note(_entry(EventKind.STOP))
 
     def _pass(self, *, may_start: bool = False) -> None:
         if not self._is_passing:
@@ -149,7 +150,7 @@ class JournalledEngine(Engine):
         def noted() -> bool:
             is_in = has_taken_in()
             if not is_in:
-                self._note(_entry(What.DEFERRED, position=self._starts))
+                self._note(_entry(EventKind.DEFERRED, position=self._starts))
             return is_in
 
         return noted
@@ -165,46 +166,46 @@ class JournalledEngine(Engine):
         return noted
 
 
-def events_of(journal: Iterable[int]) -> Iterator[Event]:
-    """The events in a journal; the first, ``BEGIN``, has the readings before all others."""
-    event = Event(What.BEGIN, 0, 0, [])
-    for number in journal:
+def events_of(event_log: Iterable[int]) -> Iterator[Event]:
+    """The events of a log; the first, ``BEGIN``, has the readings before all others."""
+    event = Event(EventKind.BEGIN, 0, 0, [])
+    for number in event_log:
         if number >= 0:
             event.readings.append(number)
             continue
-        what, place, position = _parts(number)
-        if what is What.DEFERRED:
+        kind, place, position = _parts(number)
+        if kind is EventKind.DEFERRED:
             event = event._replace(limit=position)
-        elif what is not What.HOOK:
+        elif kind is not EventKind.HOOK:
             yield event
-            event = Event(what, place, position, [])
+            event = Event(kind, place, position, [])
     yield event
 
 
-def starts_of(journal: Iterable[int]) -> Iterator[int]:
+def starts_of(event_log: Iterable[int]) -> Iterator[int]:
     """The hooks that have started, by their places in the order of declaration."""
-    for number in journal:
-        if number < 0 and (~number & _mask(_KIND_BITS)) == What.HOOK:
+    for number in event_log:
+        if number < 0 and (~number & _mask(_KIND_BITS)) == EventKind.HOOK:
             yield _parts(number)[1]
 
 
-def is_whole(journal: Iterable[int]) -> bool:
+def is_whole(event_log: Iterable[int]) -> bool:
     """Whether it goes to the end of the run."""
-    return _entry(What.STOP) in journal
+    return _entry(EventKind.STOP) in event_log
 
 
-def _entry(what: What, place: int = 0, position: int = 0) -> int:
-    return ~(what | place << _KIND_BITS | position << _POSITION_SHIFT)
+def _entry(kind: EventKind, place: int = 0, position: int = 0) -> int:
+    return ~(kind | place << _KIND_BITS | position << _POSITION_SHIFT)
 
 
-def _parts(entry: int) -> tuple[What, int, int]:
+def _parts(entry: int) -> tuple[EventKind, int, int]:
     value = ~entry
     place = value >> _KIND_BITS & _mask(_PLACE_BITS)
-    return What(value & _mask(_KIND_BITS)), place, value >> _POSITION_SHIFT
+    return EventKind(value & _mask(_KIND_BITS)), place, value >> _POSITION_SHIFT
 
 
 def _mask(bits: int) -> int:
     return (1 << bits) - 1
 
 
-_TIMER, _LOOP_BACK, _OFFER = map(_entry, (What.TIMER, What.LOOP_BACK, What.OFFER))
+_TIMER, _LOOP_BACK, _OFFER = map(_entry, (EventKind.TIMER, EventKind.LOOP_BACK, EventKind.OFFER))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.core.ticks import TickBook
+from neuros.core.metrics import TickIntervals
 
 MS = 1_000_000
 
 
-def book(*starts_ms: float, period_ms: float = 20.0) -> TickBook:
-    ticks = TickBook(round(period_ms * MS))
+def book(*starts_ms: float, period_ms: float = 20.0) -> TickIntervals:
+    ticks = TickIntervals(round(period_ms * MS))
     for start_ms in starts_ms:
         ticks.note(round(start_ms * MS))
     return ticks

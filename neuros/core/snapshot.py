@@ -1,4 +1,4 @@
-"""The books of a running node as plain data: for reports, ``run.json`` and the table at the end.
+"""The metrics of a running node as plain data: for reports, ``run.json`` and the table at the end.
 
 :func:`snapshot` may be called from any thread while the engine runs. It only reads, and it takes no
 lock, so figures of one snapshot can be an event apart; once the node has stopped they are exact.
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from neuros.core.accounting import IDLE, Rest, State
 from neuros.core.engine import Engine
-from neuros.core.flow import Outlet
 from neuros.core.hook import Hook
-from neuros.core.inputs import Inlet
+from neuros.core.input_queue import Subscription
+from neuros.core.metrics import IDLE, Rest, State
+from neuros.core.send_window import SendWindow
 from neuros.hooks import HookKind
 
 _T = TypeVar("_T")
@@ -22,7 +22,7 @@ _ATTEMPTS = 10
 
 
 def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
-    """What a node has sent, received and done so far; JSON-serialisable. Any thread.
+    """The metrics of a node so far; JSON-serialisable. Any thread.
 
     Args:
         now_ns: the time now, on the engine's clock.
@@ -31,7 +31,7 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         ``state``: what it does now, ``{"state", "cause"}``.
         ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
-        ``incoming``: the same; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
+        ``incoming``: likewise; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
         is ready to start on the oldest unread packet.
         ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
         those that initialise, how many of the seconds that took.
@@ -42,12 +42,12 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
     return {
         "state": {"state": rest.state.value, "cause": rest.cause},
         "executing": _executing(engine, now_ns),
-        "outgoing": {str(o.connection): _outgoing(o) for o in engine.outlets.values()},
+        "outgoing": {str(o.connection): _outgoing(o) for o in engine.send_windows.values()},
         "incoming": {
-            f"{inlet.name} -> {engine.node.name}.{inlet.input_name}"
-            if inlet.is_external
-            else inlet.name: _incoming(inlet)
-            for inlet in engine.inlets.values()
+            f"{subscription.name} -> {engine.node.name}.{subscription.input_name}"
+            if subscription.is_external
+            else subscription.name: _incoming(subscription)
+            for subscription in engine.subscriptions.values()
         },
         "hooks": _hooks(hooks),
         "accounting": _accounting(engine, hooks, rest, now_ns),
@@ -55,7 +55,7 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
 
 
 def steadily(read: Callable[[], _T], otherwise: _T) -> _T:
-    """Read what another thread changes meanwhile: again, if it changed under the reader's eyes."""
+    """Read what another thread changes meanwhile: again, if it changed while it was read."""
     for _ in range(_ATTEMPTS):
         try:
             return read()
@@ -75,43 +75,44 @@ def _executing(engine: Engine, now_ns: int) -> dict[str, Any] | None:
     }
 
 
-def _outgoing(outlet: Outlet) -> dict[str, Any]:
-    acknowledged = outlet.acknowledged  # before `sent`, which only grows: outstanding is never < 0
-    sent = outlet.sent
+def _outgoing(window: SendWindow) -> dict[str, Any]:
+    acknowledged = window.acknowledged  # before `sent`, which only grows: outstanding is never < 0
+    sent = window.sent
     return {
         "sent": sent,
         "acknowledged": acknowledged,
-        "outstanding": sent - acknowledged if outlet.is_reliable else 0,
-        "window": outlet.window,
-        "is_reliable": outlet.is_reliable,
-        "is_blocked": outlet.is_blocked,
+        "outstanding": sent - acknowledged if window.is_reliable else 0,
+        "window": window.size,
+        "is_reliable": window.is_reliable,
+        "is_blocked": window.is_blocked,
     }
 
 
-def _incoming(inlet: Inlet) -> dict[str, Any]:
-    consumed, discarded = inlet.consumed, inlet.discarded  # before `received`, for the same reason
-    received = inlet.received
+def _incoming(subscription: Subscription) -> dict[str, Any]:
+    consumed = subscription.consumed  # before `received`, for that reason, too
+    discarded = subscription.discarded
+    received = subscription.received
     return {
         "received": received,
         "consumed": consumed,
         "discarded": discarded,
-        "longest_discard": inlet.longest_discard,
+        "longest_discard": subscription.longest_discard,
         "unread": received - consumed - discarded,
-        "acknowledged": inlet.acknowledged,
-        "taker": steadily(lambda: _taker(inlet), None),
+        "acknowledged": subscription.acknowledged,
+        "taker": steadily(lambda: _taker(subscription), None),
     }
 
 
-def _taker(inlet: Inlet) -> str | None:
-    """A hook that could start now, and would take a packet of this inlet."""
-    hooks = (each.slot.hook for each in inlet.mailboxes if each.slot.would_take(each))
+def _taker(subscription: Subscription) -> str | None:
+    """A hook that could start now, and would take a packet of this subscription."""
+    hooks = (q.hook_input.hook for q in subscription.queues if q.hook_input.would_take(q))
     return next((hook.name for hook in hooks if hook.is_ready()), None)
 
 
 def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
-    books: dict[str, dict[str, Any]] = {}
+    metrics: dict[str, dict[str, Any]] = {}
     for hook in hooks:  # a function with two marks is two hooks of one name
-        entry = books.setdefault(hook.name, {"executions": 0, "busy_s": 0.0, "missed_ticks": 0})
+        entry = metrics.setdefault(hook.name, {"executions": 0, "busy_s": 0.0, "missed_ticks": 0})
         entry["executions"] += hook.executions
         entry["busy_s"] += hook.busy_ns / 1e9
         entry["missed_ticks"] += hook.missed_ticks
@@ -119,16 +120,16 @@ def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
             entry["initialise_s"] = entry.get("initialise_s", 0.0) + hook.busy_ns / 1e9
         if hook.ticks is not None:
             entry["ticks"] = steadily(hook.ticks.figures, None)
-    return books
+    return metrics
 
 
 def _accounting(engine: Engine, hooks: tuple[Hook, ...], rest: Rest, now_ns: int) -> dict[str, Any]:
     nothing: dict[Rest, int] = {}
-    spent = steadily(lambda: dict(engine.accounts.totals_ns), nothing)
+    spent = steadily(lambda: dict(engine.spent_ns), nothing)
     for hook in hooks:
         cause = Rest(State.EXECUTING, hook.name)
         spent[cause] = spent.get(cause, 0) + hook.busy_ns
-    # What is not booked yet is what the node does now; a hook that has just ended may be ahead.
+    # What is not counted yet is what the node does now; a hook that has just ended may be ahead.
     open_ns = max(0, now_ns - engine.created_ns - sum(spent.values()))
     spent[rest] = spent.get(rest, 0) + open_ns
 

@@ -1,10 +1,15 @@
-"""How regular a timed hook was: the times between its starts, counted as they pass."""
+"""Metrics of an engine: the states that its wall time is counted by, and intervals of ticks.
+
+Between two events nothing of a node changes, so the time between them has one cause, which is
+asked for once, when the next event arrives.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from enum import Enum
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 WITHIN_MS = (1, 2, 5, 10)
 """Shares are given of intervals that are off the period by no more than this."""
@@ -13,7 +18,34 @@ _BIN_NS = 100_000
 _MOST_BINS = 20_000
 
 
-class TickBook:
+class State(str, Enum):
+    """The state of a node at a moment."""
+
+    REGISTERING = "registering"
+    EXECUTING = "executing"
+    WAITING = "waiting"
+    BLOCKED = "blocked"
+    IDLE = "idle"
+    SCHEDULING = "scheduling"
+    PAUSED = "paused"
+
+    __hash__ = str.__hash__  # time is counted at every event, and Enum's own is ten times slower
+
+
+class Rest(NamedTuple):
+    """The state of a node, and the hook, input or connection that causes it."""
+
+    state: State
+    cause: str = ""
+
+
+REGISTERING = Rest(State.REGISTERING)
+SCHEDULING = Rest(State.SCHEDULING)
+IDLE = Rest(State.IDLE)
+PAUSED = Rest(State.PAUSED)
+
+
+class TickIntervals:
     """Intervals between the starts of one timed hook, in a memory that does not grow with them.
 
     Args:
@@ -63,7 +95,7 @@ class TickBook:
         self._bins[min(interval_ns // _BIN_NS, _MOST_BINS)] += 1
 
     def skip(self, duration_ns: int) -> None:
-        """A time has passed that is no part of an interval."""
+        """Leave a time out of the current interval."""
         if self._last_ns is not None:
             self._last_ns += duration_ns
 
