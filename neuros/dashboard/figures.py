@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-from neuros.core.spending import spending_of
+from neuros.core.time_budget import time_budget_of
 
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""
@@ -206,7 +206,7 @@ class Figures:
             self._ended_factor = self.sim_time / running_s
 
     def _end_node(self, name: str, books: Mapping[str, Any], running_s: float | None) -> None:
-        spent = spending_of(books, running_s)
+        spent = time_budget_of(books, running_s)
         self.nodes[name] = {
             "state": "ended",
             "cause": "",

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from neuros.core.spending import spending_of
+from neuros.core.time_budget import time_budget_of
 from neuros.observe.load_table import load_table
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
@@ -186,7 +186,7 @@ def _results(node_folder: Path) -> dict[str, Any]:
 
 
 def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
-    spent = spending_of(node, running_s)
+    spent = time_budget_of(node, running_s)
     if spent is None:
         return ["?", "?", "?", "?", "never reported"]
     remark = "" if node["report"] == "final" else node["report"]
