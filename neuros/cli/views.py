@@ -168,7 +168,7 @@ def _run_view(options: argparse.Namespace) -> int:
     from neuros.launch.rerun import await_server
     from neuros.views.onlooker import look_on
     from neuros.views.rerun_feed import RerunFeed
-    from neuros.views.scene import Source
+    from neuros.views.visual_types import Source
 
     told = json.loads(sys.stdin.readline())
     sources = {

@@ -1,4 +1,4 @@
-"""An onlooker of a run that shows what it sees in a viewer."""
+"""Onlooker of a run that shows packets in a viewer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines, connect
-from neuros.views.scene import Mark, Source
+from neuros.views.visual_types import Mark, Source
 
 _PERIOD_S = 0.2
 
@@ -20,7 +20,7 @@ def look_on(
     sources: Mapping[str, tuple[str, str, Source]],
     show: Callable[[str, float, Sequence[Mark]], None],
 ) -> None:
-    """Ask again and again what passes, until the run is over.
+    """Ask for samples of packets until the run is over.
 
     Args:
         sources: by name, the node and the port, and what is shown of it.

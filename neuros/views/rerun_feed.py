@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from neuros.views.scene import Mark, Numbers, Picture, Points, Pose, Source
+from neuros.views.visual_types import Mark, Numbers, Picture, Points, Pose, Source
 
 _TIMELINE = "time"
 _TRAIL = 1000

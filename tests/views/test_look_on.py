@@ -8,7 +8,7 @@ from pathlib import Path
 
 from neuros.launch.channels import Channels
 from neuros.views.onlooker import look_on
-from neuros.views.scene import Mark, Numbers, Source
+from neuros.views.visual_types import Mark, Numbers, Source
 
 
 def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:

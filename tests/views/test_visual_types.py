@@ -12,7 +12,7 @@ from sensor_msgs.msg import Image, Imu, LaserScan
 from std_msgs.msg import Float64, String
 
 from neuros.runtime.sampling import Sampler
-from neuros.views.scene import Mark, Numbers, Picture, Points, Pose, Source
+from neuros.views.visual_types import Mark, Numbers, Picture, Points, Pose, Source
 
 
 def seen(source: Source, packet: Any) -> list[Mark]:
