@@ -1,4 +1,4 @@
-"""From what nodes show of themselves to what the page shows: rates, shares, latencies, losses."""
+"""Figures of the page, from counters of nodes: rates, shares, latencies, losses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LATE_S = 2.0
 
 
 class Latency:
-    """How long packets of one connection were on their way: from being sent to a hook's start.
+    """Latency of one connection: from the sending of a packet to the start of a hook on it.
 
     Sender and receiver show themselves at different moments; what belongs together is told by the
     packets' positions. Both count on the monotonic clock of one machine.
@@ -62,7 +62,7 @@ class Latency:
 
 
 class Speed:
-    """How fast a growing figure grows, over :data:`WINDOW_S`."""
+    """Growth of a counter, over :data:`WINDOW_S`."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque()
@@ -81,7 +81,7 @@ class Speed:
 
 
 class Loss:
-    """How many packets of a best-effort connection were lost on their way, so far.
+    """Packets of a best-effort connection that were lost on their way, so far.
 
     Both ends show their counts at different moments, and what arrives while a hook executes is
     taken in after it. So the receiver's count is compared with what had been sent shortly before it
@@ -117,7 +117,7 @@ class Loss:
 
 
 class Figures:
-    """Keeps what is needed of the past, and gives what is to be shown.
+    """Figures of all nodes and connections, with as much of the past as they need.
 
     Attributes:
         nodes, connections: by name, ready for JSON.
