@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.api.frames import frame_of
 from neuros.errors import RunError
-from neuros.observe.past_run import open_run
-from neuros.observe.report import run_table
+from neuros.observe.run_record import open_run, run_table
 
 if TYPE_CHECKING:
     from neuros.observe.bag.opened import Bag

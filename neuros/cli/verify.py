@@ -24,8 +24,8 @@ def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def _verify(options: argparse.Namespace) -> int:
     from neuros.observe.difference import compare
-    from neuros.observe.past_run import open_run
     from neuros.observe.recorded import Recorded
+    from neuros.observe.run_record import open_run
 
     a, b = open_run(options.run_a), open_run(options.run_b)
     recorded = Recorded()

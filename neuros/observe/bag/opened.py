@@ -1,4 +1,4 @@
-"""A bag that is open for reading."""
+"""Bag that is open for reading."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class RecordedTopic:
 
 
 class Bag:
-    """What a run has recorded.
+    """Topics and metadata of a recorded run.
 
     Attributes:
         folder: the rosbag2 folder.

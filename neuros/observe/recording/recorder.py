@@ -1,4 +1,4 @@
-"""Moves packets from the spools of a run into its bag, in the order of their wall time."""
+"""Recorder: moves packets from the spools of a run into its bag, ordered by wall time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from neuros.errors import EnvironmentFault
-from neuros.observe.recording.bag_writer import BagWriter
-from neuros.observe.recording.definitions import Definitions
-from neuros.observe.recording.listened import forget_listened, listened_topics
+from neuros.observe.recording.bag_writer import BagWriter, Definitions
 from neuros.observe.recording.plan import BAG_NAME, LISTENER, RecordingPlan, Topic
-from neuros.observe.recording.spool import NO_TIME, ForwardClock, SpoolReader
+from neuros.observe.recording.spool import (
+    NO_TIME,
+    ForwardClock,
+    SpoolReader,
+    forget_listened,
+    listened_topics,
+)
 from neuros.observe.recording.stored import Stored
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from

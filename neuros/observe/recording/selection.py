@@ -1,4 +1,4 @@
-"""Which packets of a project a recording holds, and which node keeps them."""
+"""Selection of the packets that a recording holds, and of the node that keeps each."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CLOCK = "/clock"
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be recorded.
+    """Topics to record, and the storage.
 
     Attributes:
         everything: all that the project's nodes send and hear, and ``/clock``.
         topics: names and patterns of topics, connections or outputs; besides everything, or alone.
-        exclude: the same, left out in any case.
+        exclude: names and patterns that are left out in any case.
         storage: ``mcap`` or ``sqlite3``.
     """
 
@@ -35,7 +35,7 @@ class Request:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where packets of a topic can be kept."""
+    """A node that can keep the packets of a topic."""
 
     node: str
     way: Way

@@ -1,4 +1,4 @@
-"""The messages of a bag, also of one that has lost its end.
+"""Reader of the messages of a bag, also of one that has lost its end.
 
 An MCAP file is a row of records, each with its length, so it can be read from its beginning as far
 as it goes (https://mcap.dev/spec). Libraries begin at its end, where the index is.

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from neuros.observe.report import consumed_percent
 from neuros.observe.review.figures import colour, new_figure, plain
 from neuros.observe.review.run import Run
+from neuros.observe.run_record import consumed_percent
 
 _Cells = Callable[[Run], float | None]
 

@@ -19,8 +19,7 @@ from neuros.core.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.observe.load_table import FILE_NAME
 from neuros.observe.packets import FOLDER, Numbers, Packets, packet_figures, read_packets
-from neuros.observe.past_run import connection_of
-from neuros.observe.report import FORMAT
+from neuros.observe.run_record import FORMAT, connection_of
 from neuros.project.model import Connection
 
 
