@@ -14,7 +14,7 @@ from neuros.errors import RunError
 from neuros.observe.run_record import open_run, run_table
 
 if TYPE_CHECKING:
-    from neuros.observe.bag.opened import Bag
+    from neuros.observe.bag.bag_reader import Bag
 
 
 class Run:
@@ -109,7 +109,7 @@ class Run:
             UsageError: if nothing was recorded.
             EnvironmentFault: if the bag is damaged.
         """
-        from neuros.observe.bag.opened import open_bag
+        from neuros.observe.bag.bag_reader import open_bag
 
         return open_bag(self.folder)
 

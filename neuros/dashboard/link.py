@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import connect, encode_line
-from neuros.dashboard.figures import Figures
+from neuros.dashboard.live_metrics import LiveMetrics
 
 _MOST_WAITING = 100
 
@@ -206,7 +206,7 @@ class Link:
     def __init__(self, pages: Pages, names: tuple[str, ...], start_s: float) -> None:
         self._pages = pages
         self._names = set(names)
-        self._figures = Figures()
+        self._figures = LiveMetrics()
         self._answered: set[str] = set()
         self._has_answered = asyncio.Event()
         self._writer: asyncio.StreamWriter | None = None

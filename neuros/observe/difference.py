@@ -15,7 +15,7 @@ from neuros.project.model import Connection
 
 
 class Recordings(Protocol):
-    """Bags of runs (:class:`neuros.observe.recorded.Recorded`)."""
+    """Bags of runs (:class:`neuros.observe.recorded_packets.RecordedPackets`)."""
 
     def message(self, run: Path, connection: str, number: int) -> Any: ...
     def digests(self, run: Path, connection: str) -> Numbers | None: ...

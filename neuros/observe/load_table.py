@@ -121,7 +121,7 @@ class LoadTable:
 
 @dataclass
 class _Extremes:
-    """What a summary needs of any number of readings."""
+    """Sums and maxima of any number of readings."""
 
     count: int = 0
     percent_sum: float = 0.0

@@ -22,7 +22,7 @@ _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 
 
 class Ended(Protocol):
-    """How a run ended, as far as a record needs it."""
+    """Outcome of a run, as far as a record needs it."""
 
     exit_code: int
     reason: str
@@ -220,7 +220,7 @@ class PastRun:
 
     @cached_property
     def connections(self) -> dict[str, Mapping[str, Any]]:
-        """What ``run.json`` has of each connection, by ``a.out -> b.in``, in their order."""
+        """The figures of each connection, by ``a.out -> b.in``, in their order."""
         return {each["connection"]: each for each in self.record["connections"]}
 
     def connection(self, name: str) -> Connection:

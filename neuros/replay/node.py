@@ -15,7 +15,7 @@ from neuros.core.journal import is_whole
 from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec
-from neuros.observe.replayed import RecordedNode
+from neuros.observe.recorded_node import RecordedNode
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.comparison import Comparison
 from neuros.replay.debugging import is_quit

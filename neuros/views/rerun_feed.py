@@ -1,4 +1,4 @@
-"""Feeds a Rerun viewer with what is sampled of a run's packets."""
+"""Feed of a Rerun viewer with samples of a run's packets."""
 
 from __future__ import annotations
 

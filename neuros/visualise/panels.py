@@ -33,7 +33,7 @@ class Series:
             self._shorten()
 
     def shown(self, end_s: float) -> tuple[Array, list[Any]]:
-        """What lies in the shown time before ``end_s``."""
+        """Times and values of the shown time before ``end_s``."""
         times = np.array(self.times)
         if self._duration_s is None or not times.size:
             return times, self.values

@@ -57,7 +57,7 @@ class Canvas:
             ]
             try:
                 panel.draw(axes, end_s)
-            except Exception as error:  # whatever Matplotlib thinks of what a plugin has given
+            except Exception as error:  # of Matplotlib, about data that a plugin has given
                 faults.append(f"'{panel.title}' cannot be drawn: {error}")
                 for each in axes:
                     each.clear()

@@ -1,4 +1,4 @@
-"""What is shown of packets, told by their types."""
+"""Visual types of packets, by their message types."""
 
 from __future__ import annotations
 

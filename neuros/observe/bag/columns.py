@@ -29,7 +29,7 @@ _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 
 
 class Irregular(Exception):
-    """What has no such layout: sequences of messages or strings, wide strings, big-endian data."""
+    """Data without a layout: sequences of messages or strings, wide strings, big-endian data."""
 
 
 @dataclass
@@ -149,7 +149,7 @@ _MOST_LAYOUTS = 64
 
 
 class TypeStore(Protocol):
-    """What is needed of ``rosbags.typesys.store.Typestore``."""
+    """Part of ``rosbags.typesys.store.Typestore`` that is used here."""
 
     @property
     def fielddefs(self) -> Mapping[str, Any]: ...

@@ -71,7 +71,7 @@ class Definitions:
 
 
 def _file_of(type_name: str) -> Path | None:
-    """Where a message package is installed, so is its share folder, some folders further up."""
+    """The definition: the share folder is some folders above an installed message package."""
     try:
         spec = importlib.util.find_spec(type_name.split("/")[0])
     except (ImportError, ValueError):
@@ -130,7 +130,7 @@ class CheckedMcap(McapWriter):
 
     @property
     def pending_bytes(self) -> int:
-        """What waits for the next checkpoint."""
+        """Bytes that wait for the next checkpoint."""
         return self._new.tell() - self._new.start + self.chunk.bio.tell()
 
     def put(self, connection: int, log_ns: int, publish_ns: int, data: bytes) -> None:
@@ -268,7 +268,7 @@ class BagWriter(Writer):
 
     @property
     def pending_bytes(self) -> int:
-        """What the next checkpoint has to write."""
+        """Bytes that the next checkpoint has to write."""
         return int(cast(Any, self.storage).pending_bytes)
 
     def checkpoint(self) -> None:
@@ -294,7 +294,7 @@ class BagWriter(Writer):
 
 
 def _qos(topic: Topic) -> Qos:
-    """What the sender of a topic offers."""
+    """The quality of service that the sender of a topic offers."""
     latched = QosDurability.TRANSIENT_LOCAL
     return Qos(
         history=QosHistory.KEEP_LAST,

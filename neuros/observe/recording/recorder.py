@@ -133,7 +133,7 @@ class Recorder:
         forget_listened(self._run)
 
     def abandon(self) -> None:
-        """Leave bag and spools as they are."""
+        """Stop, and leave bag and spools unfinished."""
         self.bag.shut()
         for source in self._sources:
             source.reader.close(remove=False)

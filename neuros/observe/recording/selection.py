@@ -51,10 +51,10 @@ def plan_recording(
     is_alone: bool,
     custom: Mapping[str, str],
 ) -> RecordingPlan:
-    """What is recorded of a run of the nodes ``names``.
+    """Plan the recording of a run of the nodes ``names``.
 
     Args:
-        is_alone: nobody outside the run can publish in its domain, so there is no clock to hear.
+        is_alone: only the run can publish in its domain, so there is no clock to hear.
 
     Raises:
         UsageError: if something is asked for that does not exist.
@@ -136,7 +136,7 @@ def _external(names: Names, node: Node, *, is_output: bool) -> Iterator[_Place]:
 
 
 def _streams(places: Sequence[_Place], topics: Sequence[Topic]) -> dict[str, tuple[Stream, ...]]:
-    """Packets that pass a node in one and the same way are kept once, for all their topics."""
+    """Packets that pass a node in one way are kept once, for all their topics."""
     groups: dict[tuple[str, Way, str], list[int]] = {}
     for place in places:
         key = (place.node, place.way, place.name)

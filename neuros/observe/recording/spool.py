@@ -1,4 +1,4 @@
-"""A spool: the packets that one node keeps, on their way into the bag.
+"""Spool: the packets that one node keeps, on their way into the bag.
 
 Files, each appended to until it has some size: the recorder reads behind the writer and removes a
 file once all of it is safe in the bag. A packet is one ``write`` to the page cache: it costs 2 us,
@@ -43,7 +43,7 @@ class Record(NamedTuple):
 
 
 class ForwardClock:
-    """Wall time in nanoseconds that goes on evenly where somebody sets the clock back."""
+    """Wall time in nanoseconds that goes on evenly where the clock is set back."""
 
     def __init__(self) -> None:
         self._ahead_ns = time.time_ns() - time.monotonic_ns()
@@ -124,7 +124,7 @@ class SpoolWriter:
 
 
 def open_tap(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
-    """What keeps the packets of a node."""
+    """The spool of a node, for writing."""
     return SpoolWriter(run / node, plan.streams.get(node, ()))
 
 

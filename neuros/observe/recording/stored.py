@@ -59,7 +59,7 @@ class StoredTopics:
         self._places: dict[Path, dict[str, array[int]]] = {}
 
     def messages(self, topic: str) -> list[Stored]:
-        """Those of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
+        """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
         found: list[Stored] = []
         for path in sorted(self._folder.glob("*.mcap")):
             with open(path, "rb") as file:

@@ -57,7 +57,7 @@ _MOST_TICKS = 12
 
 
 def time_budget_figure(run: Run) -> Any | None:
-    """How each node divided its time; ``None`` if none has reported."""
+    """Time budgets of all nodes; ``None`` if none has reported."""
     budgets = run.time_budgets
     if not budgets:
         return None
@@ -79,7 +79,7 @@ def time_budget_figure(run: Run) -> Any | None:
 
 
 def counts_figure(run: Run) -> Any | None:
-    """What became of the packets of every connection."""
+    """Packets of every connection: consumed, unread, discarded, lost."""
     names = list(run.connections)[::-1]
     if not names:
         return None

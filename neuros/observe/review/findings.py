@@ -49,7 +49,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Gain:
-    """What leaving out discard limits would bring.
+    """Gain of a run without some discard limits.
 
     Attributes:
         connections: those that would have none.
@@ -62,7 +62,7 @@ class Gain:
 
 @dataclass(frozen=True)
 class Bottleneck:
-    """What limits the speed of a run.
+    """Node or loop that limits the speed of a run.
 
     Attributes:
         pacing: the node whose speed counts: it owns time, or else it was held up most.

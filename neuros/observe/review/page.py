@@ -42,7 +42,7 @@ img { max-width: 100%; height: auto }
 .table { overflow-x: auto }
 table { border-collapse: collapse; font-size: .88rem }
 th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #DDD }
-th:first-child, td:first-child, .words td { text-align: left }
+th:first-child, td:first-child, .text td { text-align: left }
 code { background: #F0F0F0; padding: .1rem .3rem; overflow-wrap: anywhere }
 </style>
 </head>
@@ -95,7 +95,7 @@ def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
 def table_part(
     title: str, header: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "numbers"
 ) -> str:
-    """A table under a heading; of ``kind`` ``numbers`` or ``words``, by which it is aligned."""
+    """A table under a heading; aligned for its ``kind``, ``numbers`` or ``text``."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join(
         f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
@@ -178,7 +178,7 @@ def _provenance(run: Run) -> str:
         "command": shlex.join(record.get("command", ())),
     }
     rows = [[key, str(value)] for key, value in cells.items() if value]
-    return table_part("Where it comes from", ["", ""], rows, "words")
+    return table_part("Where it comes from", ["", ""], rows, "text")
 
 
 def _machine(machine: Mapping[str, Any]) -> str:

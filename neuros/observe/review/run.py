@@ -25,7 +25,7 @@ from neuros.project.model import Connection
 
 @dataclass(frozen=True)
 class Run:
-    """What is known about a run.
+    """Run folder that is open for review.
 
     Attributes:
         record: ``run.json``, or as much of it as the project and the packet lists give.
@@ -42,7 +42,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """What a heading calls it."""
+        """Name for headings."""
         return f"{self.record.get('project', '?')} ({self.folder.name})"
 
     @property
@@ -68,7 +68,7 @@ class Run:
 
     @cached_property
     def time_budgets(self) -> dict[str, TimeBudget]:
-        """How each node that has reported spent its time."""
+        """Time budget of each node that has reported."""
         found = {name: time_budget_of(node, self.running_s) for name, node in self.nodes.items()}
         return {name: spent for name, spent in found.items() if spent is not None}
 
@@ -124,7 +124,7 @@ def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """What the launcher wrote before the run, and the nodes during it."""
+    """A record from files that were written before and during the run."""
     if not (folder / "project.json").is_file():
         raise UsageError(f"{folder} has no run.json: it is no folder that a run has left behind")
     project = _json(folder / "project.json")

@@ -1,4 +1,4 @@
-"""Figures of the page, from counters of nodes: rates, shares, latencies, losses."""
+"""Live metrics of the page, from counters of nodes: rates, shares, latencies, losses."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Loss:
             self._missing.popleft()
 
     def _sent_by(self, then_s: float) -> float | None:
-        """How many had been sent then, as far as that is known."""
+        """The count of packets sent by then, if known."""
         for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
             if a_s <= then_s <= b_s:
                 return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
@@ -116,8 +116,8 @@ class Loss:
         return self._sent[-1][1] if is_since else None
 
 
-class Figures:
-    """Figures of all nodes and connections, with as much of the past as they need.
+class LiveMetrics:
+    """Live metrics of all nodes and connections, with as much of the past as they need.
 
     Attributes:
         nodes, connections: by name, ready for JSON.

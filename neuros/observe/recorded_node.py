@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import UsageError
-from neuros.observe.bag.opened import Bag, open_bag
+from neuros.observe.bag.bag_reader import Bag, open_bag
 from neuros.observe.packets import FOLDER, read_packets
 from neuros.observe.recording.plan import RecordingPlan, load_plan
 from neuros.observe.run_record import PastRun, open_run
@@ -80,7 +80,7 @@ class RecordedNode:
         return arrivals.packet(number)
 
     def sent(self) -> dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]]:
-        """What it sent: by way and port or connection, the topics with name, type and packets.
+        """Packets sent: by way and port or connection, the topics with name, type and packets.
 
         A topic is called by its connection, if it belongs to one.
         """

@@ -11,7 +11,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from neuros.errors import NeurosError
-from neuros.observe.bag.opened import Bag, RecordedTopic, open_bag
+from neuros.observe.bag.bag_reader import Bag, RecordedTopic, open_bag
 from neuros.observe.packets import Numbers
 from neuros.observe.recording.plan import PLAN_NAME
 from neuros.observe.recording.stored import stored_messages
@@ -20,7 +20,7 @@ _LARGE_BYTES = 64 * 1024
 """The buffers of larger messages travel beside them, and nodes digest them apart."""
 
 
-class Recorded:
+class RecordedPackets:
     """Bags of runs.
 
     Attributes:

@@ -166,7 +166,7 @@ class Bag:
 
     @property
     def damage(self) -> str | None:
-        """What is missing, in a sentence."""
+        """The missing packets, in a sentence."""
         if not self.missing:
             return None
         topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
