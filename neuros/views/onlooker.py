@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines, connect
-from neuros.views.visual_types import Mark, Source
+from neuros.views.visual_types import Mark, VisualTypes
 
 _PERIOD_S = 0.2
 
 
 def look_on(
     run: Path,
-    sources: Mapping[str, tuple[str, str, Source]],
+    sources: Mapping[str, tuple[str, str, VisualTypes]],
     show: Callable[[str, float, Sequence[Mark]], None],
 ) -> None:
     """Ask for samples of packets until the run is over.
@@ -53,7 +53,7 @@ def look_on(
                     show(name, now_s - begin_s, list(sources[name][2].marks(sample)))
 
 
-def _ask(lines: Lines, sources: Mapping[str, tuple[str, str, Source]]) -> None:
+def _ask(lines: Lines, sources: Mapping[str, tuple[str, str, VisualTypes]]) -> None:
     wanted: dict[str, dict[str, Any]] = {}
     for node, port, source in sources.values():
         wanted.setdefault(node, {})[port] = source.wanted()

@@ -78,7 +78,7 @@ class Picture:
 Mark = Pose | Points | Numbers | Picture
 
 
-class Source:
+class VisualTypes:
     """Visual types of one output or external input."""
 
     def __init__(self, type_name: str) -> None:
