@@ -67,7 +67,7 @@ class Recorder:
         for topic in plan.topics:
             self.number_of(topic)
         self._sources = [
-            _Source(
+            _SpoolSource(
                 SpoolReader(run / node),
                 [
                     self._numbers(plan.topics[place] for place in stream.topics)
@@ -77,7 +77,7 @@ class Recorder:
             )
             for node, streams in plan.streams.items()
         ]
-        self._listener = _Source(SpoolReader(run / LISTENER), [], owns_time=False)
+        self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
         self._sources.append(self._listener)
         self._held: list[_Kept] = []
         self._wall_clock = ForwardClock()
@@ -211,7 +211,7 @@ class Recorder:
         return tuple(number for number in numbers if number is not None)
 
 
-class _Source:
+class _SpoolSource:
     """A spool, and the topics of its streams."""
 
     def __init__(
