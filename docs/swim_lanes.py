@@ -15,9 +15,9 @@ import tempfile
 from pathlib import Path
 
 import neuros
-from neuros.observe.review.lanes import lanes_figure
 from neuros.observe.review.page import png
 from neuros.observe.review.run import open_for_review
+from neuros.observe.review.timeline import timeline_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
@@ -48,7 +48,7 @@ def draw(name: str, folder: Path) -> None:
         output=folder,
         check=True,
     )
-    figure = lanes_figure(open_for_review(folder))
+    figure = timeline_figure(open_for_review(folder))
     assert figure is not None
     (FIGURES / f"swim_lanes_{name}.png").write_bytes(png(figure))
 

@@ -17,7 +17,7 @@ from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.published import VOTING
 from benchmarks.reproduce.tables import Layout, Ours, Remark
 from neuros.observe.packets import read_packets
-from neuros.observe.past_run import open_run
+from neuros.observe.run_record import open_run
 
 PROJECT = ROOT / "examples" / "2_synchronisation" / "voting"
 THINK_S = 5.0

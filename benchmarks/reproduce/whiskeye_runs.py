@@ -25,7 +25,7 @@ from benchmarks.reproduce.packets import (
 )
 from benchmarks.subjects.whiskeye import IMU, WHISKEYE
 from neuros.observe.packets import read_packets
-from neuros.observe.past_run import open_run
+from neuros.observe.run_record import open_run
 
 FILES = {
     "tick_20ms": "tick_20ms.json",

@@ -30,7 +30,7 @@ from neuros.launch.sides import Sides
 from neuros.launch.supervisor import Supervisor
 from neuros.observe.budgets import broken_budgets, losses
 from neuros.observe.recording.plan import RecordingPlan
-from neuros.observe.report import run_record, run_table
+from neuros.observe.run_record import run_record, run_table
 from neuros.runtime.side import ELSEWHERE_VARIABLE
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5

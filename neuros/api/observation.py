@@ -14,7 +14,7 @@ from neuros.launch.run_processes import RUN_ID
 from neuros.project.model import Project
 
 if TYPE_CHECKING:
-    from neuros.observe.monitor import LoadMonitor
+    from neuros.observe.load import LoadMonitor
 
 HOST = "host"
 """The columns of all nodes together, where they share a process."""
@@ -78,9 +78,8 @@ class Observation:
 def _monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
-    from neuros.observe.load import LAUNCHER, LoadMeter
+    from neuros.observe.load import LAUNCHER, LoadMeter, LoadMonitor
     from neuros.observe.load_table import LoadTable
-    from neuros.observe.monitor import LoadMonitor
 
     groups = [HOST] if is_one_process else list(names)
     table = LoadTable([*groups, LAUNCHER], os.cpu_count() or 1)

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.api.frames import frame_of
 from neuros.errors import RunError
-from neuros.observe.past_run import open_run
-from neuros.observe.report import run_table
+from neuros.observe.run_record import open_run, run_table
 
 if TYPE_CHECKING:
-    from neuros.observe.bag.opened import Bag
+    from neuros.observe.bag.bag_reader import Bag
 
 
 class Run:
@@ -110,7 +109,7 @@ class Run:
             UsageError: if nothing was recorded.
             EnvironmentFault: if the bag is damaged.
         """
-        from neuros.observe.bag.opened import open_bag
+        from neuros.observe.bag.bag_reader import open_bag
 
         return open_bag(self.folder)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.run import Run
-from neuros.observe.report import consumed_percent
+from neuros.observe.run_record import consumed_percent
 
 CSV_NAME = "sweep.csv"
 _REASON_CHARACTERS = 50

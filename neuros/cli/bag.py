@@ -32,7 +32,7 @@ def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def _info(options: argparse.Namespace) -> int:
     from tabulate import tabulate
 
-    from neuros.observe.bag.opened import open_bag
+    from neuros.observe.bag.bag_reader import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]

@@ -106,8 +106,7 @@ def _is_looked_at(listening: socket.socket) -> bool:
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
     from neuros.api.observation import owner_of_processes
     from neuros.dashboard.server import Sources
-    from neuros.observe.load import LAUNCHER, LoadMeter
-    from neuros.observe.load_now import LoadNow
+    from neuros.observe.load import LAUNCHER, LoadMeter, LoadNow
 
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
     load_now = LoadNow(LoadMeter(owner))

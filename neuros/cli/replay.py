@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from neuros.errors import UsageError
 
 if TYPE_CHECKING:
-    from neuros.observe.bag.opened import RecordedTopic
+    from neuros.observe.bag.bag_reader import RecordedTopic
 
 
 def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -108,7 +108,7 @@ def _replay(options: argparse.Namespace) -> int:
     if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
         raise UsageError("replay: --rate must be above 0, --delay and -w not below")
     from neuros.cli.messages import find_messages_of
-    from neuros.observe.bag.opened import open_bag
+    from neuros.observe.bag.bag_reader import open_bag
     from neuros.transport.playing import PlayedTopic, play
 
     find_messages_of(Path(options.run))

@@ -24,7 +24,7 @@ from neuros.project.model import NodeFile
 
 if TYPE_CHECKING:
     from neuros.hooks import HookSpec
-    from neuros.observe.past_run import PastRun
+    from neuros.observe.run_record import PastRun
     from neuros.replay.node import ReplayedNode
 
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
@@ -40,7 +40,7 @@ def replay_node(options: argparse.Namespace) -> int:
     from neuros.api.workspace import WORKSPACE
     from neuros.cli.messages import require_messages
     from neuros.messages.cache import message_cache
-    from neuros.observe.replayed import RecordedNode, recorded_node
+    from neuros.observe.recorded_node import RecordedNode, recorded_node
     from neuros.replay.containers import as_on_this_machine, ran_in_container
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
@@ -85,9 +85,9 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
 
 def run_replayed(options: argparse.Namespace) -> int:
     """The process that :func:`replay_node` becomes."""
-    from neuros.observe.past_run import open_run
     from neuros.observe.provenance import python_versions
-    from neuros.observe.replayed import RecordedNode
+    from neuros.observe.recorded_node import RecordedNode
+    from neuros.observe.run_record import open_run
     from neuros.project.split import node_file_from_json
     from neuros.replay.containers import note_on_versions, ran_in_container
     from neuros.replay.debugging import debugpy_on

@@ -44,9 +44,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _report(options: argparse.Namespace) -> int:
+    from neuros.observe.review.findings import findings_of
     from neuros.observe.review.page import report_page
     from neuros.observe.review.run import open_for_review
-    from neuros.observe.review.words import findings_of
 
     run = open_for_review(options.run)
     findings = findings_of(run)
@@ -67,7 +67,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.observe.review.gallery import figures_of
+    from neuros.observe.review.page import figures_of
 
     try:
         return figures_of(run)
@@ -109,8 +109,8 @@ def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
 
 def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> bytes:
     from neuros.observe.review.comparison import comparison_figure, labels_of
+    from neuros.observe.review.findings import findings_of
     from neuros.observe.review.page import bottleneck_part, figure_part, page, png, table_part
-    from neuros.observe.review.words import findings_of
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")

@@ -24,11 +24,11 @@ def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def _verify(options: argparse.Namespace) -> int:
     from neuros.observe.difference import compare
-    from neuros.observe.past_run import open_run
-    from neuros.observe.recorded import Recorded
+    from neuros.observe.recorded_packets import RecordedPackets
+    from neuros.observe.run_record import open_run
 
     a, b = open_run(options.run_a), open_run(options.run_b)
-    recorded = Recorded()
+    recorded = RecordedPackets()
     verdict = compare(a, b, recorded)
     for remark in (*recorded.remarks, *verdict.remarks):
         print(f"note: {remark}")

@@ -168,11 +168,12 @@ def _run_view(options: argparse.Namespace) -> int:
     from neuros.launch.rerun import await_server
     from neuros.views.onlooker import look_on
     from neuros.views.rerun_feed import RerunFeed
-    from neuros.views.scene import Source
+    from neuros.views.visual_types import VisualTypes
 
     told = json.loads(sys.stdin.readline())
     sources = {
-        each["name"]: (each["node"], each["port"], Source(each["type"])) for each in told["sources"]
+        each["name"]: (each["node"], each["port"], VisualTypes(each["type"]))
+        for each in told["sources"]
     }
     await_server(told["url"])
     _open(told["url"])

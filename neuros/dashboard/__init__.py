@@ -1,1 +1,1 @@
-"""A page in the browser that shows a run while it goes on."""
+"""Dashboard: a page in the browser that shows a run while it goes on."""

@@ -1,4 +1,4 @@
-"""What the page is told of a project: its nodes, connections, and what of it can be looked at."""
+"""Project as the page gets it: nodes, connections, topics, and ports that can be sampled."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _topics(project: Project) -> Iterable[dict[str, Any]]:
 
 
 def _sources(node: Node, names: Names) -> Iterable[dict[str, Any]]:
-    """What packets of this node can be sampled: those of its outputs and external inputs."""
+    """Ports whose packets can be sampled: outputs and external inputs."""
     for port in node.outputs:
         yield _source(node, port, port.name, port.name)
     for port in node.inputs:

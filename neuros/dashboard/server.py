@@ -1,4 +1,4 @@
-"""The web server of a run: a page, a stream of events, and a few requests.
+"""Web server of a run: a page, a stream of events, and a few requests.
 
 ======== ============= ===========================================================
 method   path          what it does
@@ -18,24 +18,33 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import urlencode, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import URL
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import (
+    FileResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+    StreamingResponse,
+)
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from neuros.dashboard.access import Access
-from neuros.dashboard.link import Link
-from neuros.dashboard.pages import Pages, wanted_of
+from neuros.dashboard.link import Link, Pages, wanted_of
 
 STATIC = Path(__file__).parent / "static"
 _LOG_S = 0.2
@@ -64,7 +73,7 @@ class LogSource(Protocol):
 
 @dataclass(frozen=True)
 class Sources:
-    """What is read on this machine while somebody looks.
+    """Readings of this machine while a page is open.
 
     Attributes:
         open_log: begins to read the logs, with the last lines that there are.
@@ -197,3 +206,57 @@ class Dashboard:
             await self._pages.are_watched.wait()
             self._pages.send("load", await asyncio.to_thread(self._sources.load))
             await asyncio.sleep(_LOAD_S)
+
+
+_LOCAL_NAMES = {"127.0.0.1", "localhost", "[::1]", "::1"}
+
+
+class Access:
+    """ASGI middleware that lets only the user's own browser through: it has the printed token.
+
+    The server listens on 127.0.0.1 only, but other users of the machine, and any page that the
+    user's browser shows, can reach that, too. So every request needs the token: once in the URL,
+    from then on in a cookie that no script can read. A request that a page of another origin has
+    made is refused, and so is one under another name for this machine (DNS rebinding).
+
+    Args:
+        run: the run's id, for the name of the cookie: cookies do not tell ports apart.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, run: str) -> None:
+        self._app = app
+        self._token = token
+        self._cookie = f"neuros_{run[:8]}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope, receive)
+        answer = self._refusal(request) or self._welcome(request)
+        await (answer or self._app)(scope, receive, send)
+
+    def _refusal(self, request: Request) -> Response | None:
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
+            return PlainTextResponse("this dashboard answers to localhost only", 403)
+        if origin is not None and urlsplit(origin).netloc != host:
+            return PlainTextResponse("another page may not speak for this one", 403)
+        given = request.query_params.get("token") or request.cookies.get(self._cookie, "")
+        if not secrets.compare_digest(given.encode(), self._token.encode()):
+            return PlainTextResponse(
+                "wrong or missing token: open the whole address that NeuROS printed,"
+                " http://127.0.0.1:.../?token=...",
+                403,
+            )
+        return None
+
+    def _welcome(self, request: Request) -> Response | None:
+        """Move the token from the address, which others may see, into a cookie."""
+        if "token" not in request.query_params:
+            return None
+        rest = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]
+        url = URL(request.url.path).replace(query=urlencode(rest))
+        answer = RedirectResponse(str(url), 303)
+        answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
+        return answer

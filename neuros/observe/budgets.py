@@ -1,4 +1,4 @@
-"""Whether a run has kept what it promises: lossless connections, and its project's budgets."""
+"""Check of a run's record: lossless connections, and the budgets of its project."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def losses(record: Mapping[str, Any]) -> list[str]:
 
 
 def _unknown(sent: int | None, received: int | None) -> str:
-    """What is not known where the count of lost packets is not."""
+    """Say which count is missing for that of lost packets."""
     if sent is None:
         return "how many packets were sent is not known"
     if received is None:

@@ -1,4 +1,4 @@
-"""Whether two runs carried the same packets, and if not, where they parted."""
+"""Comparison of the packets of two runs, up to the first difference."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from neuros.observe.packets import Numbers, Packets, read_packets
-from neuros.observe.past_run import PastRun
+from neuros.observe.run_record import PastRun
 from neuros.project.model import Connection
 
 
 class Recordings(Protocol):
-    """What runs have recorded (:class:`neuros.observe.recorded.Recorded`)."""
+    """Bags of runs (:class:`neuros.observe.recorded_packets.RecordedPackets`)."""
 
     def message(self, run: Path, connection: str, number: int) -> Any: ...
     def digests(self, run: Path, connection: str) -> Numbers | None: ...
@@ -24,7 +24,7 @@ class Recordings(Protocol):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a comparison has shown.
+    """Result of a comparison.
 
     Attributes:
         difference: where the runs parted first, in a sentence; ``None`` if they are identical.
@@ -203,7 +203,7 @@ def _first_difference(a: Numbers, b: Numbers) -> int:
 def differing_fields(
     a: Any, b: Any, name: str = "", sides: tuple[str, str] = ("A", "B")
 ) -> Iterator[str]:
-    """What differs between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
+    """Differences between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
     fields = getattr(a, "__dataclass_fields__", None)
     if fields:
         for field in fields:

@@ -1,4 +1,4 @@
-"""What a run takes of its machine: processor, memory and threads of its processes, by node.
+"""Load of a run by node: processor, memory and threads, for its record and for the dashboard.
 
 Which processes are a node's is told by the environment that they were started with, which their
 own children inherit, wherever they run: in a process, in a container (its processes are visible on
@@ -8,51 +8,28 @@ Each process of the machine is looked at when it is new; after that, only those 
 
 from __future__ import annotations
 
+import csv
 import os
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
 
 import psutil
 
+from neuros.observe.load_table import FILE_NAME, GroupLoad, LoadTable, MachineLoad
+
 LAUNCHER = "launcher"
-"""The group of the launcher itself, its guardian, and whatever else it starts."""
+"""The group of the launcher itself, its guardian, and all else that it starts."""
+
+PERIOD_S = 1.0
 
 # A process that is just being started has still the environment of who starts it.
 _LOOKS = 3
 
 Owner = Callable[[Mapping[str, str]], str | None]
 """From the environment of a process to its group, ``None`` if it does not belong to the run."""
-
-
-@dataclass(frozen=True)
-class GroupLoad:
-    """What the processes of one node take now.
-
-    Attributes:
-        cpu_s: processor time since they exist, that of children that have ended included.
-        memory_bytes: resident memory; what processes share counts in each of them.
-    """
-
-    cpu_s: float
-    memory_bytes: int
-    threads: int
-
-
-@dataclass(frozen=True)
-class MachineLoad:
-    """What the whole machine does now.
-
-    Attributes:
-        core_percent: by core, since the last time.
-        network_sent_bytes, network_received_bytes: of all interfaces together, the loopback too,
-            since the machine was started.
-    """
-
-    core_percent: tuple[float, ...]
-    memory_used_bytes: int
-    memory_percent: float
-    network_sent_bytes: int
-    network_received_bytes: int
 
 
 class LoadMeter:
@@ -144,3 +121,95 @@ def _sum(loads: Sequence[GroupLoad]) -> GroupLoad:
         sum(load.memory_bytes for load in loads),
         sum(load.threads for load in loads),
     )
+
+
+class Meter(Protocol):
+    """Source of readings, as :class:`LoadMeter`."""
+
+    def machine(self) -> MachineLoad: ...
+    def groups(self) -> Mapping[str, GroupLoad]: ...
+
+
+class LoadNow:
+    """Load since the last call.
+
+    Args:
+        clock: monotonic, seconds.
+    """
+
+    def __init__(self, meter: Meter, clock: Callable[[], float] = time.monotonic) -> None:
+        self._meter = meter
+        self._clock = clock
+        self._before: dict[str, float] = {}
+        self._before_s = clock()
+
+    def __call__(self) -> dict[str, Any]:
+        """Percent of a core, bytes and threads, of the machine and by group; JSON-serialisable."""
+        machine, groups, now_s = self._meter.machine(), self._meter.groups(), self._clock()
+        passed_s = max(now_s - self._before_s, 1e-6)
+        shown = {
+            name: {
+                "cpu_percent": 100.0
+                * max(0.0, load.cpu_s - self._before.get(name, load.cpu_s))
+                / passed_s,
+                "memory_bytes": load.memory_bytes,
+                "threads": load.threads,
+            }
+            for name, load in groups.items()
+        }
+        self._before, self._before_s = {n: g.cpu_s for n, g in groups.items()}, now_s
+        return {
+            "cores": list(machine.core_percent),
+            "memory_percent": machine.memory_percent,
+            "memory_used_bytes": machine.memory_used_bytes,
+            "groups": shown,
+        }
+
+
+class LoadMonitor(threading.Thread):
+    """Writes ``system_load.csv`` in a run folder until :meth:`stop`.
+
+    Attributes:
+        failure: why nothing more is written, ``None`` while all is well.
+    """
+
+    def __init__(
+        self, folder: Path, meter: Meter, table: LoadTable, period_s: float = PERIOD_S
+    ) -> None:
+        super().__init__(name="neuros-monitor", daemon=True)
+        self._path = folder / FILE_NAME
+        self._meter = meter
+        self._table = table
+        self._period_s = period_s
+        self._ended = threading.Event()
+        self.failure: str | None = None
+
+    def run(self) -> None:
+        """Write rows until the end, or until there is no room for them."""
+        try:
+            with open(self._path, "w", newline="", encoding="utf-8") as file:
+                self._write(csv.writer(file), file.flush)
+        except OSError as error:
+            self.failure = (
+                f"{self._path} could not be written to ({error.strerror}): the system load was not"
+                " recorded to the end"
+            )
+
+    def stop(self) -> dict[str, Any]:
+        """Write no further row; returns the summary."""
+        self._ended.set()
+        self.join()
+        return self._table.summary()
+
+    def _write(self, writer: Any, flush: Callable[[], None]) -> None:
+        writer.writerow(self._table.header)
+        flush()
+        start_s = time.monotonic()
+        self._table.begin(start_s, self._meter.machine(), self._meter.groups())
+        due_s = start_s + self._period_s
+        while not self._ended.wait(max(0.0, due_s - time.monotonic())):
+            now_s = time.monotonic()
+            cells = self._table.row(now_s, self._meter.machine(), self._meter.groups())
+            writer.writerow([f"{now_s - start_s:.3f}", f"{time.time():.3f}", *cells])
+            flush()
+            due_s = max(due_s + self._period_s, now_s)

@@ -1,17 +1,45 @@
-"""The rows of ``system_load.csv``, and what they come to."""
+"""Rows of ``system_load.csv``: load of the machine and of each node, and their summary."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from neuros.observe.load import GroupLoad, MachineLoad
+from typing import Any
 
 FILE_NAME = "system_load.csv"
 
 _GROUP_COLUMNS = ("cpu_percent", "memory_bytes", "threads")
+
+
+@dataclass(frozen=True)
+class GroupLoad:
+    """Load of the processes of one node.
+
+    Attributes:
+        cpu_s: processor time since they exist, that of children that have ended included.
+        memory_bytes: resident memory; what processes share counts in each of them.
+    """
+
+    cpu_s: float
+    memory_bytes: int
+    threads: int
+
+
+@dataclass(frozen=True)
+class MachineLoad:
+    """Load of the whole machine.
+
+    Attributes:
+        core_percent: by core, since the last time.
+        network_sent_bytes, network_received_bytes: of all interfaces together, the loopback too,
+            since the machine was started.
+    """
+
+    core_percent: tuple[float, ...]
+    memory_used_bytes: int
+    memory_percent: float
+    network_sent_bytes: int
+    network_received_bytes: int
 
 
 class LoadTable:
@@ -93,7 +121,7 @@ class LoadTable:
 
 @dataclass
 class _Extremes:
-    """What a summary needs of any number of readings."""
+    """Sums and maxima of any number of readings."""
 
     count: int = 0
     percent_sum: float = 0.0

@@ -1,4 +1,4 @@
-"""The packets of a run as its nodes have listed them: when, which, and how long they took.
+"""Packet lists of a run: times, digests and latencies, as its nodes have written them.
 
 Reads what :mod:`neuros.runtime.packet_log` writes. Both ends' times are of the monotonic clock
 of one machine, which all its processes share; the two ends of a connection on different machines

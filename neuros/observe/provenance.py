@@ -1,4 +1,4 @@
-"""What a run was made of: versions, machine, seeds, command line, and the state of the project."""
+"""Provenance of a run: versions, machine, seeds, command line, and the state of the project."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
 
 
 class GitState:
-    """Which commit a folder is at. Asked in the background, so that nobody waits for git.
+    """Commit of a folder, asked for in the background, so that the start does not wait for git.
 
     Reads the state from when it is made.
     """

@@ -9,7 +9,7 @@ from typing import Any
 
 from neuros.errors import EnvironmentFault, NeurosError
 from neuros.launch.docker.layout import outside
-from neuros.observe.past_run import PastRun
+from neuros.observe.run_record import PastRun
 from neuros.project.model import Folders, NodeFile
 
 _FEW = 5

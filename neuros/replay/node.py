@@ -17,7 +17,7 @@ from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted,
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec
 from neuros.observe.difference import differing_fields
-from neuros.observe.replayed import RecordedNode
+from neuros.observe.recorded_node import RecordedNode
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.debugging import is_quit

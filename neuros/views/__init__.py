@@ -1,1 +1,1 @@
-"""What is seen of a project in other people's viewers: RViz and Rerun."""
+"""Viewers of other projects: RViz and Rerun."""

@@ -1,4 +1,4 @@
-"""An onlooker of a run that shows what it sees in a viewer."""
+"""Onlooker of a run that shows packets in a viewer."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines, connect
-from neuros.views.scene import Mark, Source
+from neuros.views.visual_types import Mark, VisualTypes
 
 _PERIOD_S = 0.2
 
 
 def look_on(
     run: Path,
-    sources: Mapping[str, tuple[str, str, Source]],
+    sources: Mapping[str, tuple[str, str, VisualTypes]],
     show: Callable[[str, float, Sequence[Mark]], None],
 ) -> None:
-    """Ask again and again what passes, until the run is over.
+    """Ask for samples of packets until the run is over.
 
     Args:
         sources: by name, the node and the port, and what is shown of it.
@@ -53,7 +53,7 @@ def look_on(
                     show(name, now_s - begin_s, list(sources[name][2].marks(sample)))
 
 
-def _ask(lines: Lines, sources: Mapping[str, tuple[str, str, Source]]) -> None:
+def _ask(lines: Lines, sources: Mapping[str, tuple[str, str, VisualTypes]]) -> None:
     wanted: dict[str, dict[str, Any]] = {}
     for node, port, source in sources.values():
         wanted.setdefault(node, {})[port] = source.wanted()

@@ -1,4 +1,4 @@
-"""Feeds a Rerun viewer with what is sampled of a run's packets."""
+"""Feed of a Rerun viewer with samples of a run's packets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from neuros.views.scene import Mark, Numbers, Picture, Points, Pose, Source
+from neuros.views.visual_types import Mark, Numbers, Picture, Points, Pose, VisualTypes
 
 _TIMELINE = "time"
 _TRAIL = 1000
@@ -36,7 +36,7 @@ class RerunFeed:
         sources: by ``node.port``.
     """
 
-    def __init__(self, project: str, url: str, sources: Mapping[str, Source]) -> None:
+    def __init__(self, project: str, url: str, sources: Mapping[str, VisualTypes]) -> None:
         self._trails: dict[str, deque[tuple[float, ...]]] = {}
         self._recording = rr.RecordingStream(f"neuros_{project}")
         self._recording.connect_grpc(url, default_blueprint=_blueprint(sources))
@@ -91,7 +91,7 @@ def _image(image: Mapping[str, Any]) -> Any:
     return rr.DepthImage(pixels) if pixels.dtype == np.uint16 else rr.Image(pixels)
 
 
-def _blueprint(sources: Mapping[str, Source]) -> Any:
+def _blueprint(sources: Mapping[str, VisualTypes]) -> Any:
     """The world to the left, images and curves to the right; what there is not is left out."""
     left: list[Any] = []
     if any(source.is_in_space for source in sources.values()):

@@ -1,4 +1,4 @@
-"""The configuration of RViz for a project: a display for each connection that it can show.
+"""Configuration of RViz for a project: a display for each connection that it can show.
 
 The file is JSON, which is YAML, too.
 """

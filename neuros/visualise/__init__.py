@@ -1,4 +1,4 @@
-"""Figures for plugins: fed by hooks, drawn by a process of their own.
+"""Figures for plugins: fed by hooks, drawn by a separate process.
 
 ::
 

@@ -1,4 +1,4 @@
-"""From hooks to the process that draws: what it cannot take now is kept, and in the end left out.
+"""Feed of the drawing process: messages that it cannot take now are kept, and left out at last.
 
 No thread, and nothing that waits: a message goes into the socket as far as it takes it, the rest
 with the next one.

@@ -1,4 +1,4 @@
-"""The figures that plugins make. Nothing here draws, and Matplotlib is not imported."""
+"""Figures that plugins make and feed; their process draws, so Matplotlib is not imported here."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from neuros.errors import EnvironmentFault
-from neuros.visualise.angles import wrapped, yaw_of
 from neuros.visualise.feed import Feed, is_drawn
-from neuros.visualise.pixels import small_pixels
 
+_LARGEST_SIDE = 320
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
 
 
 class _Figure:
-    """What all figures have.
+    """Common part of all figures.
 
     Args:
         title: of the figure; its file is named after it, with a number where that is taken.
@@ -173,10 +173,10 @@ class VisualiseRotations(_Figure):
         self._check(line_name)
         kind = self._kinds[line_name]
         if kind == "quaternion":
-            angle_rad = yaw_of(orientation)
+            angle_rad = _yaw_of(orientation)
         else:
             angle_rad = math.radians(orientation) if kind == "degrees" else float(orientation)
-        self._send(line_name, float(timestamp), wrapped(angle_rad))
+        self._send(line_name, float(timestamp), _wrapped(angle_rad))
 
 
 class VisualiseImages(_Figure):
@@ -206,7 +206,7 @@ class VisualiseImages(_Figure):
             ValueError: for another encoding or shape.
         """
         self._check(name)
-        message = ("data", self._number, name, timestamp, small_pixels(image))
+        message = ("data", self._number, name, timestamp, _small_pixels(image))
         self._feed.send_latest(f"{self._number} {name}", message)
 
 
@@ -256,9 +256,59 @@ class VisualiseRing(_Figure):
 
 
 def _file_for(title: str) -> Path:
-    """Where no other figure of this process is saved."""
+    """A file in which no other figure of this process is saved."""
     folder = Path(os.environ.get("NEUROS_RUN_DIR") or ".").absolute()
     stem = re.sub(r"[\W_]+", "_", title).strip("_").lower()[:_LONGEST_STEM] or "figure"
     numbered = (f"{stem}_{number}" for number in itertools.count(2))
     names = itertools.chain([stem], numbered)
     return next(file for name in names if not is_drawn(file := folder / f"{name}.png"))
+
+
+def _small_pixels(image: Any) -> Any:
+    """Every n-th pixel of a ``sensor_msgs/msg/Image`` or array; red comes first.
+
+    Raises:
+        ValueError: for an encoding or shape that cannot be drawn.
+    """
+    pixels = _pixels(image)
+    step = max(1, math.ceil(max(pixels.shape[:2]) / _LARGEST_SIDE))
+    return np.ascontiguousarray(pixels[::step, ::step])
+
+
+def _pixels(image: Any) -> Any:
+    encoding = getattr(image, "encoding", None)
+    if encoding is None:
+        pixels = np.asarray(image)
+        if pixels.size and (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)):
+            return pixels
+        raise ValueError(
+            f"an image has shape (height, width) or (height, width, 3): {pixels.shape}"
+        )
+    if encoding not in _CHANNELS:
+        raise ValueError(f"images with encoding {encoding} cannot be drawn: rgb8, bgr8, mono8 can")
+    channels, height, width = _CHANNELS[encoding], image.height, image.width
+    data = np.frombuffer(image.data, np.uint8)
+    step = image.step or width * channels
+    if not (width and height) or step < width * channels or len(data) < step * height:
+        raise ValueError(f"{len(data)} bytes are no image of {width} x {height}, {step} per row")
+    rows = data[: step * height].reshape(height, step)
+    if encoding == "mono8":
+        return rows[:, :width]
+    pixels = rows[:, : channels * width].reshape(height, width, channels)
+    return pixels if encoding == "rgb8" else pixels[..., ::-1]
+
+
+def _yaw_of(orientation: Any) -> float:
+    """Rotation about the vertical in radians, (-pi, pi], of a unit quaternion.
+
+    ``orientation``: anything with ``x``, ``y``, ``z``, ``w``, such as
+    ``geometry_msgs/msg/Quaternion``.
+    """
+    q = orientation
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def _wrapped(angle_rad: float) -> float:
+    """An angle in (-pi, pi]."""
+    remainder = math.remainder(angle_rad, math.tau)
+    return math.pi if remainder == -math.pi else remainder

@@ -1,4 +1,4 @@
-"""The parts of a figure: they keep what is to be shown, and draw it when they are asked to."""
+"""Panels of a figure: lines, angles, images, spikes, rings; each keeps its data and draws it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from neuros.visualise.angles import Array, broken_at_wraps, population_vector
+Array = npt.NDArray[np.float64]
 
 _MOST_POINTS = 20_000
 _RING_COLUMNS = 600
@@ -32,7 +33,7 @@ class Series:
             self._shorten()
 
     def shown(self, end_s: float) -> tuple[Array, list[Any]]:
-        """What lies in the shown time before ``end_s``."""
+        """Times and values of the shown time before ``end_s``."""
         times = np.array(self.times)
         if self._duration_s is None or not times.size:
             return times, self.values
@@ -152,7 +153,7 @@ class AnglesPanel(LinesPanel):
         axes[0].set_yticks([*marks], [*marks.values()])
 
     def _prepared(self, times: Array, values: Array) -> tuple[Array, Array]:
-        return broken_at_wraps(times, values)
+        return _broken_at_wraps(times, values)
 
 
 class ImagesPanel(Panel):
@@ -232,7 +233,7 @@ class RingPanel(Panel):
     def _draw_now(self, circle: Any, name: str, activity: Array) -> None:
         phases = 2.0 * np.pi * (np.arange(activity.size + 1) + 0.5) / activity.size
         circle.plot(phases, np.append(activity, activity[0]), color=self._colour(name))
-        direction = population_vector(activity)
+        direction = _population_vector(activity)
         if direction is not None:
             circle.plot([direction, direction], [0.0, activity.max()], "--", color="0.2")
 
@@ -244,11 +245,28 @@ class RingPanel(Panel):
         rolled = np.roll(values[nearest], half, axis=1).T  # from -pi to pi
         extent = (times[0], max(times[-1], times[0] + 1e-3), -math.pi, math.pi)
         history.imshow(rolled, aspect="auto", origin="lower", extent=extent, interpolation="none")
-        directions = [population_vector(column) for column in values[nearest]]
+        directions = [_population_vector(column) for column in values[nearest]]
         decoded = np.array([math.nan if d is None else d for d in directions])
-        history.plot(*broken_at_wraps(grid, decoded), color="w", linewidth=1)
+        history.plot(*_broken_at_wraps(grid, decoded), color="w", linewidth=1)
         history.set_ylim(-math.pi, math.pi)
         history.set_yticks([-math.pi, 0.0, math.pi], [r"$-\pi$", "0", r"$\pi$"])
+
+
+def _broken_at_wraps(time_s: Array, angle_rad: Array) -> tuple[Array, Array]:
+    """Both series with a NaN where a line from one angle to the next would cross the figure."""
+    jumps = np.flatnonzero(np.abs(np.diff(angle_rad)) > math.pi) + 1
+    return np.insert(time_s, jumps, np.nan), np.insert(angle_rad, jumps, np.nan)
+
+
+def _population_vector(activity: Array) -> float | None:
+    """The direction, in radians, that a ring of neurons stands for; ``None`` if it is silent.
+
+    Neuron ``i`` of ``n`` prefers ``2 pi (i + 1/2) / n``; the direction is that of the sum of these
+    unit vectors, weighted by activity (Georgopoulos, Schwartz & Kettner, Science 233, 1416, 1986).
+    """
+    phases = 2.0 * np.pi * (np.arange(activity.size) + 0.5) / max(activity.size, 1)
+    total = complex(np.sum(activity * np.exp(1j * phases)))
+    return None if abs(total) < 1e-12 else math.atan2(total.imag, total.real)
 
 
 PANELS = {

@@ -10,7 +10,7 @@ import pytest
 from launching import BACKENDS, EXAMPLES, launch
 
 from neuros.cli.main import main
-from neuros.observe.review.bars import spending_figure
+from neuros.observe.review.figures import time_budget_figure
 from neuros.observe.review.run import open_for_review
 
 FIGURES = {"graph", "time_shares", "swim_lanes", "real_time", "packets", "latency"}
@@ -108,7 +108,7 @@ def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
     words = dict(re.findall(r"(?m)^  (\w+) .*executes (\d+%)", capsys.readouterr().out))
     assert words == executing
 
-    (axes,) = spending_figure(run).axes
+    (axes,) = time_budget_figure(run).axes
     names = [label.get_text() for label in axes.get_yticklabels()]
     drawn = {
         name: [f"{bars[row].get_width():.0f}%" for bars in axes.containers]

@@ -12,7 +12,7 @@ import pytest
 
 from neuros.errors import UsageError
 from neuros.observe.difference import Verdict, compare, differing_fields
-from neuros.observe.past_run import PastRun, open_run
+from neuros.observe.run_record import PastRun, open_run
 
 FIRST, SECOND = "a.out -> b.in", "b.out -> c.in"
 

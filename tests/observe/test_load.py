@@ -1,19 +1,23 @@
-"""Which processes are a run's, and what they take: with real processes."""
+"""Load of real processes, told apart by node; the load now; the thread that writes rows."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
 import psutil
 import pytest
 
-from neuros.observe.load import LAUNCHER, GroupLoad, LoadMeter
+from neuros.observe.load import LAUNCHER, LoadMeter, LoadMonitor, LoadNow
+from neuros.observe.load_table import FILE_NAME, GroupLoad, LoadTable, MachineLoad
 
 DEADLINE_S = 20.0
 MARK = "NEUROS_TEST_GROUP"
@@ -145,3 +149,89 @@ def test_the_machine_has_a_figure_for_every_core() -> None:
     assert len(load.core_percent) == psutil.cpu_count()
     assert 0 < load.memory_percent < 100
     assert load.memory_used_bytes > 0
+
+
+class SteadyMeter:
+    cpu_s = 10.0
+
+    def machine(self) -> MachineLoad:
+        return MachineLoad((50.0, 20.0), 3_000, 40.0, 1, 2)
+
+    def groups(self) -> dict[str, GroupLoad]:
+        return {"robot": GroupLoad(self.cpu_s, 500, 7)}
+
+
+def test_processor_time_is_that_since_the_last_look() -> None:
+    now_s = [0.0]
+    meter = SteadyMeter()
+    load_now = LoadNow(meter, lambda: now_s[0])
+    now_s[0] = 1.0
+    assert load_now()["groups"]["robot"]["cpu_percent"] == 0.0
+    now_s[0], meter.cpu_s = 3.0, 11.0
+    shown = load_now()
+    assert shown["groups"]["robot"] == {"cpu_percent": 50.0, "memory_bytes": 500, "threads": 7}
+    assert shown["cores"] == [50.0, 20.0]
+
+
+PERIOD_S = 0.005
+
+
+class Meter:
+    """Counts how often it was asked."""
+
+    def __init__(self, enough: int) -> None:
+        self._enough = enough
+        self.asked = 0
+        self.has_enough = threading.Event()
+
+    def machine(self) -> MachineLoad:
+        return MachineLoad((50.0,), 1000, 10.0, 0, 0)
+
+    def groups(self) -> dict[str, GroupLoad]:
+        self.asked += 1
+        if self.asked > self._enough:
+            self.has_enough.set()
+        return {"snn": GroupLoad(0.01 * self.asked, 2000, 3)}
+
+
+def run(folder: Path, meter: Meter) -> LoadMonitor:
+    monitor = LoadMonitor(folder, meter, LoadTable(["snn"], 1), PERIOD_S)
+    monitor.start()
+    return monitor
+
+
+def test_every_period_has_a_row_and_the_file_ends_with_the_run(tmp_path: Path) -> None:
+    meter = Meter(5)
+    monitor = run(tmp_path, meter)
+    assert meter.has_enough.wait(DEADLINE_S)
+    summary = monitor.stop()
+    with open(tmp_path / FILE_NAME, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == summary["samples"] >= 5
+    assert [row["snn.threads"] for row in rows] == ["3"] * len(rows)
+    times = [float(row["time_s"]) for row in rows]
+    assert times == sorted(times)
+    assert monitor.failure is None
+
+
+def test_rows_can_be_read_while_the_run_goes_on(tmp_path: Path) -> None:
+    meter = Meter(3)
+    monitor = run(tmp_path, meter)
+    try:
+        assert meter.has_enough.wait(DEADLINE_S)
+        assert len((tmp_path / FILE_NAME).read_text().splitlines()) >= 3
+    finally:
+        monitor.stop()
+
+
+def test_a_full_disk_is_told_at_the_end_and_ends_nothing_but_the_monitor(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / FILE_NAME).symlink_to("/dev/full")
+    monitor = run(tmp_path, Meter(5))
+    monitor.join(DEADLINE_S)
+    assert not monitor.is_alive()
+    monitor.stop()
+    assert monitor.failure is not None
+    assert "No space left on device" in monitor.failure
+    assert FILE_NAME in monitor.failure

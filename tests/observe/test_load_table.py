@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 
-from neuros.observe.load import GroupLoad, MachineLoad
-from neuros.observe.load_table import LoadTable, load_table
+from neuros.observe.load_table import GroupLoad, LoadTable, MachineLoad, load_table
 
 
 def machine(cores: tuple[float, ...] = (10.0, 30.0), sent_bytes: int = 0) -> MachineLoad:

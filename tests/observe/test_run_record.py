@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from neuros.launch.outcome import Outcome
-from neuros.observe.report import run_record
+from neuros.observe.run_record import run_record
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from neuros.launch.channels import Channels
 from neuros.views.onlooker import look_on
-from neuros.views.scene import Mark, Numbers, Source
+from neuros.views.visual_types import Mark, Numbers, VisualTypes
 
 
 def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
     channels = Channels(tmp_path)
     shown: list[tuple[str, Sequence[Mark]]] = []
-    sources = {"robot.imu": ("robot", "imu", Source("sensor_msgs/msg/Imu"))}
+    sources = {"robot.imu": ("robot", "imu", VisualTypes("sensor_msgs/msg/Imu"))}
     onlooker = threading.Thread(
         target=look_on, args=(tmp_path, sources, lambda name, _, marks: shown.append((name, marks)))
     )

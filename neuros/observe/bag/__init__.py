@@ -1,1 +1,1 @@
-"""Reading what a run has recorded: :func:`neuros.bag.open` is its public face."""
+"""Reading of bags; :func:`neuros.bag.open` is the public function."""

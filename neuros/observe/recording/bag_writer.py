@@ -1,14 +1,17 @@
-"""A rosbag2 folder that is complete on the disk at every checkpoint.
+"""Writer of a rosbag2 folder that is complete on the disk at every checkpoint.
 
 ``rosbags`` writes the index of an MCAP file and ``metadata.yaml`` when it closes a bag; a bag that
 was never closed does not open. Here every checkpoint closes it, as far as its readers can tell, and
 the next one writes over the end of the former. So whatever happens in between, also a SIGKILL,
 leaves the bag of the last checkpoint. Besides, each message has two times: ``rosbags`` takes one.
+
+A bag holds the definitions of its message types, so that it can be read where they are not.
 """
 
 from __future__ import annotations
 
 import errno
+import importlib.util
 import os
 import struct
 from collections.abc import Mapping
@@ -28,9 +31,70 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from neuros.observe.recording.definitions import Definitions
+from neuros.errors import EnvironmentFault
 from neuros.observe.recording.plan import Topic
+
+
+class Definitions:
+    """The definitions of message types: those that come with ROS, and what is installed here."""
+
+    def __init__(self) -> None:
+        self.store: Typestore = get_typestore(Stores.ROS2_JAZZY)
+
+    def add(self, type_name: str) -> None:
+        """See to it that the store has a type, and all types of its fields.
+
+        Raises:
+            EnvironmentFault: if no definition of one of them is found.
+        """
+        if type_name in self.store.fielddefs:
+            return
+        path = _file_of(type_name)
+        if path is None:
+            raise EnvironmentFault(
+                f"message type {type_name} cannot be recorded: its definition"
+                f" (share/{type_name}.msg) is not installed here"
+            )
+        types = get_types_from_msg(path.read_text("utf-8"), type_name)
+        for used in _types_of_fields(types[type_name][1]):
+            if used.endswith("/msg/wstring"):
+                raise EnvironmentFault(
+                    f"message type {type_name} cannot be recorded: it has a wstring, which the"
+                    " library that writes bags does not know; use string, which is UTF-8"
+                )
+            if used != type_name:
+                self.add(used)
+        self.store.register(types)
+
+
+def _file_of(type_name: str) -> Path | None:
+    """The definition: the share folder is some folders above an installed message package."""
+    try:
+        spec = importlib.util.find_spec(type_name.split("/")[0])
+    except (ImportError, ValueError):
+        spec = None
+    for location in (spec.submodule_search_locations or ()) if spec else ():
+        for folder in Path(location).parents:
+            path = folder / "share" / f"{type_name}.msg"
+            if path.is_file():
+                return path
+    return None
+
+
+def _types_of_fields(fields: object) -> list[str]:
+    """The message types in rosbags' description of fields."""
+    found: list[str] = []
+    if isinstance(fields, str):
+        if "/" in fields:
+            found.append(fields)
+    elif isinstance(fields, (list, tuple)):
+        for part in fields:
+            found += _types_of_fields(part)
+    return found
+
 
 # Opcode, length, channel, number within the channel, log time, publish time.
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -66,7 +130,7 @@ class CheckedMcap(McapWriter):
 
     @property
     def pending_bytes(self) -> int:
-        """What waits for the next checkpoint."""
+        """Bytes that wait for the next checkpoint."""
         return self._new.tell() - self._new.start + self.chunk.bio.tell()
 
     def put(self, connection: int, log_ns: int, publish_ns: int, data: bytes) -> None:
@@ -204,7 +268,7 @@ class BagWriter(Writer):
 
     @property
     def pending_bytes(self) -> int:
-        """What the next checkpoint has to write."""
+        """Bytes that the next checkpoint has to write."""
         return int(cast(Any, self.storage).pending_bytes)
 
     def checkpoint(self) -> None:
@@ -230,7 +294,7 @@ class BagWriter(Writer):
 
 
 def _qos(topic: Topic) -> Qos:
-    """What the sender of a topic offers."""
+    """The quality of service that the sender of a topic offers."""
     latched = QosDurability.TRANSIENT_LOCAL
     return Qos(
         history=QosHistory.KEEP_LAST,

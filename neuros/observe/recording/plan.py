@@ -1,4 +1,4 @@
-"""What is recorded, by whom: one file in the run folder tells nodes and recorder alike."""
+"""Recording plan: the file in the run folder that tells nodes and recorder what to record."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def load_plan(run: Path) -> RecordingPlan:
 
 
 def _why_no_plan(run: Path) -> str:
-    """What a path is that is no folder of a run that was recorded."""
+    """Say why a path is no folder of a recorded run."""
     if not run.exists():
         return f"{run}: there is no such file or folder"
     if not run.is_dir():

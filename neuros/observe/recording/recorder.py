@@ -1,4 +1,4 @@
-"""Moves packets from the spools of a run into its bag, in the order of their wall time."""
+"""Recorder: moves packets from the spools of a run into its bag, ordered by wall time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from neuros.errors import EnvironmentFault
-from neuros.observe.recording.bag_writer import BagWriter
-from neuros.observe.recording.definitions import Definitions
-from neuros.observe.recording.listened import forget_listened, listened_topics
+from neuros.observe.recording.bag_writer import BagWriter, Definitions
 from neuros.observe.recording.plan import BAG_NAME, LISTENER, RecordingPlan, Topic
-from neuros.observe.recording.spool import NO_TIME, ForwardClock, SpoolReader
+from neuros.observe.recording.spool import (
+    NO_TIME,
+    ForwardClock,
+    SpoolReader,
+    forget_listened,
+    listened_topics,
+)
 from neuros.observe.recording.stored import Stored
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
@@ -63,7 +67,7 @@ class Recorder:
         for topic in plan.topics:
             self.number_of(topic)
         self._sources = [
-            _Source(
+            _SpoolSource(
                 SpoolReader(run / node),
                 [
                     self._numbers(plan.topics[place] for place in stream.topics)
@@ -73,7 +77,7 @@ class Recorder:
             )
             for node, streams in plan.streams.items()
         ]
-        self._listener = _Source(SpoolReader(run / LISTENER), [], owns_time=False)
+        self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
         self._sources.append(self._listener)
         self._held: list[_Kept] = []
         self._wall_clock = ForwardClock()
@@ -129,7 +133,7 @@ class Recorder:
         forget_listened(self._run)
 
     def abandon(self) -> None:
-        """Leave bag and spools as they are."""
+        """Stop, and leave bag and spools unfinished."""
         self.bag.shut()
         for source in self._sources:
             source.reader.close(remove=False)
@@ -207,7 +211,7 @@ class Recorder:
         return tuple(number for number in numbers if number is not None)
 
 
-class _Source:
+class _SpoolSource:
     """A spool, and the topics of its streams."""
 
     def __init__(

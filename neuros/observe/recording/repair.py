@@ -1,4 +1,4 @@
-"""Completes the bag of a run that was cut off: what its file holds, and what is in the spools."""
+"""Repair of the bag of a run that was cut off, from its file and from the spools."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader, ReaderError
 
 from neuros.errors import EnvironmentFault
-from neuros.observe.recording.listened import listened_topics
 from neuros.observe.recording.plan import (
     BAG_NAME,
     LISTENER,
@@ -23,7 +22,7 @@ from neuros.observe.recording.plan import (
     load_plan,
 )
 from neuros.observe.recording.recorder import Recorder, has_spools
-from neuros.observe.recording.spool import SpoolReader
+from neuros.observe.recording.spool import SpoolReader, listened_topics
 from neuros.observe.recording.stored import is_whole, stored_messages
 
 DAMAGED_NAME = "bag.damaged"
@@ -31,7 +30,7 @@ DAMAGED_NAME = "bag.damaged"
 
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
-    """Whether nobody else writes the bag of a run now; and nobody will, within the block."""
+    """Whether no other process writes the bag of a run, now and within the block."""
     descriptor = os.open(run / PLAN_NAME, os.O_RDONLY)
     try:
         try:

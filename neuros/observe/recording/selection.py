@@ -1,4 +1,4 @@
-"""Which packets of a project a recording holds, and which node keeps them."""
+"""Selection of the packets that a recording holds, and of the node that keeps each."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CLOCK = "/clock"
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be recorded.
+    """Topics to record, and the storage.
 
     Attributes:
         everything: all that the project's nodes send and hear, and ``/clock``.
         topics: names and patterns of topics, connections or outputs; besides everything, or alone.
-        exclude: the same, left out in any case.
+        exclude: names and patterns that are left out in any case.
         storage: ``mcap`` or ``sqlite3``.
     """
 
@@ -34,8 +34,8 @@ class Request:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where packets of a topic can be kept."""
+class _Candidate:
+    """Candidate to keep the packets of a topic: a node, and the way in which they pass it."""
 
     node: str
     way: Way
@@ -51,10 +51,10 @@ def plan_recording(
     is_alone: bool,
     custom: Mapping[str, str],
 ) -> RecordingPlan:
-    """What is recorded of a run of the nodes ``names``.
+    """Plan the recording of a run of the nodes ``names``.
 
     Args:
-        is_alone: nobody outside the run can publish in its domain, so there is no clock to hear.
+        is_alone: only the run can publish in its domain, so there is no clock to hear.
 
     Raises:
         UsageError: if something is asked for that does not exist.
@@ -82,7 +82,7 @@ def plan_recording(
     )
 
 
-def _places(project: Project, names: Collection[str]) -> Iterator[_Place]:
+def _places(project: Project, names: Collection[str]) -> Iterator[_Candidate]:
     """One place for each topic and sender, in the order of the project."""
     for connection in project.connections:
         yield from _connection_place(project, connection, names)
@@ -102,7 +102,7 @@ def _places(project: Project, names: Collection[str]) -> Iterator[_Place]:
 
 def _connection_place(
     project: Project, connection: Connection, names: Collection[str]
-) -> Iterator[_Place]:
+) -> Iterator[_Candidate]:
     source, destination = connection.source_node, connection.destination_node
     topic = Topic(
         f"{connection.topic}/data",
@@ -113,14 +113,14 @@ def _connection_place(
     )
     if source in names:
         if source == destination:
-            yield _Place(source, Way.TO_ITSELF, str(connection), topic)
+            yield _Candidate(source, Way.TO_ITSELF, str(connection), topic)
         else:
-            yield _Place(source, Way.SENT, connection.source_output, topic)
+            yield _Candidate(source, Way.SENT, connection.source_output, topic)
     elif destination in names:
-        yield _Place(destination, Way.RECEIVED, str(connection), topic)
+        yield _Candidate(destination, Way.RECEIVED, str(connection), topic)
 
 
-def _external(names: Names, node: Node, *, is_output: bool) -> Iterator[_Place]:
+def _external(names: Names, node: Node, *, is_output: bool) -> Iterator[_Candidate]:
     for port in node.outputs if is_output else node.inputs:
         if port.external_topic is not None:
             qos = port.qos or (OFFERED if is_output else ASKED)
@@ -132,11 +132,13 @@ def _external(names: Names, node: Node, *, is_output: bool) -> Iterator[_Place]:
                 is_latched=qos.is_latched,
             )
             way = Way.SENT if is_output else Way.HEARD
-            yield _Place(node.name, way, port.name, topic)
+            yield _Candidate(node.name, way, port.name, topic)
 
 
-def _streams(places: Sequence[_Place], topics: Sequence[Topic]) -> dict[str, tuple[Stream, ...]]:
-    """Packets that pass a node in one and the same way are kept once, for all their topics."""
+def _streams(
+    places: Sequence[_Candidate], topics: Sequence[Topic]
+) -> dict[str, tuple[Stream, ...]]:
+    """Packets that pass a node in one way are kept once, for all their topics."""
     groups: dict[tuple[str, Way, str], list[int]] = {}
     for place in places:
         key = (place.node, place.way, place.name)

@@ -1,4 +1,4 @@
-"""A spool: the packets that one node keeps, on their way into the bag.
+"""Spool: the packets that one node keeps, on their way into the bag.
 
 Files, each appended to until it has some size: the recorder reads behind the writer and removes a
 file once all of it is safe in the bag. A packet is one ``write`` to the page cache: it costs 2 us,
@@ -13,14 +13,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
-from neuros.observe.recording.plan import RecordingPlan, Stream
+from neuros.observe.recording.plan import LISTENER, RecordingPlan, Stream, Topic
 from neuros.ports import Way
 
 FILE_BYTES = 8 << 20
@@ -41,7 +43,7 @@ class Record(NamedTuple):
 
 
 class ForwardClock:
-    """Wall time in nanoseconds that goes on evenly where somebody sets the clock back."""
+    """Wall time in nanoseconds that goes on evenly where the clock is set back."""
 
     def __init__(self) -> None:
         self._ahead_ns = time.time_ns() - time.monotonic_ns()
@@ -122,7 +124,7 @@ class SpoolWriter:
 
 
 def open_recorder(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
-    """What keeps the packets of a node."""
+    """The spool of a node, for writing."""
     return SpoolWriter(run / node, plan.streams.get(node, ()))
 
 
@@ -229,3 +231,53 @@ def _split(data: bytes, records: list[Record]) -> bytes:
         records.append(Record(wall_ns, sim_ns, stream, data[at + head : after]))
         at = after
     return data[at:]
+
+
+_LIST = "topics.json"
+
+
+class ListenedSpool:
+    """Spool of the recorder itself, for topics that become known as the run goes on.
+
+    Their types and qualities of service are known only when a sender appears; so the list of topics
+    is written before the first packet of each, for all readers of the spool.
+    """
+
+    def __init__(self, run: Path) -> None:
+        self._folder = run / LISTENER
+        self._topics: list[Topic] = []
+        self._spool = SpoolWriter(self._folder, ())
+
+    def add(self, topic: Topic) -> int:
+        """The number of a new topic. Raises ``OSError``."""
+        self._topics.append(topic)
+        self._folder.mkdir(exist_ok=True)
+        text = json.dumps([asdict(each) for each in self._topics])
+        new = self._folder / f"{_LIST}.new"
+        new.write_text(text, "utf-8")
+        new.replace(self._folder / _LIST)
+        return len(self._topics) - 1
+
+    def keep(self, number: int, wall_ns: int, data: bytes) -> None:
+        """Keep a packet. Raises ``OSError``."""
+        self._spool.append(wall_ns, NO_TIME, number, data)
+
+    def close(self) -> None:
+        """Keep nothing any more."""
+        self._spool.close()
+
+
+def listened_topics(run: Path) -> list[Topic]:
+    """The topics that have been heard so far, in the order of their numbers."""
+    try:
+        return [Topic(**each) for each in json.loads((run / LISTENER / _LIST).read_text("utf-8"))]
+    except FileNotFoundError:
+        return []
+
+
+def forget_listened(run: Path) -> None:
+    """Remove the list; its spool must have been removed before."""
+    for name in (_LIST, f"{_LIST}.new"):
+        (run / LISTENER / name).unlink(missing_ok=True)
+    if (run / LISTENER).is_dir():
+        (run / LISTENER).rmdir()

@@ -1,4 +1,4 @@
-"""The messages of a bag, also of one that has lost its end.
+"""Reader of the messages of a bag, also of one that has lost its end.
 
 An MCAP file is a row of records, each with its length, so it can be read from its beginning as far
 as it goes (https://mcap.dev/spec). Libraries begin at its end, where the index is.
@@ -59,7 +59,7 @@ class StoredTopics:
         self._places: dict[Path, dict[str, array[int]]] = {}
 
     def messages(self, topic: str) -> list[Stored]:
-        """Those of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
+        """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
         found: list[Stored] = []
         for path in sorted(self._folder.glob("*.mcap")):
             with open(path, "rb") as file:

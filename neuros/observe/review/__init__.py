@@ -1,1 +1,1 @@
-"""Runs that are over, looked at: what held them up, figures, pages, comparisons."""
+"""Review of runs: findings, figures, pages, comparisons."""

@@ -1,4 +1,4 @@
-"""Several runs side by side."""
+"""Comparison of runs: a table and a figure with a column for each."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from neuros.observe.report import consumed_percent
+from neuros.observe.review.figures import colour, new_figure, plain
 from neuros.observe.review.run import Run
-from neuros.observe.review.style import colour, new_figure, plain
+from neuros.observe.run_record import consumed_percent
 
 _Cells = Callable[[Run], float | None]
 
@@ -36,7 +36,7 @@ def comparison_rows(runs: Sequence[Run]) -> tuple[list[str], list[list[str]]]:
 
 
 def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same as text."""
+    """The rows as text."""
     from tabulate import tabulate
 
     align = ("left", *("right" for _ in header[1:])) if rows else None
@@ -97,7 +97,7 @@ def _consumed(name: str) -> _Cells:
 
 def _executing(name: str) -> _Cells:
     def cell(run: Run) -> float | None:
-        spent = run.spending.get(name)
+        spent = run.time_budgets.get(name)
         return 100 * spent.shares["executing"] if spent and spent.total_s else None
 
     return cell

@@ -1,18 +1,28 @@
-"""One page of HTML with everything in it: no other file, no script, no network."""
+"""HTML page of a run: one file with its tables and figures, without scripts or network."""
 
 from __future__ import annotations
 
 import base64
 import io
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape
 from string import Template
 from typing import Any
 
+from neuros.observe.review.figures import (
+    counts_figure,
+    graph_figure,
+    latency_figure,
+    load_figure,
+    ticks_figure,
+    time_budget_figure,
+    time_figure,
+)
+from neuros.observe.review.findings import Findings
 from neuros.observe.review.run import Run
-from neuros.observe.review.words import Findings
+from neuros.observe.review.timeline import timeline_figure
 
 _PAGE = Template("""\
 <!DOCTYPE html>
@@ -32,7 +42,7 @@ img { max-width: 100%; height: auto }
 .table { overflow-x: auto }
 table { border-collapse: collapse; font-size: .88rem }
 th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #DDD }
-th:first-child, td:first-child, .words td { text-align: left }
+th:first-child, td:first-child, .text td { text-align: left }
 code { background: #F0F0F0; padding: .1rem .3rem; overflow-wrap: anywhere }
 </style>
 </head>
@@ -71,7 +81,7 @@ def page(title: str, parts: Sequence[str]) -> str:
 
 
 def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
-    """What limits a run, in words."""
+    """The findings under a heading."""
     lines = [f"<p>{escape(findings.headline)}</p>"]
     if findings.reasons:
         items = "".join(f"<li>{escape(reason)}</li>" for reason in findings.reasons)
@@ -85,7 +95,7 @@ def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
 def table_part(
     title: str, header: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "numbers"
 ) -> str:
-    """A table under a heading; of ``kind`` ``numbers`` or ``words``, by which it is aligned."""
+    """A table under a heading; aligned for its ``kind``, ``numbers`` or ``text``."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join(
         f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
@@ -168,7 +178,7 @@ def _provenance(run: Run) -> str:
         "command": shlex.join(record.get("command", ())),
     }
     rows = [[key, str(value)] for key, value in cells.items() if value]
-    return table_part("Where it comes from", ["", ""], rows, "words")
+    return table_part("Where it comes from", ["", ""], rows, "text")
 
 
 def _machine(machine: Mapping[str, Any]) -> str:
@@ -176,3 +186,68 @@ def _machine(machine: Mapping[str, Any]) -> str:
     cores = f"{machine['cores']} cores" if "cores" in machine else None
     parts = [machine.get("processor"), cores, memory, machine.get("system")]
     return ", ".join(str(part) for part in parts if part)
+
+
+_FIGURES: tuple[tuple[str, str, str, Callable[[Run], Any]], ...] = (
+    (
+        "graph",
+        "Nodes and connections",
+        "Each node with its busiest hook and how it spent its time; each connection with its"
+        " guarantee, what it carried and lost, and how long a packet waited for a hook (median).",
+        graph_figure,
+    ),
+    (
+        "time_shares",
+        "Where the time went",
+        "Shares of each node's time, without the start and the end of the run; what is missing to"
+        " 100 % is scheduling: a hook whose turn has not come.",
+        time_budget_figure,
+    ),
+    (
+        "swim_lanes",
+        "Who waits for whom",
+        "Hooks as bars, packets from their sender to the start of a hook on them, and"
+        " acknowledgements back.",
+        timeline_figure,
+    ),
+    (
+        "real_time",
+        "Simulated against real time",
+        "One point per simulated second; wall time from the first hook on.",
+        time_figure,
+    ),
+    (
+        "packets",
+        "Packets",
+        "What became of the packets of each connection.",
+        counts_figure,
+    ),
+    (
+        "latency",
+        "Latency",
+        "The share of packets on which a hook had started within a time after they were sent.",
+        latency_figure,
+    ),
+    (
+        "ticks",
+        "Regularity of timed hooks",
+        "Intervals between the starts of a hook with a period.",
+        ticks_figure,
+    ),
+    (
+        "system_load",
+        "Processor and memory",
+        "Of each node's processes, once per second from the command on; 100 % is one core.",
+        load_figure,
+    ),
+)
+
+
+def figures_of(run: Run) -> dict[str, tuple[str, str, bytes]]:
+    """By file name (without ending): title, what is seen, PNG; only what says something."""
+    found = {}
+    for name, title, text, draw in _FIGURES:
+        figure = draw(run)
+        if figure is not None:
+            found[name] = (title, text, png(figure))
+    return found

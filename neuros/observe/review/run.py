@@ -1,7 +1,7 @@
-"""A run folder as a reviewer finds it: also of a run that was cut off, or of an older version.
+"""Run folder opened for review, also of a run that was cut off, or of an older version.
 
-:mod:`neuros.observe.past_run` refuses what it cannot rely on; here whatever is there is shown, and
-what is missing is said.
+:mod:`neuros.observe.run_record` refuses what it cannot rely on; a review shows what there is, and
+says what is missing.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from neuros.core.spending import Spending, spending_of
+import numpy as np
+
+from neuros.core.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.observe.load_table import FILE_NAME
-from neuros.observe.packets import FOLDER, Packets, packet_figures, read_packets
-from neuros.observe.past_run import connection_of
-from neuros.observe.report import FORMAT
-from neuros.observe.review.trace import Trace, read_trace
+from neuros.observe.packets import FOLDER, Numbers, Packets, packet_figures, read_packets
+from neuros.observe.run_record import FORMAT, connection_of
 from neuros.project.model import Connection
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is known about a run.
+    """Run folder that is open for review.
 
     Attributes:
         record: ``run.json``, or as much of it as the project and the packet lists give.
@@ -42,7 +42,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """What a heading calls it."""
+        """Name for headings."""
         return f"{self.record.get('project', '?')} ({self.folder.name})"
 
     @property
@@ -67,9 +67,9 @@ class Run:
         return {name: connection_of(name, figures) for name, figures in self.connections.items()}
 
     @cached_property
-    def spending(self) -> dict[str, Spending]:
-        """How each node that has reported spent its time."""
-        found = {name: spending_of(node, self.running_s) for name, node in self.nodes.items()}
+    def time_budgets(self) -> dict[str, TimeBudget]:
+        """Time budget of each node that has reported."""
+        found = {name: time_budget_of(node, self.running_s) for name, node in self.nodes.items()}
         return {name: spent for name, spent in found.items() if spent is not None}
 
     @cached_property
@@ -124,7 +124,7 @@ def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """What the launcher wrote before the run, and the nodes during it."""
+    """A record from files that were written before and during the run."""
     if not (folder / "project.json").is_file():
         raise UsageError(f"{folder} has no run.json: it is no folder that a run has left behind")
     project = _json(folder / "project.json")
@@ -186,3 +186,51 @@ def _json(file: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise UsageError(f"{file} is broken: it holds no object")
     return found
+
+
+@dataclass(frozen=True)
+class Trace:
+    """First executions of a node's hooks; times of the monotonic clock, in nanoseconds.
+
+    Attributes:
+        hooks: name and kind of each hook that ran.
+        which: of each execution, its hook's place in ``hooks``, (executions,).
+        starts_ns, ends_ns: from when to when, (executions,).
+        credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
+    """
+
+    hooks: tuple[tuple[str, str], ...]
+    which: Numbers
+    starts_ns: Numbers
+    ends_ns: Numbers
+    credits: Numbers
+
+    @property
+    def is_running(self) -> Numbers:
+        """Which executions were not of initialise hooks, (executions,)."""
+        initialisers = [i for i, (_, kind) in enumerate(self.hooks) if kind == "initialise"]
+        found: Numbers = ~np.isin(self.which, initialisers)
+        return found
+
+
+def read_trace(folder: Path) -> Trace:
+    """Read the lists of a node; empty where there are none."""
+    executions = _triples(folder / "executions")
+    try:
+        hooks = json.loads((folder / "hooks.json").read_text("utf-8"))
+        names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
+    except (OSError, ValueError, TypeError, KeyError):
+        names = []
+    # A node that was killed may have listed a hook's execution, and not its name.
+    count = int(executions[:, 0].max()) + 1 if len(executions) else 0
+    names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
+    which, starts_ns, ends_ns = executions.T
+    return Trace(tuple(names), which, starts_ns, ends_ns, _triples(folder / "credits"))
+
+
+def _triples(file: Path) -> Numbers:
+    try:
+        data = file.read_bytes()
+    except OSError:
+        data = b""
+    return np.frombuffer(data[: len(data) // 24 * 24], np.int64).reshape(-1, 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_bottleneck import wires
+from test_findings import wires
 
 from neuros.project.layout import Layout, lay_out
 

@@ -33,7 +33,7 @@ def test_of_a_run_that_was_cut_off_packets_are_counted(tmp_path: Path) -> None:
     assert run.connections[WIRE]["sent"] == run.connections[WIRE]["consumed"] == PACKETS
     assert run.connections[WIRE]["latency_ms"]["p50"] == 5.0
     assert run.missing[0].startswith("run.json: the run goes on, or its launcher was killed")
-    assert run.spending == {}
+    assert run.time_budgets == {}
 
 
 def test_an_older_run_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_start_and_end_of_a_run_are_taken_off_what_a_node_waited_for(tmp_path: P
     """It waited 2 s for the others to begin, and 10 s are the run."""
     spent = accounting(executing={"f": 3.0}, blocked={WIRE: 9.0}, registering=5.0)
     run = open_for_review(run_folder(tmp_path, {WIRE: 0}, {"a": spent}))
-    assert run.spending["a"].blocked == {WIRE: 7.0}
+    assert run.time_budgets["a"].blocked == {WIRE: 7.0}
 
 
 def test_in_process_the_turns_of_others_are_no_execution(tmp_path: Path) -> None:
@@ -91,11 +91,11 @@ def test_in_process_the_turns_of_others_are_no_execution(tmp_path: Path) -> None
     spent = accounting(executing={"f": 4.0}, waiting={"in": 1.0}, scheduling=8.0)
     run = open_for_review(run_folder(tmp_path, {}, {"a": spent}, backend="in-process"))
     shares = {"executing": 0.4, "waiting": 0.1, "blocked": 0.0, "idle": 0.0}
-    assert run.spending["a"].shares == pytest.approx(shares)
+    assert run.time_budgets["a"].shares == pytest.approx(shares)
 
 
 def test_initialise_hooks_do_not_count(tmp_path: Path) -> None:
     spent = accounting(executing={"init": 4.0}, waiting={"in": 10.0})
     run = open_for_review(run_folder(tmp_path, {}, {"b": spent}))
-    assert run.spending["b"].own_s == 0.0
-    assert run.spending["b"].waiting == {"in": 10.0}
+    assert run.time_budgets["b"].own_s == 0.0
+    assert run.time_budgets["b"].waiting == {"in": 10.0}

@@ -1,4 +1,4 @@
-"""How nodes spent the time in which all of them ran: the same for table, report and figures.
+"""Time budget of a node: its share of executing, waiting, blocked and idle time.
 
 That time counts from when the last node had initialised until the end was asked for (``running_s``
 of ``run.json``). A node executes its hooks, waits for input, is blocked by an output, or idles
@@ -14,12 +14,12 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Spending:
+class TimeBudget:
     """One node's wall time while the run was under way, in seconds.
 
     Attributes:
         executing: by hook; waiting: by input; blocked: by connection.
-        own_s: what it needs for itself: hooks and scheduling.
+        own_s: needed by the node itself, whatever the others do.
     """
 
     executing: Mapping[str, float]
@@ -30,12 +30,12 @@ class Spending:
 
     @property
     def executing_s(self) -> float:
-        """In hooks."""
+        """All hooks together."""
         return sum(self.executing.values())
 
     @property
     def own_s(self) -> float:
-        """What nobody else could spare it."""
+        """Hooks and scheduling."""
         return self.executing_s + self.scheduling_s
 
     @property
@@ -64,7 +64,7 @@ class Spending:
         }
 
 
-def spending_of(node: Mapping[str, Any], running_s: float | None) -> Spending | None:
+def time_budget_of(node: Mapping[str, Any], running_s: float | None) -> TimeBudget | None:
     """How a node of ``run.json`` spent its time; ``None`` if it has not reported.
 
     The books of a node begin with it. Initialise hooks are left out; what then is longer than the
@@ -92,7 +92,7 @@ def spending_of(node: Mapping[str, Any], running_s: float | None) -> Spending | 
         return {name: s for (kind, name), s in rests.items() if kind == state and s > 0}
 
     idle_s, scheduling_s = rests["idle", ""], rests["scheduling", ""]
-    return Spending(executing, of("waiting"), of("blocked"), idle_s, scheduling_s)
+    return TimeBudget(executing, of("waiting"), of("blocked"), idle_s, scheduling_s)
 
 
 def _without_initialising(

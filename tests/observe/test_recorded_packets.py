@@ -1,4 +1,4 @@
-"""What runs have recorded, as comparisons need it."""
+"""Packets and digests from the bags of runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from observe.recordings import NUMBER, number, plan, record, spool
 from xxhash import xxh3_64_intdigest
 
-from neuros.observe import recorded
-from neuros.observe.recorded import Recorded
+from neuros.observe import recorded_packets
+from neuros.observe.recorded_packets import RecordedPackets
 from neuros.transport.large_packets import LARGE_BYTES
 
 
@@ -17,7 +17,7 @@ def test_digests_are_those_of_the_packets_in_the_order_in_which_they_were_sent(
 ) -> None:
     spool(tmp_path, "a", [(10, None, number(1)), (30, None, number(3)), (30, None, number(2))])
     record(tmp_path, plan())
-    found, name = Recorded(), NUMBER.connection or ""
+    found, name = RecordedPackets(), NUMBER.connection or ""
     digests = found.digests(tmp_path, name)
     assert digests is not None
     assert digests.tolist() == [xxh3_64_intdigest(number(n)) for n in (1, 3, 2)]
@@ -28,14 +28,14 @@ def test_digests_are_those_of_the_packets_in_the_order_in_which_they_were_sent(
 
 
 def test_a_run_without_a_recording_has_nothing_and_a_damaged_one_says_so(tmp_path: Path) -> None:
-    found = Recorded()
+    found = RecordedPackets()
     assert found.digests(tmp_path, NUMBER.connection or "") is None
     assert found.remarks == []
     (tmp_path / "recording.json").write_text("{")
-    found = Recorded()
+    found = RecordedPackets()
     assert found.message(tmp_path, NUMBER.connection or "", 1) is None
     assert "recording.json is damaged" in found.remarks[0]
 
 
 def test_packets_are_large_from_the_size_on_from_which_nodes_digest_them_apart() -> None:
-    assert recorded._LARGE_BYTES == LARGE_BYTES
+    assert recorded_packets._LARGE_BYTES == LARGE_BYTES

@@ -1,13 +1,16 @@
-"""The end of a run: one record (``run.json``) and one table, from the last reports of the nodes."""
+"""Record of a run (``run.json``): made from the last reports of its nodes, and read again."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
-from neuros.core.spending import spending_of
+from neuros.core.time_budget import time_budget_of
+from neuros.errors import UsageError
 from neuros.observe.load_table import load_table
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
@@ -19,7 +22,7 @@ _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 
 
 class Ended(Protocol):
-    """How a run ended, as far as a record needs it."""
+    """Outcome of a run, as far as a record needs it."""
 
     exit_code: int
     reason: str
@@ -177,7 +180,7 @@ def _node(name: str, ended: Ended) -> dict[str, Any]:
 
 
 def _results(node_folder: Path) -> dict[str, Any]:
-    """What the node's plugin has found out."""
+    """The results that the node's plugin has saved."""
     try:
         results = json.loads((node_folder / "results.json").read_text("utf-8"))
     except (OSError, ValueError):
@@ -186,7 +189,7 @@ def _results(node_folder: Path) -> dict[str, Any]:
 
 
 def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
-    spent = spending_of(node, running_s)
+    spent = time_budget_of(node, running_s)
     if spent is None:
         return ["?", "?", "?", "?", "never reported"]
     remark = "" if node["report"] == "final" else node["report"]
@@ -206,3 +209,60 @@ def _times(record: Mapping[str, Any]) -> str:
         f" {record['real_time_factor'] or 0:.2f} ({record['running_s'] or 0:.2f} s without"
         " initialisation and ending)"
     )
+
+
+@dataclass(frozen=True)
+class PastRun:
+    """The folder of a run and its ``run.json``."""
+
+    folder: Path
+    record: Mapping[str, Any]
+
+    @cached_property
+    def connections(self) -> dict[str, Mapping[str, Any]]:
+        """The figures of each connection, by ``a.out -> b.in``, in their order."""
+        return {each["connection"]: each for each in self.record["connections"]}
+
+    def connection(self, name: str) -> Connection:
+        """A connection as the project has it."""
+        return connection_of(name, self.connections[name])
+
+
+def connection_of(name: str, figures: Mapping[str, Any]) -> Connection:
+    """A connection as the project has it, from what ``run.json`` has of it."""
+    (source, output), (destination, input_) = (end.split(".") for end in name.split(" -> "))
+    limit, queue_size = figures.get("discard_limit"), figures.get("queue_size", 1)
+    return Connection(source, output, destination, input_, limit, queue_size, figures["index"])
+
+
+def open_run(folder: Path) -> PastRun:
+    """Read a run folder.
+
+    Raises:
+        UsageError: if it is none, the run has not ended, or another version of NeuROS wrote it.
+    """
+    file = folder / "run.json"
+    try:
+        record = json.loads(file.read_text("utf-8"))
+    except FileNotFoundError as error:
+        if any(folder.glob("*/node.json")):
+            why = "its run goes on, or its launcher was killed"
+        else:
+            why = "it is no folder that a run has left behind"
+        raise UsageError(f"{folder} has no run.json: {why}") from error
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
+    found = record.get("format", 1) if isinstance(record, dict) else None
+    if found != FORMAT:
+        raise UsageError(
+            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
+            " version that the run was made with, or run the project again"
+        )
+    run = PastRun(folder, record)
+    try:
+        _ = [run.connection(name) for name in run.connections]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(f"{file} is broken (its connections cannot be read: {error!r})") from error
+    return run

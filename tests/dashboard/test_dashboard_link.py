@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as Decoder
 from sensor_msgs.msg import CompressedImage, Image
 
-from neuros.dashboard.pictures import data_url
+from neuros.dashboard.link import data_url
 from neuros.runtime.sampling import preview
 
 

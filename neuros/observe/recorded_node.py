@@ -1,4 +1,4 @@
-"""What a recorded run has of one node: what reached it, and what it sent."""
+"""Packets of one node in a recorded run: received and sent."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import UsageError
-from neuros.observe.bag.opened import Bag, open_bag
+from neuros.observe.bag.bag_reader import Bag, open_bag
 from neuros.observe.packets import FOLDER, read_packets
-from neuros.observe.past_run import PastRun, open_run
 from neuros.observe.recording.plan import RecordingPlan, load_plan
+from neuros.observe.run_record import PastRun, open_run
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
@@ -80,7 +80,7 @@ class RecordedNode:
         return arrivals.packet(number)
 
     def sent(self) -> dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]]:
-        """What it sent: by way and port or connection, the topics with name, type and packets.
+        """Packets sent: by way and port or connection, the topics with name, type and packets.
 
         A topic is called by its connection, if it belongs to one.
         """
@@ -167,7 +167,7 @@ class RecordedNode:
 
 
 class _Arrivals:
-    """What has arrived at one place; ``places``: which of the packets, if not simply all."""
+    """Arrivals of one input; ``places``: which of the packets, if not all."""
 
     def __init__(self, packets: Sequence[Any], places: Sequence[int] | None = None) -> None:
         self._packets, self._places = packets, places

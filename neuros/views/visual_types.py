@@ -1,7 +1,7 @@
-"""What is shown of packets in space and over time, told by the types of the project's outputs.
+"""Visual types: poses, points, numbers and pictures that viewers show of a message type.
 
-Poses and scans stand in one world, images beside it, and all other numbers are curves. What there
-is in a message of a type that is not known here is asked for once; its first numbers are shown.
+Poses and scans stand in one world, images beside it, and all other numbers are curves. The
+fields of an unknown message type are asked for once; its first numbers are shown.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _SCAN = "sensor_msgs/msg/LaserScan"
 
 @dataclass(frozen=True)
 class Pose:
-    """Where something is, and how it is turned (x, y, z, w), metres; at a time, seconds."""
+    """Position in metres and orientation (x, y, z, w) at a time, seconds."""
 
     time_s: float
     position: tuple[float, ...]
@@ -78,8 +78,8 @@ class Picture:
 Mark = Pose | Points | Numbers | Picture
 
 
-class Source:
-    """One output (or external input), and what is shown of it."""
+class VisualTypes:
+    """Visual types of one output or external input."""
 
     def __init__(self, type_name: str) -> None:
         self.is_image = type_name in _IMAGES
@@ -96,7 +96,7 @@ class Source:
         return self._numbers is None or bool(self._numbers)
 
     def wanted(self) -> dict[str, Any]:
-        """What is to be sampled next (see :class:`neuros.runtime.sampling.Sampler`)."""
+        """Fields to sample next (see :class:`neuros.runtime.sampling.Sampler`)."""
         if self.is_image:
             return {"image": True}
         if self.is_scan:
@@ -106,7 +106,7 @@ class Source:
         return {"fields": [*self._pose_fields(), *self._numbers]}
 
     def marks(self, sample: Mapping[str, Any]) -> Iterator[Mark]:
-        """What is to be shown of a sample."""
+        """Marks of a sample."""
         if "image" in sample:
             yield Picture(sample["image"])
         if "all" in sample:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from neuros.dashboard.figures import Figures
+from neuros.dashboard.live_metrics import LiveMetrics
 
 LINK = "a.o -> b.x"
 STATES = ("waiting", "blocked", "executing", "idle", "registering", "scheduling", "paused")
@@ -42,7 +42,7 @@ def incoming(received: int, discarded: int = 0) -> dict[str, Any]:
 
 
 def test_rates_are_those_of_the_last_second() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     for tenth in range(40):
         sent = tenth if tenth < 20 else 20 + (tenth - 20) * 10
         figures.take(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
@@ -50,7 +50,7 @@ def test_rates_are_those_of_the_last_second() -> None:
 
 
 def test_a_connection_has_the_counters_of_both_its_ends() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take(node_status("b", 1.0, incoming=incoming(7, discarded=2)))
     figures.take(node_status("a", 1.0, outgoing=outgoing(8, outstanding=1)))
     shown = figures.connections[LINK]
@@ -63,7 +63,7 @@ def test_a_connection_has_the_counters_of_both_its_ends() -> None:
 
 
 def test_where_the_sender_is_not_seen_the_rate_is_that_of_arrivals() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     for second in range(3):
         figures.take(node_status("b", second, incoming=incoming(5 * second)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(5.0)
@@ -71,7 +71,7 @@ def test_where_the_sender_is_not_seen_the_rate_is_that_of_arrivals() -> None:
 
 def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first() -> None:
     for is_sender_first in (True, False):
-        figures = Figures()
+        figures = LiveMetrics()
         statuses = [
             node_status(
                 "a", 1.0, outgoing=outgoing(12), sent_ns={LINK: [12, [7_000_000, 9_000_000]]}
@@ -85,7 +85,7 @@ def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first(
 
 
 def test_shares_are_seconds_of_each_state_per_second() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take(node_status("a", 1.0, executing={"f": 1.0}, waiting={"x": 2.0}))
     figures.take(node_status("a", 2.0, executing={"f": 1.25}, waiting={"x": 2.5, "y": 0.25}))
     shares = figures.nodes["a"]["shares"]
@@ -93,7 +93,7 @@ def test_shares_are_seconds_of_each_state_per_second() -> None:
 
 
 def test_hooks_have_their_count_and_mean_time() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take(node_status("a", 1.0, hooks={"f": [10, 0.05], "g": [0, 0.0]}))
     hooks = figures.nodes["a"]["hooks"]
     assert hooks["f"] == {"executions": 10, "rate_hz": 0.0, "mean_ms": pytest.approx(5.0)}
@@ -101,7 +101,7 @@ def test_hooks_have_their_count_and_mean_time() -> None:
 
 
 def test_the_real_time_factor_is_that_of_now() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     assert figures.real_time_factor is None
     figures.take(node_status("a", 10.0, sim_time=3.0))
     figures.take(node_status("a", 11.0, sim_time=5.0))
@@ -109,7 +109,7 @@ def test_the_real_time_factor_is_that_of_now() -> None:
 
 
 def test_a_node_that_loads_its_plugin_has_no_figures_yet() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take({"node": "a", "sim_time": None, "books": None})
     assert figures.nodes == {"a": {"state": "loading", "cause": ""}}
 
@@ -120,7 +120,7 @@ def lost(sent: list[int], received: list[int], hooks: list[float] | None = None)
     Args:
         hooks: for how long a hook of the receiver has been executing at each status, in seconds.
     """
-    figures = Figures()
+    figures = LiveMetrics()
     for place, (out, arrived) in enumerate(zip(sent, received, strict=True)):
         now_s, for_s = 10 + 0.2 * place, hooks[place] if hooks else 0.0
         hook = {"name": "f", "for_s": for_s, "executions": 1} if for_s else None
@@ -148,13 +148,13 @@ def test_what_waits_for_a_hook_to_end_is_not_lost() -> None:
 
 
 def test_nothing_is_lost_on_a_reliable_connection() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take(node_status("a", 1.0, outgoing=outgoing(5)))
     assert figures.connections[LINK]["lost"] == 0
 
 
 def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
-    figures = Figures()
+    figures = LiveMetrics()
     figures.take(
         node_status("a", 1.0, outgoing=outgoing(5, 1), sim_time=1.0, hook={"name": "f", "for_s": 1})
     )

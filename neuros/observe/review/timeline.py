@@ -1,4 +1,4 @@
-"""The swim lanes: hooks as bars, packets and acknowledgements as lines between the lanes."""
+"""Timeline figure: a lane of hooks for each node, packets and acknowledgements between them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from neuros.observe.packets import Numbers
-from neuros.observe.review.run import Run
-from neuros.observe.review.style import (
+from neuros.observe.review.figures import (
     BLUE,
     GREEN,
     GREY,
@@ -20,6 +19,7 @@ from neuros.observe.review.style import (
     new_figure,
     plain,
 )
+from neuros.observe.review.run import Run
 
 _SECOND_NS = 1_000_000_000
 _MOST_LINES = 4_000
@@ -44,7 +44,7 @@ def first_second(run: Run) -> int | None:
     return max(firsts, default=None)
 
 
-def lanes_figure(run: Run) -> Any | None:
+def timeline_figure(run: Run) -> Any | None:
     """The first second in which all nodes ran, and a part of it enlarged."""
     start_ns = first_second(run)
     if start_ns is None:
@@ -154,7 +154,7 @@ def _has_lost(run: Run, name: str) -> bool:
 
 
 def _answers(run: Run, name: str, window: tuple[int, int]) -> Numbers | None:
-    """The same of acknowledgements: from the start on a packet to when its sender knew.
+    """Milliseconds of acknowledgements: from the start on a packet to when its sender knew.
 
     They are cumulative: one is drawn from the last packet that it counts.
     """

@@ -1,4 +1,4 @@
-"""From what nodes show of themselves to what the page shows: rates, shares, latencies, losses."""
+"""Live metrics of the page, from counters of nodes: rates, shares, latencies, losses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-from neuros.core.spending import spending_of
+from neuros.core.time_budget import time_budget_of
 
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""
@@ -23,7 +23,7 @@ _LATE_S = 2.0
 
 
 class Latency:
-    """How long packets of one connection were on their way: from being sent to a hook's start.
+    """Latency of one connection: from the sending of a packet to the start of a hook on it.
 
     Sender and receiver show themselves at different moments; what belongs together is told by the
     packets' positions. Both count on the monotonic clock of one machine.
@@ -62,7 +62,7 @@ class Latency:
 
 
 class Speed:
-    """How fast a growing figure grows, over :data:`WINDOW_S`."""
+    """Growth of a counter, over :data:`WINDOW_S`."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque()
@@ -81,7 +81,7 @@ class Speed:
 
 
 class Loss:
-    """How many packets of a best-effort connection were lost on their way, so far.
+    """Packets of a best-effort connection that were lost on their way, so far.
 
     Both ends show their counts at different moments, and what arrives while a hook executes is
     taken in after it. So the receiver's count is compared with what had been sent shortly before it
@@ -108,7 +108,7 @@ class Loss:
             self._missing.popleft()
 
     def _sent_by(self, then_s: float) -> float | None:
-        """How many had been sent then, as far as that is known."""
+        """The count of packets sent by then, if known."""
         for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
             if a_s <= then_s <= b_s:
                 return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
@@ -116,8 +116,8 @@ class Loss:
         return self._sent[-1][1] if is_since else None
 
 
-class Figures:
-    """Keeps what is needed of the past, and gives what is to be shown.
+class LiveMetrics:
+    """Live metrics of all nodes and connections, with as much of the past as they need.
 
     Attributes:
         nodes, connections: by name, ready for JSON.
@@ -206,7 +206,7 @@ class Figures:
             self._ended_factor = self.sim_time / running_s
 
     def _end_node(self, name: str, books: Mapping[str, Any], running_s: float | None) -> None:
-        spent = spending_of(books, running_s)
+        spent = time_budget_of(books, running_s)
         self.nodes[name] = {
             "state": "ended",
             "cause": "",

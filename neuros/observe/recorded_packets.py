@@ -1,4 +1,4 @@
-"""The packets of runs as their bags have them, for comparisons: one by one, and as digests."""
+"""Packets of runs from their bags, for comparisons: one by one, and as digests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from neuros.errors import NeurosError
-from neuros.observe.bag.opened import Bag, RecordedTopic, open_bag
+from neuros.observe.bag.bag_reader import Bag, RecordedTopic, open_bag
 from neuros.observe.packets import Numbers
 from neuros.observe.recording.plan import PLAN_NAME
 from neuros.observe.recording.stored import stored_messages
@@ -20,8 +20,8 @@ _LARGE_BYTES = 64 * 1024
 """The buffers of larger messages travel beside them, and nodes digest them apart."""
 
 
-class Recorded:
-    """What runs have recorded.
+class RecordedPackets:
+    """Bags of runs.
 
     Attributes:
         remarks: why a bag could not be read, a sentence each.
@@ -43,7 +43,7 @@ class Recorded:
         return None if found is None else found[0]
 
     def are_as_of_nodes(self, run: Path, connection: str) -> bool:
-        """Whether nodes have the same digests: of small messages, which travel whole."""
+        """Whether nodes digest them alike: small messages, which travel whole."""
         found = self._digests_of(run, connection)
         return found is not None and found[1]
 

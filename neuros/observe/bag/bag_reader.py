@@ -1,4 +1,4 @@
-"""A bag that is open for reading."""
+"""Bag that is open for reading."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class RecordedTopic:
 
 
 class Bag:
-    """What a run has recorded.
+    """Topics and metadata of a recorded run.
 
     Attributes:
         folder: the rosbag2 folder.
@@ -166,7 +166,7 @@ class Bag:
 
     @property
     def damage(self) -> str | None:
-        """What is missing, in a sentence."""
+        """The missing packets, in a sentence."""
         if not self.missing:
             return None
         topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
