@@ -27,7 +27,7 @@ explain say why nothing moves
 drain   stop the hooks that send unasked; some start     last_round
         once more (their places, by node)
 stop    start no further hook, finalise and end
-say     let nodes elsewhere hear this (see launch.sides) text
+say     let nodes elsewhere hear this (see launch.peers) text
 leave   all is said and heard: a node at its end may go
 pause   start no further hook
 resume  go on
@@ -35,10 +35,10 @@ step    while paused, go on by so many steps             count, is_driven
 look    show what you do; what to sample, by node        wanted, asker
 ======= ================================================ =================
 
-Onlookers (the dashboard) are on the same channel, and get no more than they ask for:
+Observers (the dashboard) are on the same channel, and get no more than they ask for:
 
 ======= ================================================ =================
-kind    sent by an onlooker                              fields
+kind    sent by an observer                              fields
 ======= ================================================ =================
 watch   it is there
 look    all nodes are to show it what they do, once      wanted
@@ -50,7 +50,7 @@ signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 
 ======= ================================================ =================
-kind    sent to onlookers                                fields
+kind    sent to observers                                fields
 ======= ================================================ =================
 glimpse what a node does, for the one that asked         node, ...
 phase   where the run is in its life                     phase, is_paused

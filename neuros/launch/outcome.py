@@ -1,4 +1,4 @@
-"""How a run ends, and how it ended."""
+"""Phases of a run, and its outcome."""
 
 from __future__ import annotations
 

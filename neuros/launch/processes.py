@@ -1,11 +1,11 @@
-"""The processes of a run: which still run, which were killed, and who ended without being asked."""
+"""Node processes of a run: those that run, were killed, or ended without being asked."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 from neuros.launch.outcome import Outcome
-from neuros.launch.watch import Watch
+from neuros.launch.stall_detector import StallDetector
 from neuros.ports import RunningNode
 
 
@@ -16,8 +16,8 @@ class Processes:
         killed: the names of all nodes whose processes were killed.
     """
 
-    def __init__(self, watch: Watch, outcome: Outcome) -> None:
-        self._watch = watch
+    def __init__(self, detector: StallDetector, outcome: Outcome) -> None:
+        self._detector = detector
         self._outcome = outcome
         self._running: list[RunningNode] = []
         self._has_told_failure: set[str] = set()
@@ -53,7 +53,7 @@ class Processes:
         return [
             process
             for process in self._running
-            if not any(self._watch.is_loaded(name) for name in process.names)
+            if not any(self._detector.is_loaded(name) for name in process.names)
         ]
 
     def have_reported(self) -> bool:
@@ -76,10 +76,10 @@ class Processes:
     def _when(self, process: RunningNode, is_stopping: bool) -> str:
         if is_stopping:
             return "ended while finalising"
-        if not any(map(self._watch.is_greeted, process.names)):
+        if not any(map(self._detector.is_greeted, process.names)):
             were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
             return f"ended before {were} wrote is above)"
-        seen = "".join(self._watch.last_seen(name) for name in process.names)
+        seen = "".join(self._detector.last_seen(name) for name in process.names)
         return f"ended unexpectedly{seen}"
 
 

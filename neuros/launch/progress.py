@@ -1,4 +1,4 @@
-"""How far a run has come, in one line, from the reports that nodes make once per second.
+"""Progress of a run in one line, from the reports that nodes make once per second.
 
 Standard library and ``tqdm``, which lays out the bar; nothing here writes or waits.
 """

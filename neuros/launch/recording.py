@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from neuros.launch.companion import start_companion
+from neuros.launch.child_processes import start_sidecar
 
 END = b"end\n"
 """What the recorder is told when nothing more will come."""
@@ -70,7 +70,7 @@ class RecorderProcess:
 
     def _start(self) -> subprocess.Popen[bytes]:
         # The nodes come first: what the recorder has not got to waits for it on the disk.
-        return start_companion("recorder", self._command, self._run, self._log, self._environment)
+        return start_sidecar("recorder", self._command, self._run, self._log, self._environment)
 
     def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
         """What it says, ``None`` if it ends without a word."""

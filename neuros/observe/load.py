@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import psutil
 
 LAUNCHER = "launcher"
-"""The group of the launcher itself, its guardian, and whatever else it starts."""
+"""The group of the launcher itself, its reaper, and whatever else it starts."""
 
 # A process that is just being started has still the environment of who starts it.
 _LOOKS = 3

@@ -1,4 +1,4 @@
-"""What an onlooker is told of a node several times per second: counters, state, latest times."""
+"""What an observer is told of a node several times per second: counters, state, latest times."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What onlookers see of the packets that pass a node: as few as they ask for, and none unasked.
+"""What observers see of the packets that pass a node: as few as they ask for, and none unasked.
 
-Each onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
+Each observer asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
 So a node that nobody asks pays for one look at an empty table per packet, and one that is asked for
 so many packets per question at most, however fast it sends.
@@ -69,11 +69,11 @@ class _Request:
 
 
 class Sampler:
-    """Looks at packets for onlookers.
+    """Looks at packets for observers.
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
-            each onlooker; empty as long as nobody looks.
+            each observer; empty as long as nobody looks.
     """
 
     def __init__(self) -> None:

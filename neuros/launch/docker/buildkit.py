@@ -15,12 +15,12 @@ import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 from typing import Any
 
 from docker import DockerClient
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.docker.context import serving
 from neuros.launch.docker.dockerfile import Instruction, has_syntax_line
 from neuros.launch.docker.engine import Abilities, engine_socket
 
@@ -129,15 +129,8 @@ def _served(content: bytes) -> Iterator[str]:
         def log_message(self, *_: object) -> None:
             """Nobody wants to know."""
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}{secret}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with serving(ThreadingHTTPServer(("127.0.0.1", 0), Handler)) as address:
+        yield address + secret
 
 
 def _as_classic(stream: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:

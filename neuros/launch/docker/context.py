@@ -1,16 +1,22 @@
-"""What goes to the engine for one build: files, Dockerfile, arguments, network."""
+"""Input of one image build: files, Dockerfile, arguments, network, wheels."""
 
 from __future__ import annotations
 
 import io
 import tarfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from types import MappingProxyType
 
 from docker import DockerClient
 
+from neuros.errors import EnvironmentFault
 from neuros.launch.docker.recipes import files_of
 
 CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
@@ -105,3 +111,48 @@ def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
     entry.uname = entry.gname = ""
     entry.mode = 0o755 if entry.mode & 0o111 else 0o644
     return entry
+
+
+@contextmanager
+def serving(server: ThreadingHTTPServer) -> Iterator[str]:
+    """Serve as long as the context lasts; yields the address, which ends without a slash."""
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder of wheels while an image is built without a package index; yields the address.
+
+    The classic builder has no mounts, and what is copied into an image stays in its layers. So pip
+    gets the wheels over HTTP from this machine, while the build uses this machine's network; only
+    programs of this machine reach the server.
+
+    Raises:
+        EnvironmentFault: if there are no wheels.
+    """
+    if not any(folder.glob("*.whl")):
+        raise EnvironmentFault(f"--wheelhouse {folder}: there are no wheels (*.whl) in this folder")
+    with serving(_server(folder)) as address:
+        yield f"{address}/"
+
+
+def _server(folder: Path) -> ThreadingHTTPServer:
+    """At the same port for the same folder, if that is free: the builder caches by address."""
+    handler = partial(_Handler, directory=str(folder))
+    try:
+        port = 20000 + zlib.crc32(bytes(folder.resolve())) % 10000
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except OSError:
+        return ThreadingHTTPServer(("127.0.0.1", 0), handler)

@@ -1,4 +1,4 @@
-"""Where a node in a container finds things: the same paths on every machine."""
+"""Paths that a node finds in its container; they do not depend on the machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cache of virtual environments: what is whole, who is making what, what nobody uses.
+"""Cache of virtual environments: made, being made, and unused ones.
 
 ::
 

@@ -1,4 +1,4 @@
-"""An onlooker of a run that shows what it sees in a viewer."""
+"""An observer of a run that shows what it sees in a viewer."""
 
 from __future__ import annotations
 
