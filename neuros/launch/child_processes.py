@@ -102,7 +102,7 @@ def end_now(processes: Sequence[RunningProcess]) -> None:
 
 
 def signal_in_words(number: int) -> str:
-    """What a signal has done to a process."""
+    """The effect of a signal on a process, in words."""
     try:
         return f"killed by {signal.Signals(number).name}"
     except ValueError:  # a real-time signal

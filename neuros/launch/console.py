@@ -1,7 +1,7 @@
 """Console output of a run: the lines that nodes log, and a writer that never waits.
 
 Nodes write their own log files; the launcher only reads along. So a slow terminal never holds up
-a node, and the logs are complete whatever happens to the launcher.
+a node, and the logs are complete even if the launcher is killed.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ class NonBlockingWriter:
                 assert self._descriptor is not None
                 written = os.write(self._descriptor, self._unwritten[:_CHUNK_BYTES])
                 del self._unwritten[:written]
-        except BlockingIOError:  # somebody has made it non-blocking; so much the better
+        except BlockingIOError:  # the descriptor is non-blocking already
             return
         except OSError:
             self._give_up()

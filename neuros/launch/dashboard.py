@@ -23,7 +23,7 @@ class DashboardProcess:
 
     It listens as soon as this is made, so the address may be opened at once; requests wait until
     the process is started, which loads what it needs when the first one comes. It ends when the
-    supervisor hangs up, or, if nobody has looked, with its standard input.
+    supervisor hangs up, or, if no page was open, with its standard input.
 
     Args:
         port: on 127.0.0.1; 0: any free one.

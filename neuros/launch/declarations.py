@@ -82,7 +82,7 @@ class Declarations:
         return node in self._finalising
 
     def unfinished(self, node: str) -> list[str]:
-        """What a node that has not made its final report owes: clauses about its finalise hooks."""
+        """Clauses about the finalise hooks of a node that has not made its final report."""
         clauses = []
         hook = self._finalising.get(node)
         if hook:

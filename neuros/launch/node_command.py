@@ -58,12 +58,12 @@ def node_folder(node: NodeFile) -> Path:
 
 
 def log_file(node: NodeFile) -> Path:
-    """Where the output of a node goes."""
+    """The file for the output of a node."""
     return node_folder(node) / "node.log"
 
 
 def node_environment(node: NodeFile) -> dict[str, str]:
-    """What a node finds in its environment besides what all find there."""
+    """Environment variables of one node only."""
     return {**node.node.environment, "NEUROS_RUN_DIR": str(node_folder(node))}
 
 
@@ -100,7 +100,7 @@ def node_command(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]
 
 
 def start_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
-    """What to execute for these nodes: their scripts, one after another, and then the program.
+    """The command for these nodes: their scripts, one after another, and then the program.
 
     A script runs in a process of its own in its node's environment; what it changes there does
     not reach the node. What it prints goes to the log of its node.
@@ -147,7 +147,7 @@ def with_libraries(environment: Mapping[str, str]) -> dict[str, str]:
     """An environment for this Python, which need not restart itself in it.
 
     It is the one that the restart would make. Where the wheels do not restart Python, or not as we
-    know it, it stays as it is.
+    know it, nothing is added.
     """
     libraries = _library_paths()
     if not libraries:

@@ -15,7 +15,7 @@ from neuros.launch.outcome import Outcome, Output, Phase
 
 
 class Pause:
-    """Whether a run stands still, and for how long it has in all.
+    """The pause of a run, and the time that it has been paused in all.
 
     Args:
         send: to all nodes.
@@ -40,7 +40,7 @@ class Pause:
 
     @property
     def total_s(self) -> float:
-        """How long it has stood still so far."""
+        """Seconds of pause so far."""
         since_s = self._since_s
         return self._before_s + (0.0 if since_s is None else self._clock() - since_s)
 
@@ -57,7 +57,7 @@ class Pause:
             self._send("resume")
 
     def forget(self) -> None:
-        """It is over without anybody's doing: nodes that drain go on by themselves."""
+        """The pause is over without a request: nodes that drain go on by themselves."""
         self._before_s, self._since_s = self.total_s, None
 
     def step(self, count: int, *, is_driven: bool) -> None:

@@ -204,7 +204,7 @@ class Peers:
             self._others[state.run] = state
 
     def end(self, now_s: float) -> End | None:
-        """How the project ends elsewhere, if it does."""
+        """The end of the project elsewhere, if there is one."""
         for node, gone_s in self._gone_s.items():
             state = self._others[self._run_of[node]]
             if not state.is_ending and now_s - gone_s >= _GRACE_S:
@@ -223,12 +223,12 @@ class Peers:
         return End(worst.exit_code, reason, worst.drain_s)
 
     def books(self) -> Mapping[str, Mapping[str, Any]]:
-        """What nodes elsewhere have counted on connections to here, of peers that are over."""
+        """Counters of nodes elsewhere on connections to here, of peers that are over."""
         over = [state for state in self._others.values() if state.phase == OVER]
         return {node: ledger for state in over for node, ledger in state.books.items()}
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """What to tell the user now, as ``(severity, text)``."""
+        """Remarks for the user now, as ``(severity, text)``."""
         if self._found:
             yield "INFO", f"found elsewhere: {', '.join(self._found)}"
             self._found.clear()

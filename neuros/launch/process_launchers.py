@@ -153,5 +153,5 @@ class InProcessLauncher:
 
 
 def process_log(nodes: Sequence[NodeFile]) -> Path:
-    """Where the output of the process goes."""
+    """The file for the output of the process."""
     return nodes[0].folders.run / "host.log"

@@ -10,7 +10,7 @@ from neuros.ports import RunningNode
 
 
 class Processes:
-    """Those that the back end has started, judged by what their nodes have said before.
+    """Processes that the back end has started, judged by the reports of their nodes.
 
     Attributes:
         killed: the names of all nodes whose processes were killed.
@@ -38,7 +38,7 @@ class Processes:
         self._has_told_failure.add(name)
 
     def ended(self) -> list[tuple[RunningNode, str]]:
-        """Those that have ended since this was last asked, and how."""
+        """Processes that have ended since the last call, and how."""
         ended = [(process, how) for process in self._running if (how := process.poll())]
         for process, _ in ended:
             self._running.remove(process)
@@ -49,7 +49,7 @@ class Processes:
         process.kill()
 
     def not_loaded(self) -> list[RunningNode]:
-        """Those in which no node has come as far as its first hook."""
+        """Processes in which no node has come as far as its first hook."""
         return [
             process
             for process in self._running

@@ -32,7 +32,7 @@ Waits = Mapping[str, Mapping[str, str]]
 
 
 class Verdict(Enum):
-    """What the answers say."""
+    """Conclusion from a round of probes."""
 
     UNDECIDED = "undecided"
     DRAINED = "drained"
@@ -183,7 +183,7 @@ def counters(probes: Probes) -> tuple[Any, ...]:
 def reliable_counters(
     probes: Probes, connections: Sequence[Connection]
 ) -> tuple[tuple[int, ...], ...]:
-    """What happens on reliable connections, counted; packets that may be lost flood on."""
+    """All that happens on reliable connections, counted; packets that may be lost flood on."""
     return tuple(
         (outgoing["sent"], outgoing["acknowledged"], incoming["received"], incoming["acknowledged"])
         for _, outgoing, incoming in _reliable(probes, connections)
@@ -216,7 +216,7 @@ def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
 
 
 def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[str, str]]:
-    """Who waits for whom, and why."""
+    """The nodes that wait for each other, and why."""
     result: dict[str, dict[str, str]] = {name: {} for name in probes}
     for connection in connections:
         key = str(connection)

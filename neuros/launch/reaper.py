@@ -66,7 +66,7 @@ class Reaper:
     ) -> Reaper:
         """Start a reaper and wait until it is on duty.
 
-        It holds ``lock``, too, so that nobody takes the domain before the last node is gone, and
+        It holds ``lock``, too, so that no run takes the domain before the last node is gone, and
         removes the lock file in the end. ``environment`` is added to its own. Raises
         ``EnvironmentFault``.
         """

@@ -26,7 +26,7 @@ _REMOVE_S = 5.0
 
 
 class Orders:
-    """What the launcher has told the reaper so far."""
+    """Orders of the launcher to the reaper so far."""
 
     def __init__(self, started_s: float) -> None:
         self.started_s = started_s
@@ -136,7 +136,7 @@ def _resume_containers(run_id: str, orders: Orders) -> None:
 
 
 def _remove_containers(run_id: str, orders: Orders) -> None:
-    """What a killed launcher had asked the engine for may still be on its way."""
+    """Containers that a killed launcher had asked for may still be on their way."""
     for engine in orders.engines:
         from neuros.launch.leftover_containers import remove_containers
 

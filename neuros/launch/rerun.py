@@ -1,4 +1,4 @@
-"""The two processes behind a Rerun viewer: its server, and what feeds it from a run."""
+"""Two processes behind a Rerun viewer: its server, and the feed from a run."""
 
 from __future__ import annotations
 

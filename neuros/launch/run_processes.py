@@ -1,4 +1,4 @@
-"""Which processes of this machine belong to a run, read from ``/proc``.
+"""Processes of a run on this machine, read from ``/proc``.
 
 Standard library only: the reaper runs this.
 """

@@ -1,4 +1,4 @@
-"""The runs on this machine whose user this process may see: its own, or all if it is root's.
+"""Runs on this machine that this user may see: its own, or all for root.
 
 Each run has a reaper from before its first process until after its last: where a reaper is,
 there is a run. So nothing is written down that could be out of date; what the reaper guards
@@ -58,7 +58,7 @@ class Session:
         return started_at(pid) == start and _user_of(pid) == self.user
 
     def states(self) -> Mapping[str, str]:
-        """How each node is: running, ending (its launcher has gone), or not running."""
+        """The state of each node: running, ending (its launcher has gone), or not running."""
         processes = RunProcesses(self.run)
         there = set(processes.nodes().values())
         if self.backend == "in-process" and processes.alive():
@@ -85,7 +85,7 @@ class Session:
 
 
 def reaper_environment(session: Session) -> dict[str, str]:
-    """What makes a reaper known as that of a run."""
+    """Environment that marks a reaper as that of a run."""
     return {_VARIABLE: json.dumps(asdict(session))}
 
 
@@ -118,7 +118,7 @@ def _user_of(pid: int) -> int | None:
 
 
 def _session(described: Mapping[str, Any]) -> Session:
-    """What a reaper's environment describes; raises ``KeyError`` if something lacks."""
+    """The run that a reaper's environment describes; raises ``KeyError`` if something lacks."""
     known = {each.name: described[each.name] for each in fields(Session)}
     known |= {name: tuple(described[name]) for name in ("nodes", "launcher")}
     return Session(**known)

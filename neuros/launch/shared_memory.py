@@ -217,7 +217,7 @@ def remove_dead_runs(
 
 
 def _dead(folder: Path) -> dict[str, int]:
-    """Names and inodes of what nobody holds, of runs without processes."""
+    """Names and inodes without a lock, of runs without processes."""
     found: dict[str, int] = {}
     is_alive: dict[str, bool] = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
@@ -233,7 +233,7 @@ def _dead(folder: Path) -> dict[str, int]:
 
 
 def _inode_if_free(path: Path) -> int | None:
-    """The inode of a file or folder of this user that nobody has locked."""
+    """The inode of a file or folder of this user without a lock."""
     with contextlib.suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:

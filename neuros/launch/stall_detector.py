@@ -115,7 +115,7 @@ class StallDetector:
         return True
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """What to tell the user now, as ``(severity, text)``."""
+        """Remarks for the user now, as ``(severity, text)``."""
         if now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             if self._silent:
@@ -161,14 +161,14 @@ class StallDetector:
                 yield "WARN", with_stack(text, held)
 
     def stack_of(self, name: str) -> Stack | None:
-        """Where a node stands in its plugin, as far as is known."""
+        """The stack of a node in its plugin, as far as is known."""
         if held := self._held(name):
             return held
         stack = self._reports.get(name, {}).get("stack")
         return Stack(*stack) if stack else None
 
     def threads_of(self, name: str) -> str:
-        """Where the threads of a node's process were if that has not reported for seconds."""
+        """The threads of a node's process if that has not reported for seconds."""
         return held_threads(self._run_folder / self._hosts.get(name, name))
 
     def executing(self, name: str) -> str:
@@ -180,12 +180,12 @@ class StallDetector:
         return held.hook if held else ""
 
     def last_seen(self, name: str) -> str:
-        """What a node was doing when it reported last: ``", last seen executing 'step'"``."""
+        """The hook of a node at its last report: ``", last seen executing 'step'"``."""
         hook = self.executing(name)
         return f", last seen executing '{hook}'" if hook else ""
 
     def _held(self, name: str) -> Stack | None:
-        """Where a node stands that holds Python's global lock."""
+        """The stack of a node that holds Python's global lock."""
         held = held_stack(self._run_folder / self._hosts.get(name, name))
         return held if held is not None and held.node == name else None
 
@@ -253,7 +253,7 @@ class Backlog:
             samples.clear()
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """What to tell the user now, as ``(severity, text)``: each connection once."""
+        """Remarks for the user now, as ``(severity, text)``: each connection once."""
         for key, connection in self._connections.items():
             if key in self._named:
                 continue

@@ -225,7 +225,7 @@ class Supervisor:
     # ------------------------------------------------------------------ time
 
     def _pause_s(self, has_shown: bool) -> float:
-        """How long nothing needs to be looked at; ``has_shown``: nodes are logging now."""
+        """Seconds until the next look; ``has_shown``: nodes are logging now."""
         if has_shown or self._shutdown.phase is not Phase.RUNNING:
             return _TICK_S
         end_s = self._end_s

@@ -111,7 +111,7 @@ def _is_here(engine: DockerClient) -> bool:
 
 @contextmanager
 def _served(content: bytes) -> Iterator[str]:
-    """Serve this at an address that nobody guesses, to programs of this machine only."""
+    """Serve this at a secret address, to programs of this machine only."""
     secret = f"/{secrets.token_urlsafe()}/context.tar.gz"
 
     class Handler(BaseHTTPRequestHandler):
@@ -127,7 +127,7 @@ def _served(content: bytes) -> Iterator[str]:
             self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
-            """Nobody wants to know."""
+            """Log nothing."""
 
     with serving(ThreadingHTTPServer(("127.0.0.1", 0), Handler)) as address:
         yield address + secret

@@ -31,7 +31,7 @@ _NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What all builds on this machine need, whatever they build.
+    """Needs of this machine that all builds share.
 
     Attributes:
         arguments: build arguments; the engine keeps proxies out of the images' history.
@@ -47,12 +47,12 @@ class Surroundings:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """What has to lie beside every Dockerfile for it."""
+        """Files to lay beside every Dockerfile."""
         return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
 
     @property
     def lines(self) -> str:
-        """What every stage of a Dockerfile has to declare for it."""
+        """Lines to declare in every stage of a Dockerfile."""
         lines = []
         if self.ca_bundle:
             lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
@@ -65,7 +65,7 @@ class Surroundings:
 def surroundings(
     engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
 ) -> Surroundings:
-    """What this machine's environment, and the engine, ask for.
+    """Needs of this machine, from its environment and the engine.
 
     A wheelhouse leaves proxies out, and packages of the operating system.
     """
@@ -106,7 +106,7 @@ def context_of(
 
 
 def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
-    """Readable by all, whatever the umask of whoever wrote it was."""
+    """Make it readable by all, without its owner."""
     entry.uid = entry.gid = 0
     entry.uname = entry.gname = ""
     entry.mode = 0o755 if entry.mode & 0o111 else 0o644

@@ -50,7 +50,7 @@ class Containers:
     abilities: Abilities
 
     def record(self) -> dict[str, Any]:
-        """What there is to know of them later, ready for JSON. Raises ``EnvironmentFault``."""
+        """The engine's version and the images, ready for JSON. Raises ``EnvironmentFault``."""
         with engine_faults("Docker"):
             version = self.engine.version()["Version"]
         images = {
@@ -61,7 +61,7 @@ class Containers:
 
 
 def find_containers(names: Iterable[str], project_folder: Path | None) -> Containers:
-    """What containers of these names are started from.
+    """The engine and the images for containers of these names.
 
     Raises:
         EnvironmentFault: if there is no engine, or an image is not there.
@@ -184,7 +184,7 @@ class DockerLauncher:
 
 
 def _in_run_folder(nodes: Sequence[NodeFile]) -> list[Path]:
-    """What is there before any node runs, and is not to be written by all: folders, the project."""
+    """Entries of the run folder that not all nodes may write to: folders, the project."""
     entries = sorted(nodes[0].folders.run.iterdir())
     return [path for path in entries if path.is_dir() or path.name == PROJECT_FILE]
 
@@ -281,7 +281,7 @@ class RunningContainer:
 
 
 def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: int | None) -> str:
-    """How a container ended, in words.
+    """The end of a container, in words.
 
     Args:
         log: of the node; its last line says what could not be executed.
@@ -302,7 +302,7 @@ def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: i
 
 @dataclass
 class _Fate:
-    """What is known of a container; ``exit_code`` is ``None`` while it runs."""
+    """Events of a container so far; ``exit_code`` is ``None`` while it runs."""
 
     exit_code: int | None = None
     died_s: float = 0.0
@@ -357,7 +357,7 @@ class ContainerEvents(threading.Thread):
             self._stream.close()
 
     def add(self, container_id: str) -> None:
-        """Somebody will ask for the end of this container."""
+        """Keep listening until the end of this container has been asked for."""
         self._awaited.add(container_id)
 
     def end_of(self, container_id: str) -> tuple[int, bool] | None:
@@ -373,7 +373,7 @@ class ContainerEvents(threading.Thread):
         return fate.exit_code, fate.is_out_of_memory
 
     def is_signalled(self, container_id: str) -> bool:
-        """Whether the engine has sent it a signal, whoever asked for that."""
+        """Whether the engine has sent it a signal."""
         fate = self._fates.get(container_id)
         return fate is not None and fate.is_signalled
 

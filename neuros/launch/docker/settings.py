@@ -84,7 +84,7 @@ class User:
 def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:
     """The caller, as far as a node is let in to what belongs to the caller.
 
-    Whoever runs a rootless engine is called root in its containers, with the same few rights.
+    A rootless engine calls its user root in containers, with no more rights.
 
     Raises:
         EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
@@ -159,7 +159,7 @@ def container_settings(
 
 
 def container_name(file: NodeFile, run_id: str) -> str:
-    """What a container is called: unique, and to be recognised in ``docker ps``."""
+    """The name of a container: unique, and to be recognised in ``docker ps``."""
     return f"neuros-{file.node.name}-{run_id[:8]}"
 
 
@@ -169,7 +169,7 @@ def shared_memory(run_id: str) -> Path:
 
 
 def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
-    """What a container executes, whatever the image would execute by itself."""
+    """The command of a container, in place of the image's own."""
     seen = inside(file)
     command = [*image.start, "-m", "neuros.cli", "node", *options]
     return [

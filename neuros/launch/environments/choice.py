@@ -30,7 +30,7 @@ _FORMAT = 1  # of what is made: another one makes all environments anew
 
 
 def wanted_version(folder: Path) -> Version | None:
-    """What ``.python-version`` in a container's folder says, as pyenv and uv read it; or ``None``.
+    """The version in a container's ``.python-version``, as pyenv and uv read it; or ``None``.
 
     Raises:
         EnvironmentFault: if there are no packages of ROS 2 for that Python.
@@ -92,7 +92,7 @@ def _is_version(path: Path, version: Version, environ: Mapping[str, str]) -> boo
 
 @dataclass(frozen=True)
 class Choice:
-    """What a container needs.
+    """The Python and the packages of a container.
 
     Attributes:
         version: the Python that it is to run on.
@@ -135,7 +135,7 @@ class Choice:
 
 
 def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) -> Choice:
-    """What a container with a ``requirements.txt`` needs.
+    """Choose for a container with a ``requirements.txt``.
 
     Raises:
         EnvironmentFault: if its files cannot be read, or ask for a Python without ROS 2.
@@ -157,7 +157,7 @@ def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) 
 
 
 def choose_here(container: ContainerFolder, cache: Path) -> Choice:
-    """The same where it runs on this version of Python in any case.
+    """Choose for a container that runs on this version of Python.
 
     Raises:
         EnvironmentFault: if its files cannot be read.
@@ -174,7 +174,7 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
 
 
 def own_needs() -> list[str]:
-    """What NeuROS itself needs, as requirements; empty if it is not installed here."""
+    """The requirements of NeuROS itself; empty if it is not installed here."""
     try:
         needs = importlib.metadata.requires("neuros") or []
     except importlib.metadata.PackageNotFoundError:

@@ -41,7 +41,7 @@ _FEW = 5
 
 
 class Pythons:
-    """What the nodes run on whose containers have a ``requirements.txt``.
+    """Pythons of the nodes whose containers have a ``requirements.txt``.
 
     Args:
         choices: by the name of the node; nodes of one container share theirs.
@@ -76,7 +76,7 @@ class Pythons:
 
     @property
     def notices(self) -> list[str]:
-        """What the user should know."""
+        """Notices for the user."""
         return [choice.notice for choice in self._each() if choice.notice]
 
     @property
@@ -159,7 +159,7 @@ def _containers(
 
 
 def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """Make the environment, unless somebody else has made it meanwhile.
+    """Make the environment, unless another launch has made it meanwhile.
 
     Args:
         run_environment: is added to the environment of the programs that this starts.
@@ -180,7 +180,7 @@ def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str])
 
 
 def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """The same, under the lock."""
+    """Make it, under the lock."""
     entry = choice.entry
     if entry.python():
         return
@@ -287,7 +287,7 @@ def _fault(choice: Choice, cause: str) -> EnvironmentFault:
 
 
 def why_pip_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
-    """What in the output of pip is the cause, for a version of Python as ``3.12``.
+    """The cause in the output of pip, for a version of Python as ``3.12``.
 
     ``own_needs`` are the requirements of NeuROS itself that pip was given, too.
     """
@@ -304,7 +304,7 @@ def why_pip_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
 
 
 def why_no_venv(output: str, python: str) -> str:
-    """What in the output of ``venv`` is the cause."""
+    """The cause in the output of ``venv``."""
     if re.search(r"ensurepip|No module named '?venv", output):
         remedy = system_install(apt=f"python{python}-venv", dnf="python3-pip")
         return f"Python {python} has no venv: {remedy}"
@@ -313,7 +313,7 @@ def why_no_venv(output: str, python: str) -> str:
 
 
 def why_no_files(error: OSError, cache: Path) -> str:
-    """What is wrong with the folder of the cache."""
+    """The cause in an error of the cache's folder."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"the disk of {cache} is full: make room (df -h), or set XDG_CACHE_HOME"
     return f"{error.filename or cache}: {error.strerror}: set XDG_CACHE_HOME to another folder"
