@@ -27,7 +27,7 @@ explain say why nothing moves
 drain   stop the hooks that send unasked; some start     last_round
         once more (their places, by node)
 stop    start no further hook, finalise and end
-say     let nodes elsewhere hear this (see launch.sides) text
+say     let nodes elsewhere hear this (see launch.peers) text
 leave   all is said and heard: a node at its end may go
 pause   start no further hook
 resume  go on
@@ -35,10 +35,10 @@ step    while paused, go on by so many steps             count, is_driven
 look    show what you do; what to sample, by node        wanted, asker
 ======= ================================================ =================
 
-Onlookers (the dashboard) are on the same channel, and get no more than they ask for:
+Observers (the dashboard) are on the same channel, and get no more than they ask for:
 
 ======= ================================================ =================
-kind    sent by an onlooker                              fields
+kind    sent by an observer                              fields
 ======= ================================================ =================
 watch   it is there
 look    all nodes are to show it what they do, once      wanted
@@ -49,7 +49,15 @@ end     end the run, drained, with exit code 0           reason
 signal  do what Ctrl+C does (``neuros stop``)
 ======= ================================================ =================
 
-=========== ================================================ =========="""
+=========== ================================================ =================
+kind        sent to observers                                fields
+=========== ================================================ =================
+node_status state and counters of a node, for the one asking node, ...
+phase       phase of the run                                 phase, is_paused
+log         messages of the launcher to the user             severity, text
+ended       all nodes have ended; their last reports         exit_code, reason, ...
+=========== ================================================ =================
+"""
 
 from __future__ import annotations
 
@@ -86,7 +94,7 @@ class Lines:
         return True
 
     def receive(self) -> list[Mapping[str, Any]] | None:
-        """Messages that have arrived, after one read; ``None`` once the other end is gone."""
+        """What has arrived, after one read; ``None`` once the other end is gone."""
         try:
             return self.receive_now()
         except BlockingIOError:

@@ -154,13 +154,13 @@ class EventLoop(Protocol):
 
 
 class Voice(Protocol):
-    """What nodes say to those that another launcher has started."""
+    """Publishes the state of a launcher to its peers."""
 
     def say(self, text: str) -> None:
         """Let it be heard elsewhere, also by who comes later. Any thread."""
 
     def close(self) -> None:
-        """Let the last word arrive, then be silent."""
+        """Let the last state arrive, then be silent."""
 
 
 class Middleware(Protocol):
@@ -190,7 +190,7 @@ class Middleware(Protocol):
     def has_foreign_entities(self, file: NodeFile) -> bool:
         """Whether a plugin has subscriptions, timers, services or clients on its ROS node."""
 
-    def join_sides(
+    def join_peers(
         self,
         names: Sequence[str],
         elsewhere: Sequence[str],
@@ -198,7 +198,7 @@ class Middleware(Protocol):
     ) -> Voice:
         """Speak for the nodes ``names`` of this process, and listen to nodes elsewhere.
 
-        ``heard`` is called from any thread, with a node and its word, or ``None`` when it is gone.
+        ``heard`` is called from any thread, with a node and its state, or ``None`` when it is gone.
         """
 
     def copy(self, packet: Packet) -> Packet:

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neuros.launch.host import HostProcess
-from neuros.launch.in_process import InProcessLauncher
+from neuros.launch.child_processes import RunningProcess
 from neuros.launch.outcome import Outcome
-from neuros.launch.process import ProcessLauncher
-from neuros.launch.sides import Sides
+from neuros.launch.peers import Peers
+from neuros.launch.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.launch.supervisor import Supervisor
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
@@ -55,7 +54,7 @@ class Run:
         self.folder = folder
         self.output = Output()
         self.signals: list[int] = []
-        self.hosts: list[HostProcess] = []
+        self.hosts: list[RunningProcess] = []
         self.lasted_s = 0.0
 
     def file(self, name: str, act: str, connections: tuple[Connection, ...]) -> NodeFile:
@@ -82,7 +81,7 @@ class Run:
             self.output,
             self.signals,
             duration_s=duration_s,
-            sides=Sides("this run", elsewhere, files),
+            peers=Peers("this run", elsewhere, files),
         )
         start_s = time.monotonic()
         outcome = supervisor.run()
@@ -119,7 +118,7 @@ class _Noting:
     """A launcher whose hosts the test can look after."""
 
     launcher: Any
-    hosts: list[HostProcess]
+    hosts: list[RunningProcess]
 
     def start(self, *arguments: Any) -> Any:
         self.hosts += self.launcher.start(*arguments)

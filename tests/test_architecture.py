@@ -39,19 +39,16 @@ def is_within(module: str, package: str) -> bool:
 
 
 SUPERVISOR = (
-    "backlog",
     "supervisor",
     "channels",
     "declarations",
-    "ending",
-    "onlookers",
+    "shutdown",
+    "observers",
     "outcome",
-    "probing",
     "processes",
     "quiescence",
-    "sides",
-    "watch",
-    "word",
+    "peers",
+    "stall_detector",
 )
 
 # The first room that holds a module is its room.
@@ -216,11 +213,11 @@ def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
         ("neuros.runtime.node", "from neuros import Project", "api is on floor 6"),
         ("neuros.hooks", "def f():\n    import neuros.project.model", "project is on floor 1"),
         ("neuros.project.load", "import jsonschema", "third-party package jsonschema"),
-        ("neuros.transport.ros", "from neuros.launch import process", "launch is on floor 4"),
+        ("neuros.transport.ros", "from neuros.launch import console", "launch is on floor 4"),
         ("neuros.transport.memory", "import rclpy", "third-party package rclpy"),
         ("neuros.runtime.node", "from neuros.transport.ros import x", "sees ports only"),
-        ("neuros.launch.supervisor", "from neuros.launch.process import x", "sees ports only"),
-        ("neuros.launch.process", "from neuros.launch.supervisor import x", "on floor 5"),
+        ("neuros.launch.supervisor", "from neuros.launch.console import x", "sees ports only"),
+        ("neuros.launch.console", "from neuros.launch.supervisor import x", "on floor 5"),
         ("neuros.simulators.mujoco.sensors", "import nest", "third-party package nest"),
         ("neuros.snn.decoding", "import nest", "third-party package nest"),
         ("neuros.installation.machine", "from neuros.hooks import All", "nothing but errors"),

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.launch.docker.layout import as_here, inside
-from neuros.launch.guardian import Guardian
-from neuros.launch.in_process import InProcessLauncher
 from neuros.launch.placement import Cores
-from neuros.launch.process import ProcessLauncher
+from neuros.launch.process_launchers import InProcessLauncher, ProcessLauncher
+from neuros.launch.reaper import Reaper
 from neuros.ports import Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.transport.dds_profile import as_asked
@@ -58,7 +57,7 @@ class BackEnd:
         options: Sequence[str],
         placement: Mapping[str, Cores],
         pythons: Mapping[str, Path],
-        guardian: Guardian | None = None,
+        reaper: Reaper | None = None,
     ) -> Launcher:
         """Starts nodes; ``options`` are those of the command ``node``.
 
@@ -67,9 +66,9 @@ class BackEnd:
         if self.containers:
             from neuros.launch.docker.launcher import DockerLauncher
 
-            watch = guardian.watch_containers if guardian else None
+            watch = reaper.watch_containers if reaper else None
             return DockerLauncher(self.containers, options, watch, placement, as_asked(os.environ))
-        on_started = guardian.watch if guardian else None
+        on_started = reaper.watch if reaper else None
         if self.name == "in-process":
             return InProcessLauncher([*_COMMAND, *options, "--in-memory"], on_started, placement)
         return ProcessLauncher([*_COMMAND, *options], on_started, placement, pythons)

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TextIO
 
 from neuros.api.progress_line import ProgressLine
-from neuros.launch.console import LAYOUT, LogTail, format_record, wants_colours
+from neuros.launch.console import LAYOUT, LogTail, NonBlockingWriter, format_record, wants_colours
 from neuros.launch.progress import Progress
-from neuros.launch.screen import Screen
 
 
 class Console:
@@ -33,7 +32,7 @@ class Console:
         *,
         shows_progress: bool | None = None,
     ) -> None:
-        self._screen = Screen(stream)
+        self._writer = NonBlockingWriter(stream)
         self._translate = translate
         self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
         colours = stream is not None and wants_colours(stream, os.environ)
@@ -45,9 +44,9 @@ class Console:
 
     def write(self, text: str) -> None:
         """Write as it is, but for the names of paths."""
-        self._screen.write(self._line.around(self._translate(text)))
+        self._writer.write(self._line.around(self._translate(text)))
         if self._is_finishing:
-            self._screen.finish(self._is_enough, self._patience_s)
+            self._writer.finish(self._is_enough, self._patience_s)
 
     def log(self, severity: str, text: str) -> None:
         """Write a record of the launcher itself, after what nodes have logged so far."""
@@ -60,15 +59,15 @@ class Console:
 
     def poll(self) -> object:
         """Show what nodes have logged since; it stays in their files while the reader is behind."""
-        self._screen.flush()
-        if self._screen.is_behind or self._is_finishing:
+        self._writer.flush()
+        if self._writer.is_behind or self._is_finishing:
             return None
-        self._screen.write(self._line.update())
+        self._writer.write(self._line.update())
         return self._tail.poll()
 
     def finish(self, patience_s: float | None) -> None:
         """Show the rest; from now on wait for the reader, or lose ``patience_s`` seconds."""
-        self._screen.write(self._line.end())
+        self._writer.write(self._line.end())
         self._is_finishing = True
         self._patience_s = patience_s
         self.write("")

@@ -6,9 +6,9 @@ import os
 
 from neuros.installation.progress import Progress, Stream
 from neuros.launch.environments.pythons import Pythons
-from neuros.launch.guardian import Guardian
+from neuros.launch.node_command import without_mark
+from neuros.launch.reaper import Reaper
 from neuros.launch.run_processes import RUN_ID
-from neuros.launch.wheels import without_mark
 from neuros.messages.needed import Messages
 
 
@@ -25,14 +25,14 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
         return
     # pip, the compiler, and what they start must not outlive a launcher that is killed.
     run_id = os.urandom(8).hex()
-    guardian = Guardian.start(run_id)
+    reaper = Reaper.start(run_id)
     try:
         progress = Progress(output)
         if messages is not None:
             messages.make(progress, {**without_mark(os.environ), RUN_ID: run_id})
         pythons.make(progress, {RUN_ID: run_id})
     finally:
-        guardian.finish()
+        reaper.finish()
 
 
 def are_made(pythons: Pythons, messages: Messages | None) -> bool:

@@ -21,17 +21,17 @@ from neuros.api.run_folder import make_run_folder, write_node_files, write_recor
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock, choose_domain
-from neuros.launch.guardian import Guardian
-from neuros.launch.host_command import with_messages
+from neuros.launch.node_command import with_messages
 from neuros.launch.outcome import Outcome
+from neuros.launch.peers import Peers
 from neuros.launch.progress import Progress
-from neuros.launch.sessions import Session, guardian_environment, this_process
-from neuros.launch.sides import Sides
+from neuros.launch.reaper import Reaper
+from neuros.launch.sessions import Session, reaper_environment, this_process
 from neuros.launch.supervisor import Supervisor
 from neuros.observe.budgets import broken_budgets, losses
 from neuros.observe.recording.plan import RecordingPlan
 from neuros.observe.run_record import run_record, run_table
-from neuros.runtime.side import ELSEWHERE_VARIABLE
+from neuros.runtime.peer_link import ELSEWHERE_VARIABLE
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
@@ -51,7 +51,7 @@ class Shown:
 class Views(Protocol):
     """Windows and pages that show a run, from when there is a control socket to its end."""
 
-    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None: ...
+    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None: ...
     def finish(self) -> None: ...
 
 
@@ -125,17 +125,17 @@ class Execution:
         started = time.time()
         with contextlib.ExitStack() as stack:
             stack.callback(self._domain.release)
-            environment = guardian_environment(self._session(started))
-            guardian = Guardian.start(self._run_id, self._domain, environment)
-            stack.callback(guardian.finish)
-            guardian.remove_later(self.folder / SOCKET_NAME)
-            return self._run(guardian, started)
+            environment = reaper_environment(self._session(started))
+            reaper = Reaper.start(self._run_id, self._domain, environment)
+            stack.callback(reaper.finish)
+            reaper.remove_later(self.folder / SOCKET_NAME)
+            return self._run(reaper, started)
 
     def cancel(self) -> None:
         """Give up what it holds, in the place of :meth:`run`."""
         self._domain.release()
 
-    def _run(self, guardian: Guardian, started: float) -> dict[str, Any]:
+    def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:
         started_s = time.monotonic()
         observation = self._observation()
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
@@ -144,14 +144,14 @@ class Execution:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
             for severity, notice in self._plan.back_end.notices:
                 self._console.log(severity, notice)
-            recording = self._recording(guardian)
-            supervisor = self._supervisor(guardian)
+            recording = self._recording(reaper)
+            supervisor = self._supervisor(reaper)
             outcome = supervisor.outcome
             duration = self._plan.duration
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             if self._views is not None:
                 shown = Shown(self._run_id, self.folder, self._beside(), self._logs)
-                self._views.start(shown, guardian, self._console.log)
+                self._views.start(shown, reaper, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -164,7 +164,7 @@ class Execution:
                 outcome.fail(fault, EXIT_ENVIRONMENT)
             if self._views is not None:
                 self._views.finish()
-            guardian.finish()
+            reaper.finish()
             # Whoever has ended the run is not made to wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
@@ -195,10 +195,10 @@ class Execution:
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return record
 
-    def _recording(self, guardian: Guardian) -> Recording | None:
+    def _recording(self, reaper: Reaper) -> Recording | None:
         if self._recording_plan is None:
             return None
-        return Recording(self._recording_plan, self._run_id, self.folder, self._beside(), guardian)
+        return Recording(self._recording_plan, self._run_id, self.folder, self._beside(), reaper)
 
     def _beside(self) -> dict[str, str]:
         """What programs beside the nodes get, which know the same messages."""
@@ -266,17 +266,17 @@ class Execution:
             self._plan.project.names.namespace,
         )
 
-    def _supervisor(self, guardian: Guardian) -> Supervisor:
+    def _supervisor(self, reaper: Reaper) -> Supervisor:
         return Supervisor(
             self._files,
-            self._plan.launcher(guardian),
+            self._plan.launcher(reaper),
             self._environment(),
             self.folder,
             self._console,
             self._signals,
             wishes=self._wishes,
             duration_s=self._plan.duration.wall_s,
-            sides=Sides(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
+            peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
             waker=self._waker,
         )
 

@@ -13,8 +13,8 @@ from neuros.api.network import THIS_MACHINE, Network, chosen_network
 from neuros.api.request import Duration, Request
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.launch.environments.pythons import Pythons, require_one_python
-from neuros.launch.guardian import Guardian
 from neuros.launch.placement import place, usable_cores
+from neuros.launch.reaper import Reaper
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.ports import Launcher
@@ -71,8 +71,8 @@ class Plan:
         paths = self.messages.paths if self.messages else ()
         return [replace(f, messages=paths) for f in files if f.node.name in self.names]
 
-    def launcher(self, guardian: Guardian | None = None) -> Launcher:
-        """The launcher of the back end; ``guardian`` hears of all it starts."""
+    def launcher(self, reaper: Reaper | None = None) -> Launcher:
+        """The launcher of the back end; ``reaper`` hears of all it starts."""
         nodes = [self.project.node(name) for name in self.names]
         options: list[str] = []
         if self.duration.sim_s is not None:
@@ -84,7 +84,7 @@ class Plan:
         if self.recording is not None:
             options.append("--record")
         return self.back_end.launcher(
-            options, place(nodes) if self.is_placed else {}, self.pythons.paths, guardian
+            options, place(nodes) if self.is_placed else {}, self.pythons.paths, reaper
         )
 
 

@@ -18,7 +18,7 @@ from neuros.api.plan import Plan
 from neuros.api.request import Request
 from neuros.api.run_folder import run_folder_path
 from neuros.errors import UsageError
-from neuros.launch.guardian import Guardian
+from neuros.launch.reaper import Reaper
 from neuros.launch.recording import Recorded, RecorderProcess
 from neuros.observe.recording.plan import BAG_NAME, RecordingPlan
 from neuros.observe.recording.selection import plan_recording
@@ -42,7 +42,7 @@ class Recording:
         run_id: str,
         run: Path,
         environment: Mapping[str, str],
-        guardian: Guardian,
+        reaper: Reaper,
     ) -> None:
         self._plan = replace(plan, custom={**plan.custom, "run_id": run_id})
         self._run = run
@@ -54,7 +54,7 @@ class Recording:
             ) from error
         command = [sys.executable, "-m", "neuros.cli", "recorder", str(run)]
         self._process = RecorderProcess(command, run, log_of(run), environment)
-        guardian.watch(self._process.pid)
+        reaper.watch(self._process.pid)
 
     def finish(self, signals: Sequence[int]) -> Recorded:
         """Have the bag completed; who has no patience for that sends another signal."""

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from neuros.api.environments import make_environments
 from neuros.errors import Problem
+from neuros.launch.child_processes import signal_in_words
 from neuros.launch.environments.pythons import Pythons
-from neuros.launch.host import signal_in_words
-from neuros.launch.wheels import without_mark
+from neuros.launch.node_command import without_mark
 from neuros.messages.needed import Messages
 from neuros.project.model import Node, Project
 from neuros.project.plugin_files import PluginFile, read_plugin

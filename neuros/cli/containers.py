@@ -82,9 +82,8 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
 def _build(options: argparse.Namespace) -> int:
     from neuros.installation.progress import Progress
     from neuros.launch.docker.building import ImageBuilder, Wishes
-    from neuros.launch.docker.context import surroundings
+    from neuros.launch.docker.context import served, surroundings
     from neuros.launch.docker.engine import connect
-    from neuros.launch.docker.wheelhouse import served
 
     wishes = Wishes(
         logs=_cache() / "builds",

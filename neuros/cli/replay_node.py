@@ -180,10 +180,10 @@ def _folder(output: str | None) -> Path:
 
 
 def _become(command: Sequence[str], file: NodeFile) -> None:
-    from neuros.launch.host_command import (
-        host_arguments,
-        host_environment,
+    from neuros.launch.node_command import (
         node_environment,
+        process_environment,
+        start_arguments,
         start_environment,
         with_messages,
     )
@@ -199,9 +199,9 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
         "ROS_LOG_DIR": str(file.folders.run),
     }
     environment = start_environment(
-        command, [file], with_messages(host_environment(os.environ, added), file.messages)
+        command, [file], with_messages(process_environment(os.environ, added), file.messages)
     )
-    arguments = host_arguments(command, [file])
+    arguments = start_arguments(command, [file])
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os.chdir(file.folders.run)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.launch.dead_runs import remove_dead_runs
 from neuros.launch.sessions import Session, sessions
+from neuros.launch.shared_memory import remove_dead_runs
 
 _SHOWN = 8  # digits of a run's id
 _AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
@@ -87,7 +87,7 @@ def _stop(options: argparse.Namespace) -> int:
     for session in chosen:
         print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
     for name in remove_dead_runs():
-        print(f"removed {name} from shared memory: its run was killed, and its guardian, too")
+        print(f"removed {name} from shared memory: its run was killed, and its reaper, too")
     return 0
 
 
@@ -110,7 +110,7 @@ def _is_named(session: Session, name: str) -> bool:
 
 
 def _await_end(chosen: Sequence[Session]) -> None:
-    """Until the guardians have gone, and with them all that they guard."""
+    """Until the reapers have gone, and with them all that they guard."""
     begin_s = time.monotonic()
     waiting, has_insisted = {session.run for session in chosen}, False
     while waiting := waiting & {session.run for session in sessions()}:

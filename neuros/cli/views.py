@@ -16,7 +16,7 @@ from neuros.errors import EnvironmentFault
 if TYPE_CHECKING:
     from neuros.api.execution import Shown
     from neuros.api.plan import Plan
-    from neuros.launch.guardian import Guardian
+    from neuros.launch.reaper import Reaper
     from neuros.launch.rerun import RerunProcesses
     from neuros.launch.tools import Tool
 
@@ -79,7 +79,7 @@ class Views:
                 self._take_rerun(reason)
         self._dashboard = dashboard_of(options, is_wanted=self._opens_graph)
 
-    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None:
+    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
         """Open windows and pages, once there is a control socket. Raises ``EnvironmentFault``."""
         for notice in self._notices:
             log("INFO", notice)
@@ -87,11 +87,11 @@ class Views:
             arguments = [] if tool.program == "rqt_graph" else ["-d", self._write_rviz(run.folder)]
             running = tool.start(arguments, run.folder, run.environment)
             self._running.append(running)
-            running.announce(guardian)
+            running.announce(reaper)
             log("INFO", f"{tool.program}: a window on this display")
         if self._dashboard is not None:
             self._running.append(self._dashboard)
-            guardian.watch(
+            reaper.watch(
                 start_dashboard(
                     self._dashboard,
                     self._plan,
@@ -105,7 +105,7 @@ class Views:
             if self._opens_graph:
                 _open(f"{self._dashboard.url}#graph-section")
         if self._rerun is not None:
-            self._start_rerun(self._rerun, run, guardian)
+            self._start_rerun(self._rerun, run, reaper)
             log("INFO", f"visualisations: {self._rerun.url}")
 
     def finish(self) -> None:
@@ -136,7 +136,7 @@ class Views:
         self._rerun = RerunProcesses()
         self._notices.append(f"--visualisations: in Rerun, since {reason}")
 
-    def _start_rerun(self, rerun: RerunProcesses, run: Shown, guardian: Guardian) -> None:
+    def _start_rerun(self, rerun: RerunProcesses, run: Shown, reaper: Reaper) -> None:
         from neuros.dashboard.plan import plan as shown_plan
 
         sources = shown_plan(self._plan.project, self._plan.names)["sources"]
@@ -144,7 +144,7 @@ class Views:
         told = {"project": self._plan.project.name, "sources": sources}
         self._running.append(rerun)
         for pid in rerun.start(command, run.folder, run.environment, told):
-            guardian.watch(pid)
+            reaper.watch(pid)
 
     def _write_rviz(self, folder: Path) -> str:
         from neuros.views.rviz import rviz_configuration
@@ -166,7 +166,7 @@ def _open(url: str) -> None:
 
 def _run_view(options: argparse.Namespace) -> int:
     from neuros.launch.rerun import await_server
-    from neuros.views.onlooker import look_on
+    from neuros.views.observer import look_on
     from neuros.views.rerun_feed import RerunFeed
     from neuros.views.visual_types import VisualTypes
 

@@ -1,1 +1,1 @@
-"""Where nodes run, and what starts, watches and ends them."""
+"""Back ends that run nodes, and the supervisor that starts, watches and ends them."""

@@ -1,4 +1,4 @@
-"""Where a container is described: a folder of its name, beside the project file or in NeuROS."""
+"""Finds the folder that describes a container, beside the project file or in NeuROS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 FOLDER = "containers"
-OWN_FOLDER = Path(__file__).resolve().parents[2] / FOLDER
+PACKAGE = Path(__file__).resolve().parents[1]
+"""The folder of the Python package ``neuros``."""
+
+OWN_FOLDER = PACKAGE.parent / FOLDER
 """NeuROS's own; they are part of the source checkout."""
 
 _SLIP = 0.9

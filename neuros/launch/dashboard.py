@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import UsageError
-from neuros.launch.companion import start_companion
+from neuros.launch.child_processes import start_sidecar
 
 HOST = "127.0.0.1"
 _END_S = 3.0
@@ -23,7 +23,7 @@ class DashboardProcess:
 
     It listens as soon as this is made, so the address may be opened at once; requests wait until
     the process is started, which loads what it needs when the first one comes. It ends when the
-    supervisor hangs up, or, if nobody has looked, with its standard input.
+    supervisor hangs up, or, if no page was open, with its standard input.
 
     Args:
         port: on 127.0.0.1; 0: any free one.
@@ -70,7 +70,7 @@ class DashboardProcess:
             EnvironmentFault: if it cannot be started.
         """
         descriptor = self._listening.fileno()
-        self._process = process = start_companion(
+        self._process = process = start_sidecar(
             "dashboard", command, run, run / "dashboard.log", environment, [descriptor]
         )
         self._listening.close()

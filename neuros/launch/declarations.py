@@ -1,4 +1,4 @@
-"""What plugins declare, as far as the end of a run depends on it.
+"""Declarations of plugins that the end of a run depends on.
 
 A loop in which every hook waits for the one before it never comes to rest by itself, so a drained
 end has to stop it after one more round. Which hooks these are follows from their declarations:
@@ -82,7 +82,7 @@ class Declarations:
         return node in self._finalising
 
     def unfinished(self, node: str) -> list[str]:
-        """What a node that has not made its final report owes: clauses about its finalise hooks."""
+        """Clauses about the finalise hooks of a node that has not made its final report."""
         clauses = []
         hook = self._finalising.get(node)
         if hook:

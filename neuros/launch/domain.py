@@ -1,9 +1,9 @@
-"""Which ROS domain a run uses, and the lock that keeps two runs from taking the same one.
+"""Chooses the ROS domain of a run, and locks it against other runs.
 
 A lock file ``neuros-domain-<id>.lock`` in the temporary folder of the machine is locked with
-``flock`` for the run: the lock dies with the process (and its guardian, which inherits it), also
+``flock`` for the run: the lock dies with the process (and its reaper, which inherits it), also
 by SIGKILL. Runs that picked the first free domain hold it exclusively; runs that were told which
-domain to use share it, so that they may join each other and nobody else picks it.
+domain to use share it, so that they may join each other and no other run picks it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class DomainLock:
         self._descriptor: int | None = lock[1] if lock else None
 
     def fileno(self) -> int | None:
-        """The locked file descriptor, which the guardian holds as well; ``None`` without lock."""
+        """The locked file descriptor, which the reaper holds as well; ``None`` without lock."""
         return self._descriptor
 
     def release(self) -> None:
@@ -117,7 +117,7 @@ def _valid(text: str, source: str) -> int:
 
 
 def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:
-    """The locked file, or ``None`` if somebody else holds it or it cannot be opened."""
+    """The locked file, or ``None`` if it is held or cannot be opened."""
     path = folder / f"neuros-domain-{domain}.lock"
     while True:
         descriptor = _open(path)

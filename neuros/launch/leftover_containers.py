@@ -1,6 +1,6 @@
 """Resumes and removes containers of a run whose launcher could not: it was killed, or is ending.
 
-Speaks the engine's HTTP itself, since the guardian runs this: standard library only.
+Speaks the engine's HTTP itself, since the reaper runs this: standard library only.
 """
 
 from __future__ import annotations

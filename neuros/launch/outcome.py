@@ -1,4 +1,4 @@
-"""How a run ends, and how it ended."""
+"""Phases of a run, and its outcome."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIGNAL_NAMES = {
 
 
 class Output(Protocol):
-    """Where the supervisor writes for people; neither call may wait for a reader.
+    """Output of the supervisor for people; neither call may wait for a reader.
 
     ``poll`` shows what nodes have logged since; it returns whether that was anything.
     """
@@ -27,7 +27,7 @@ class Output(Protocol):
 
 
 class Phase(Enum):
-    """The phase of a run."""
+    """The phases of a run."""
 
     RUNNING = "running"
     DRAINING = "draining"
@@ -37,7 +37,7 @@ class Phase(Enum):
 
 @dataclass
 class Outcome:
-    """How a run ended, and what its nodes said last.
+    """The end of a run, and the last reports of its nodes.
 
     Attributes:
         exit_code: 0 ended normally, 1 a node failed or deadlock, 4 the engine went away or what

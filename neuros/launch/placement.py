@@ -40,7 +40,7 @@ def thread_limits(nodes: Sequence[Node]) -> dict[str, str]:
 
 
 def on_cores(cores: Cores | None) -> str:
-    """Where it runs, to be read after what runs; nothing where the kernel chooses."""
+    """The cores of a node in words, empty where the kernel chooses."""
     if not cores:
         return ""
     return f" on core{'s' if len(cores) > 1 else ''} {', '.join(map(str, cores))}"

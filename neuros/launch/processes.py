@@ -1,23 +1,23 @@
-"""The processes of a run: which still run, which were killed, and who ended without being asked."""
+"""Node processes of a run: those that run, were killed, or ended without being asked."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 from neuros.launch.outcome import Outcome
-from neuros.launch.watch import Watch
+from neuros.launch.stall_detector import StallDetector
 from neuros.ports import RunningNode
 
 
 class Processes:
-    """Those that the back end has started, judged by what their nodes have said before.
+    """Processes that the back end has started, judged by the reports of their nodes.
 
     Attributes:
         killed: the names of all nodes whose processes were killed.
     """
 
-    def __init__(self, watch: Watch, outcome: Outcome) -> None:
-        self._watch = watch
+    def __init__(self, detector: StallDetector, outcome: Outcome) -> None:
+        self._detector = detector
         self._outcome = outcome
         self._running: list[RunningNode] = []
         self._has_told_failure: set[str] = set()
@@ -38,7 +38,7 @@ class Processes:
         self._has_told_failure.add(name)
 
     def ended(self) -> list[tuple[RunningNode, str]]:
-        """Those that have ended since this was last asked, and how."""
+        """Processes that have ended since the last call, and how."""
         ended = [(process, how) for process in self._running if (how := process.poll())]
         for process, _ in ended:
             self._running.remove(process)
@@ -49,11 +49,11 @@ class Processes:
         process.kill()
 
     def not_loaded(self) -> list[RunningNode]:
-        """Those in which no node has come as far as its first hook."""
+        """Processes in which no node has come as far as its first hook."""
         return [
             process
             for process in self._running
-            if not any(self._watch.is_loaded(name) for name in process.names)
+            if not any(self._detector.is_loaded(name) for name in process.names)
         ]
 
     def have_reported(self) -> bool:
@@ -76,10 +76,10 @@ class Processes:
     def _when(self, process: RunningNode, is_stopping: bool) -> str:
         if is_stopping:
             return "ended while finalising"
-        if not any(map(self._watch.is_greeted, process.names)):
+        if not any(map(self._detector.is_greeted, process.names)):
             were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
             return f"ended before {were} wrote is above)"
-        seen = "".join(self._watch.last_seen(name) for name in process.names)
+        seen = "".join(self._detector.last_seen(name) for name in process.names)
         return f"ended unexpectedly{seen}"
 
 

@@ -1,4 +1,4 @@
-"""How far a run has come, in one line, from the reports that nodes make once per second.
+"""Progress of a run in one line, from the reports that nodes make once per second.
 
 Standard library and ``tqdm``, which lays out the bar; nothing here writes or waits.
 """
@@ -18,7 +18,7 @@ _BESIDE_TEXT = 18
 
 
 class Reported(Protocol):
-    """What is known of a run while it goes on."""
+    """Reports of a run that goes on."""
 
     @property
     def reports(self) -> Mapping[str, Mapping[str, Any]]: ...
@@ -73,7 +73,7 @@ class Progress:
         return "" if now is None else ", ".join([self._how_far(now), *self._figures(now)])
 
     def bar(self, columns: int, *, is_ascii: bool) -> str:
-        """The same with a bar, where an end is known; never wider than a terminal."""
+        """The line with a bar, where an end is known; never wider than a terminal."""
         from tqdm.std import tqdm
 
         now = self._read()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from neuros.launch.companion import start_companion
+from neuros.launch.child_processes import start_sidecar
 
 END = b"end\n"
 """What the recorder is told when nothing more will come."""
@@ -18,7 +18,7 @@ _LOOK_S = 0.1
 
 @dataclass
 class Recorded:
-    """What a recorder says at its end: packets by topic, and problems, a sentence each."""
+    """Last report of a recorder: packets by topic, and problems, a sentence each."""
 
     counts: dict[str, int] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -53,7 +53,7 @@ class RecorderProcess:
         """Have it put the last packets into the bag, however long that takes.
 
         Args:
-            is_given_up: asked again and again whether nobody wants to wait any longer.
+            is_given_up: asked again and again whether the user gives up waiting.
         """
         recorded = self._finish(is_given_up)
         if recorded is None and not is_given_up():  # killed, or it has failed
@@ -70,10 +70,10 @@ class RecorderProcess:
 
     def _start(self) -> subprocess.Popen[bytes]:
         # The nodes come first: what the recorder has not got to waits for it on the disk.
-        return start_companion("recorder", self._command, self._run, self._log, self._environment)
+        return start_sidecar("recorder", self._command, self._run, self._log, self._environment)
 
     def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
-        """What it says, ``None`` if it ends without a word."""
+        """Its last report, ``None`` if it makes none."""
         told: bytes | None = END
         while True:
             try:

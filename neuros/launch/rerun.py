@@ -1,4 +1,4 @@
-"""The two processes behind a Rerun viewer: its server, and what feeds it from a run."""
+"""Two processes behind a Rerun viewer: its server, and the feed from a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-from neuros.launch.companion import start_companion
+from neuros.launch.child_processes import start_sidecar
 
 HOST = "127.0.0.1"
 _MEMORY = "512MB"
@@ -56,7 +56,7 @@ class RerunProcesses:
         server += ["--newest-first"]  # who opens it late wants to see what is now
         log = run / "rerun.log"
         for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
-            self._processes.append(start_companion(what, command, run, log, environment))
+            self._processes.append(start_sidecar(what, command, run, log, environment))
         pipe = self._processes[-1].stdin
         assert pipe is not None
         with contextlib.suppress(BrokenPipeError), pipe:

@@ -1,6 +1,6 @@
-"""Which processes of this machine belong to a run, read from ``/proc``.
+"""Processes of a run on this machine, read from ``/proc``.
 
-Standard library only: the guardian runs this.
+Standard library only: the reaper runs this.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ RUN_ID = "NEUROS_RUN_ID"
 _NODE_FOLDER = b"NEUROS_RUN_DIR="
 
 
-class _Process(NamedTuple):  # a dataclass would take the guardian 10 ms to import
+class _Process(NamedTuple):  # a dataclass would take the reaper 10 ms to import
     """One line of ``/proc/<pid>/stat``; ``start`` (clock ticks) tells it from a later namesake."""
 
     pid: int
@@ -41,7 +41,7 @@ class RunProcesses:
     def add_session(self, pid: int) -> None:
         """All processes of the session that ``pid`` leads belong to the run."""
         process = _read(pid)
-        # A host that has ended already may have left children in its session.
+        # A node process that has ended already may have left children in its session.
         self._sessions[pid] = process.start if process else -1
 
     def alive(self) -> dict[int, int]:

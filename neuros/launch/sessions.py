@@ -1,7 +1,7 @@
-"""The runs on this machine whose user this process may see: its own, or all if it is root's.
+"""Runs on this machine that this user may see: its own, or all for root.
 
-Each run has a guardian from before its first process until after its last: where a guardian is,
-there is a run. So nothing is written down that could be out of date; what the guardian guards
+Each run has a reaper from before its first process until after its last: where a reaper is,
+there is a run. So nothing is written down that could be out of date; what the reaper guards
 stands in its environment, which only its user can read.
 """
 
@@ -33,7 +33,7 @@ class Session:
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
-        user: number of the user whose run it is: that of its guardian, whatever that says.
+        user: number of the user whose run it is: that of its reaper, whatever that says.
     """
 
     run: str
@@ -53,12 +53,12 @@ class Session:
 
     @property
     def is_led(self) -> bool:
-        """Whether its launcher is there; if not, the guardian is about to end it."""
+        """Whether its launcher is there; if not, the reaper is about to end it."""
         pid, start = self.launcher
         return started_at(pid) == start and _user_of(pid) == self.user
 
     def states(self) -> Mapping[str, str]:
-        """How each node is: running, ending (its launcher has gone), or not running."""
+        """The state of each node: running, ending (its launcher has gone), or not running."""
         processes = RunProcesses(self.run)
         there = set(processes.nodes().values())
         if self.backend == "in-process" and processes.alive():
@@ -84,8 +84,8 @@ class Session:
             lines.close()
 
 
-def guardian_environment(session: Session) -> dict[str, str]:
-    """What makes a guardian known as that of a run."""
+def reaper_environment(session: Session) -> dict[str, str]:
+    """Environment that marks a reaper as that of a run."""
     return {_VARIABLE: json.dumps(asdict(session))}
 
 
@@ -118,7 +118,7 @@ def _user_of(pid: int) -> int | None:
 
 
 def _session(described: Mapping[str, Any]) -> Session:
-    """What a guardian's environment describes; raises ``KeyError`` if something lacks."""
+    """The run that a reaper's environment describes; raises ``KeyError`` if something lacks."""
     known = {each.name: described[each.name] for each in fields(Session)}
     known |= {name: tuple(described[name]) for name in ("nodes", "launcher")}
     return Session(**known)

@@ -1,4 +1,4 @@
-"""Shared memory that killed nodes leave behind, and who may remove which of it.
+"""Removes the shared memory that killed nodes and killed launchers leave behind.
 
 A ROS node that ends by itself tidies up after itself; one that is killed leaves files in
 ``/dev/shm``. Fast DDS makes them in groups::
@@ -18,7 +18,12 @@ with LTTng; it goes when nobody maps it, and the next process makes it anew.
 ``neuros_<run id>_...`` holds the large packets of a run's nodes. Once the processes of that run are
 gone it goes, and only then: the name says whose it is.
 
-Standard library only: the guardian runs this.
+Where launcher and reaper were both killed, the next run removes ``neuros_<run id>_...`` and
+``neuros_<run id>``, the folder that containers share, and so does ``neuros stop``. A living owner,
+the launcher or the sender, has them locked (``flock``); locks are seen from everywhere, also where
+processes are not (from within a container). Nodes may live on for some seconds.
+
+Standard library only: the reaper runs this.
 """
 
 from __future__ import annotations
@@ -27,10 +32,13 @@ import contextlib
 import fcntl
 import os
 import re
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from neuros.launch.run_processes import RunProcesses
 
 _FAST_DDS = re.compile(
     r"(?:sem\.)?(?P<base>fast(?:rtps|dds|_datasharing)_.+?)(?P<part>_el|_sl|_mutex)?"
@@ -39,6 +47,8 @@ _LTTNG = re.compile(r"lttng-ust-wait-.+")
 _LOCKS = ("_el", "_sl")
 # The kernel stamps files with a clock that is a tick (10 ms at most) behind time.time().
 _CLOCK_SLACK_S = 0.05
+_NAME = re.compile(r"neuros_(?P<run>[0-9a-f]{16})(?:_.*)?")
+_LOOK_AGAIN_S = 0.1
 
 
 def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[str, ...]:
@@ -171,3 +181,65 @@ def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:
             if os.lstat(folder / name).st_ino == inode:
                 os.unlink(folder / name)
                 yield name
+
+
+def hold(folder: Path) -> int:
+    """Lock a folder for as long as this process lives; returns the descriptor that does it.
+
+    Raises:
+        OSError: if it cannot be opened.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
+    return descriptor
+
+
+def remove_dead_runs(
+    folder: Path = Path("/dev/shm"), *, look_again_s: float = _LOOK_AGAIN_S
+) -> tuple[str, ...]:
+    """Remove what dead runs of this user have left; returns the names removed.
+
+    Looks twice: what has just been made is locked a moment later.
+    """
+    first = _dead(folder)
+    if not first:
+        return ()
+    time.sleep(look_again_s)
+    second = _dead(folder)
+    names = sorted(name for name, inode in first.items() if second.get(name) == inode)
+    for name in names:
+        path = folder / name
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    return tuple(names)
+
+
+def _dead(folder: Path) -> dict[str, int]:
+    """Names and inodes without a lock, of runs without processes."""
+    found: dict[str, int] = {}
+    is_alive: dict[str, bool] = {}
+    for name in os.listdir(folder) if folder.is_dir() else ():
+        match = _NAME.fullmatch(name)
+        inode = _inode_if_free(folder / name) if match else None
+        if match and inode is not None:
+            run = match["run"]
+            if run not in is_alive:
+                is_alive[run] = bool(RunProcesses(run).alive())
+            if not is_alive[run]:
+                found[name] = inode
+    return found
+
+
+def _inode_if_free(path: Path) -> int | None:
+    """The inode of a file or folder of this user without a lock."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            status = os.fstat(descriptor)
+            return status.st_ino if status.st_uid == os.getuid() else None
+        finally:
+            os.close(descriptor)
+    return None

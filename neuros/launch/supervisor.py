@@ -1,4 +1,4 @@
-"""Starts a project, watches it, and brings it to its end, however that comes.
+"""Supervises a run: starts its nodes, watches them, and brings it to its end.
 
 The supervisor takes no part in the data path. It hears of the nodes over the control channel, of
 their processes from the back end, and of the user by signals; all in one thread, which never waits
@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from neuros.control import Lines
-from neuros.launch.backlog import Backlog
 from neuros.launch.channels import Channels
 from neuros.launch.declarations import Declarations
-from neuros.launch.ending import STOP_S, Ending
-from neuros.launch.onlookers import Onlookers, Overheard, Pause
+from neuros.launch.observers import Observers, Overheard, Pause
 from neuros.launch.outcome import Outcome, Output, Phase
-from neuros.launch.probing import Probing, Verdict, connections_among
+from neuros.launch.peers import Peers
 from neuros.launch.processes import Processes
-from neuros.launch.sides import Sides
-from neuros.launch.watch import Watch
+from neuros.launch.quiescence import Probing, Verdict, connections_among
+from neuros.launch.shutdown import STOP_S, Shutdown
+from neuros.launch.stall_detector import Backlog, StallDetector
 from neuros.ports import Launcher
 from neuros.project.model import NodeFile
 from neuros.stacks import remove_stack_files
@@ -47,13 +46,13 @@ class Supervisor:
         wishes: reasons for which this program wants the run to end, drained; appended to by any
             thread.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
-        sides: who starts the other nodes of the project, where not all are started here.
+        peers: who starts the other nodes of the project, where not all are started here.
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
-            hosts that end before they have connected, are seen a fifth of a second late.
+            processes that end before they have connected, are seen a fifth of a second late.
 
     Attributes:
         pause: lets the run stand still.
-        onlookers: who watches it.
+        observers: who watches it.
 
     Raises:
         EnvironmentFault: if there can be no control socket in the run folder.
@@ -70,52 +69,52 @@ class Supervisor:
         *,
         wishes: Sequence[str] = (),
         duration_s: float | None = None,
-        sides: Sides | None = None,
+        peers: Peers | None = None,
         waker: socket.socket | None = None,
     ) -> None:
         self._files = files
         self._run_folder = run_folder
         self._launcher = launcher
         self._environment = environment
-        self._output = output = Overheard(output, lambda *a, **k: self.onlookers.tell(*a, **k))
+        self._output = output = Overheard(output, lambda *a, **k: self.observers.tell(*a, **k))
         self._wishes = wishes
         self._duration_s = duration_s
         self._paused_before_s = 0.0  # the first hook
-        self._sides = sides or Sides("", (), files)
+        self._peers = peers or Peers("", (), files)
         names = [file.node.name for file in files]
         self._channels = Channels(run_folder)
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
-        self._watch = Watch(names, time.monotonic(), run_folder)
-        self._processes = Processes(self._watch, self.outcome)
-        self._sides.speak_through(lambda text: self._channels.send("say", text=text))
+        self._detector = StallDetector(names, time.monotonic(), run_folder)
+        self._processes = Processes(self._detector, self.outcome)
+        self._peers.speak_through(lambda text: self._channels.send("say", text=text))
         connections = connections_among(files)
         self._backlog = Backlog(connections)
         self._probing = Probing(
             names,
             connections,
             self._channels.send,
-            self._sides if self._sides.exist else None,
+            self._peers if self._peers.exist else None,
         )
         self._declarations = Declarations(files)
-        self._ending = Ending(
+        self._shutdown = Shutdown(
             self._channels,
             self._processes,
-            self._watch,
+            self._detector,
             self._declarations,
             self._probing,
-            self._sides,
+            self._peers,
             self.outcome,
             output,
             signals,
         )
         self.pause = Pause(self._channels.send, time.monotonic)
-        self.onlookers = Onlookers(
+        self.observers = Observers(
             self._channels,
             self.pause,
-            lambda: self._watch.is_driven,
-            lambda reason: self._ending.drain(reason, STOP_S),
+            lambda: self._detector.is_driven,
+            lambda reason: self._shutdown.drain(reason, STOP_S),
         )
         self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
             "hello": self._on_hello,
@@ -129,20 +128,20 @@ class Supervisor:
             "failed": self._on_failed,
             "explanation": self._on_explanation,
             "heard": self._on_heard,
-            **self.onlookers.handlers,
+            **self.observers.handlers,
             "signal": lambda *_: signals.append(signal.SIGINT),
         }
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
         try:
-            self._ending.heed_signals()  # one may have come before anything was started
-            if self._ending.phase is Phase.RUNNING:
+            self._shutdown.heed_signals()  # one may have come before anything was started
+            if self._shutdown.phase is Phase.RUNNING:
                 self._processes.add(self._launcher.start(self._files, self._environment))
             has_shown = True
-            while self._processes and not self._ending.is_hopeless:
+            while self._processes and not self._shutdown.is_hopeless:
                 self._channels.wait(self._pause_s(has_shown))
-                self._ending.heed_signals()
+                self._shutdown.heed_signals()
                 self._hear()
                 self._look_at_processes()
                 self._look_at_time()
@@ -152,10 +151,10 @@ class Supervisor:
             for process in self._processes:
                 process.kill()
             self._hear()
-            self.onlookers.part(self.outcome)
+            self.observers.part(self.outcome)
             self._channels.close()
             remove_stack_files([self._run_folder / file.node.name for file in self._files])
-            self.outcome.elsewhere = self._sides.books()
+            self.outcome.elsewhere = self._peers.books()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
 
@@ -169,18 +168,18 @@ class Supervisor:
             self._handlers[message["kind"]](lines, message)
 
     def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
-        self._watch.greet(message["nodes"])
-        if self._sides.exist:
-            self._channels.send_to(lines, "say", text=self._sides.word)
+        self._detector.greet(message["nodes"])
+        if self._peers.exist:
+            self._channels.send_to(lines, "say", text=self._peers.own_state)
         if self.pause.is_on:
             self._channels.send_to(lines, "pause")
-        if self._ending.phase is not Phase.RUNNING:
+        if self._shutdown.phase is not Phase.RUNNING:
             self._channels.send_to(lines, "stop")
 
     def _on_report(self, _: Lines, message: Mapping[str, Any]) -> None:
         name, now_s = message["node"], time.monotonic()
         self.outcome.take(name, message, now_s)
-        self._watch.report(name, message, now_s)
+        self._detector.report(name, message, now_s)
         self._backlog.report(message, now_s)
         self._probing.take(name, message)
 
@@ -191,7 +190,7 @@ class Supervisor:
 
     def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
         reason = f": {message['reason']}" if message["reason"] else ""
-        self._ending.drain(
+        self._shutdown.drain(
             f"{message['node']} ended the project{reason}",
             float(message["drain_s"]),
             stopped=message["node"],
@@ -200,13 +199,13 @@ class Supervisor:
     def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
         self._processes.note_failure(message["node"])
         first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
-        self._ending.fail(f"node '{message['node']}' failed: {first_line}")
+        self._shutdown.fail(f"node '{message['node']}' failed: {first_line}")
 
     def _on_heard(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._sides.hear(message["node"], message["text"], time.monotonic())
+        self._peers.hear(message["node"], message["text"], time.monotonic())
 
     def _on_explanation(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self._ending.phase is Phase.RUNNING:
+        if self._shutdown.phase is Phase.RUNNING:
             self._output.log("WARN", f"{message['node']} {'; '.join(message['lines'])}")
 
     # ------------------------------------------------------------------ processes
@@ -216,9 +215,9 @@ class Supervisor:
         if ended:
             self._hear()  # what they said last has arrived by now
         for process, how in ended:
-            is_stopping = self._ending.phase is Phase.STOPPING
+            is_stopping = self._shutdown.phase is Phase.STOPPING
             if not self._processes.may_end(process, is_stopping=is_stopping):
-                self._ending.fail(
+                self._shutdown.fail(
                     self._processes.how_it_failed(process, how, is_stopping=is_stopping),
                     exit_code=4 if process.is_abandoned else 1,
                 )
@@ -226,8 +225,8 @@ class Supervisor:
     # ------------------------------------------------------------------ time
 
     def _pause_s(self, has_shown: bool) -> float:
-        """How long nothing needs to be looked at; ``has_shown``: nodes are logging now."""
-        if has_shown or self._ending.phase is not Phase.RUNNING:
+        """Seconds until the next look; ``has_shown``: nodes are logging now."""
+        if has_shown or self._shutdown.phase is not Phase.RUNNING:
             return _TICK_S
         end_s = self._end_s
         if end_s is None:
@@ -244,16 +243,16 @@ class Supervisor:
 
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
-        self._ending.heed_sides()
-        self._ending.look(now_s)
+        self._shutdown.heed_peers()
+        self._shutdown.look(now_s)
         self._keep_pause()
-        for severity, text in self._watch.remarks_on_hooks():
+        for severity, text in self._detector.remarks_on_hooks():
             self._output.log(severity, text)
-        if self._ending.phase in (Phase.RUNNING, Phase.DRAINING):
-            for severity, text in self._watch.remarks_on_silence(now_s, self._processes.killed):
+        if self._shutdown.phase in (Phase.RUNNING, Phase.DRAINING):
+            for severity, text in self._detector.remarks_on_silence(now_s, self._processes.killed):
                 self._output.log(severity, text)
-        self.onlookers.look_at(self._ending.phase)
-        if self._ending.phase is Phase.RUNNING:
+        self.observers.look_at(self._shutdown.phase)
+        if self._shutdown.phase is Phase.RUNNING:
             self._look_at_run(now_s)
 
     def _keep_pause(self) -> None:
@@ -262,27 +261,27 @@ class Supervisor:
         outcome.is_paused = self.pause.is_on
         if outcome.started_s is not None:
             outcome.paused_s = self.pause.total_s - self._paused_before_s
-        if self._ending.phase is Phase.STOPPING and outcome.is_paused:
+        if self._shutdown.phase is Phase.STOPPING and outcome.is_paused:
             outcome.ending_s = self.pause.since_s
 
     def _look_at_run(self, now_s: float) -> None:
         if self._wishes:
-            self._ending.drain(self._wishes[0], STOP_S)
+            self._shutdown.drain(self._wishes[0], STOP_S)
             return
         if self.pause.is_on:
-            self._watch.begin_anew(now_s)
+            self._detector.begin_anew(now_s)
             self._backlog.begin_anew()
             return
         end_s = self._end_s
         if end_s is not None and now_s >= end_s:
-            self._ending.drain(f"{self._duration_s:g} s are over", STOP_S)
+            self._shutdown.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
-        for source in (self._watch, self._backlog, self._sides):
+        for source in (self._detector, self._backlog, self._peers):
             for severity, text in source.remarks(now_s):
                 self._output.log(severity, text)
-        if self._watch.has_just_stalled(now_s):
+        if self._detector.has_just_stalled(now_s):
             self._channels.send("explain")
-        if self._sides.exist or not self._watch.is_complete:  # then not all can be asked
+        if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
-        if self._probing.look(now_s, self._watch.rested_s(now_s)) is Verdict.DEAD:
-            self._ending.fail(self._probing.why_dead())
+        if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
+            self._shutdown.fail(self._probing.why_dead())

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuros.launch.companion import start_companion
+from neuros.launch.child_processes import start_sidecar
 from neuros.launch.docker.tool import ToolContainer, find_tool_image
-from neuros.launch.guardian import Guardian
+from neuros.launch.reaper import Reaper
 
 _END_S = 2.0
 _MOST_WAIT_S = 5.0
@@ -38,7 +38,7 @@ class Tool:
         command = [self.path, *arguments]
         log = run / f"{self.program}.log"
         return ToolProcess(
-            start_companion(self.program, command, run, log, environment, is_ours=False)
+            start_sidecar(self.program, command, run, log, environment, is_ours=False)
         )
 
 
@@ -48,9 +48,9 @@ class ToolProcess:
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
 
-    def announce(self, guardian: Guardian) -> None:
+    def announce(self, reaper: Reaper) -> None:
         """Have it ended if the launcher is killed."""
-        guardian.watch(self._process.pid)
+        reaper.watch(self._process.pid)
 
     def finish(self) -> None:
         """End it with the run."""

@@ -21,7 +21,7 @@ import psutil
 from neuros.observe.load_table import FILE_NAME, GroupLoad, LoadTable, MachineLoad
 
 LAUNCHER = "launcher"
-"""The group of the launcher itself, its guardian, and all else that it starts."""
+"""The group of the launcher itself, its reaper, and all else that it starts."""
 
 PERIOD_S = 1.0
 

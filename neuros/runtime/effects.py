@@ -24,7 +24,7 @@ class NodeEffects:
     Args:
         enter: puts the context of the node in place.
         recorder: where packets go that are recorded, ``None``: none are.
-        sampler: looks at packets for onlookers.
+        sampler: looks at packets for observers.
         on_first_hook: called before the first hook.
         on_initialised: called after each initialise hook.
 

@@ -22,7 +22,7 @@ from neuros.runtime.context import ContextSwitch
 from neuros.runtime.control_thread import ControlThread, signals_as_socket
 from neuros.runtime.failures import as_node_error, callback_error
 from neuros.runtime.node import NodeRuntime
-from neuros.runtime.side import ELSEWHERE_VARIABLE, SideLink
+from neuros.runtime.peer_link import ELSEWHERE_VARIABLE, PeerLink
 from neuros.stacks import StackFile
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
@@ -65,7 +65,7 @@ class NodeProcess:
         self._tell_lock = threading.Lock()
         self._lines: Lines | None = None
         self._stack_file: StackFile | None = None
-        self._side = SideLink(
+        self._peers = PeerLink(
             [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
         )
 
@@ -85,7 +85,7 @@ class NodeProcess:
             for node in self._nodes:
                 self._guard(node.finalise)
             self._guard(lambda: self.report(is_final=True))
-            self._guard(self._side.close)
+            self._guard(self._peers.close)
             if self._middleware is not None:
                 self._guard(self._middleware.close)
             thread.end()
@@ -133,7 +133,7 @@ class NodeProcess:
             node.step(count, is_driven=is_driven)
 
     def look(self, wanted: Mapping[str, Any], asker: int) -> None:
-        """Show an onlooker what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
+        """Show an observer what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
         for node in tuple(self._nodes):
             self._tell("node_status", **node.reports.look(wanted.get(node.name, {}), asker))
 
@@ -164,18 +164,18 @@ class NodeProcess:
 
     def say(self, text: str) -> None:
         """Pass on to nodes elsewhere what the launcher says. Any thread."""
-        self._side.say(text)
+        self._peers.say(text)
 
     def leave(self) -> None:
         """Nothing more will be said to nodes elsewhere. Any thread."""
-        self._side.leave()
+        self._peers.leave()
 
     # ------------------------------------------------------------------ inside
 
     def _live(self) -> None:
         self._open_middleware()
         assert self._middleware is not None
-        self._side.open(self._middleware)
+        self._peers.open(self._middleware)
         for file in self._files:
             self._add(file)
         for node in self._nodes:

@@ -93,11 +93,11 @@ class NodeReports:
         return None
 
     def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> dict[str, Any]:
-        """What an onlooker is shown: the node, and what was sampled of its packets. Any thread.
+        """What an observer is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
             wanted: what to sample for the next time (see :class:`Sampler`).
-            asker: the number of the onlooker.
+            asker: the number of the observer.
         """
         engine = self._engine
         return {

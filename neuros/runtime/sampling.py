@@ -1,6 +1,6 @@
 """Samples of the packets that pass a node, for observers that ask for them.
 
-Each onlooker asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
+Each observer asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
 Without a question a node looks at an empty table for each packet; with one, at so many packets per
 question at most, however fast it sends.
@@ -73,11 +73,11 @@ class _Request:
 
 
 class Sampler:
-    """Looks at packets for onlookers.
+    """Looks at packets for observers.
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
-            each onlooker; empty without requests.
+            each observer; empty without requests.
     """
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from neuros.errors import ProjectError
 from neuros.installation.progress import Progress
-from neuros.launch.wheels import without_mark
+from neuros.launch.node_command import without_mark
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.model import Node

@@ -206,13 +206,13 @@ class Workbench:
         """A plugin cannot create any here."""
         return False
 
-    def join_sides(
+    def join_peers(
         self,
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
     ) -> Voice:
-        """There is no other side. Raises ``NotImplementedError``."""
+        """There are no peers. Raises ``NotImplementedError``."""
         raise NotImplementedError("a plugin under test runs in one part")
 
     def copy(self, packet: Any) -> Any:

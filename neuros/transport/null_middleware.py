@@ -127,13 +127,13 @@ class NullMiddleware:
         """Nothing can call back."""
         return False
 
-    def join_sides(
+    def join_peers(
         self,
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
     ) -> Voice:
-        """There is no other side. Raises ``NotImplementedError``."""
+        """There are no peers. Raises ``NotImplementedError``."""
         raise NotImplementedError("a node without neighbours runs in one part")
 
     def copy(self, packet: Any) -> Any:

@@ -27,10 +27,10 @@ from neuros.transport.lean_node import (
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import message_class
+from neuros.transport.peer_topics import PeerVoice
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.sides import SideVoice
 from neuros.transport.values import checker
 
 _LINGER_S = 0.05
@@ -127,15 +127,15 @@ class RosProcess:
         own = self._own_entities.get(file.node.name, set())
         return not _entities(self.ros_node(file)) <= own
 
-    def join_sides(
+    def join_peers(
         self,
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> SideVoice:
+    ) -> PeerVoice:
         """Speak for nodes of this process, and listen to nodes that another launcher starts."""
         namespace = self._files[0].names.namespace
-        return SideVoice(names, elsewhere, self._context, heard, namespace)
+        return PeerVoice(names, elsewhere, self._context, heard, namespace)
 
     def copy(self, packet: Any) -> Any:
         """A packet that shares nothing with this one."""
@@ -164,7 +164,7 @@ class RosProcess:
         """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
 
         Others in that crowd notice after 20 s that a process has gone, as with one that was
-        killed; the shared memory of DDS is left to the guardian.
+        killed; the shared memory of DDS is left to the reaper.
         """
         self._no_spinning.close()
         for transport in self._transports:

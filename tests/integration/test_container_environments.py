@@ -19,8 +19,7 @@ from launching import EXAMPLES, Finished, Running, launch, start
 from packages import make_slow_package, make_wheel
 
 from neuros.installation.machine import NEWEST, OLDEST, dotted
-from neuros.launch.environments.choice import HERE
-from neuros.launch.environments.interpreters import find_python
+from neuros.launch.environments.choice import HERE, find_python
 from neuros.launch.run_processes import RUN_ID
 
 CONFLICT = EXAMPLES / "5_containers/conflict"

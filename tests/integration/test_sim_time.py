@@ -14,7 +14,7 @@ from launching import start
 
 from containers import require_containers
 from neuros.launch.domain import choose_domain
-from neuros.launch.wheels import with_libraries
+from neuros.launch.node_command import with_libraries
 
 PROJECT = Path(__file__).parent / "sim_time"
 LIMIT_S = 60.0

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import io
 import os
 import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.launch.console import LogTail, clean, format_record, wants_colours
+from neuros.launch.console import LogTail, NonBlockingWriter, clean, format_record, wants_colours
 
 
 class Screen:
@@ -210,3 +216,129 @@ def test_a_closed_tail_holds_no_files(screen: Screen) -> None:
     screen.after("snn", b"x\n")
     assert len(os.listdir("/proc/self/fd")) == before
     assert not screen.tail.poll()
+
+
+# ------------------------------------------------------------------ slow readers
+
+MUCH = "x" * 99 + "\n"
+
+
+@dataclass
+class Pipe:
+    """A writer at one end of a pipe, and a reader that reads when it is told to."""
+
+    writer: NonBlockingWriter
+    stream: TextIO
+    reader: int
+
+    def read(self) -> str:
+        return os.read(self.reader, 1 << 16).decode()
+
+    def fill(self) -> int:
+        """Write until the reader would have to read; returns how much."""
+        count = 0
+        while not self.writer.is_behind:
+            self.writer.write(MUCH)
+            count += len(MUCH)
+        return count
+
+
+@pytest.fixture
+def pipe() -> Iterator[Pipe]:
+    reader, end = os.pipe()
+    with open(end, "w", encoding="utf-8") as stream:
+        yield Pipe(NonBlockingWriter(stream), stream, reader)
+    with contextlib.suppress(OSError):  # some tests close it
+        os.close(reader)
+
+
+def never() -> bool:
+    return False
+
+
+def test_text_arrives_at_once(pipe: Pipe) -> None:
+    pipe.writer.write("hello, wörld\n")
+    assert pipe.read() == "hello, wörld\n"
+    assert not pipe.writer.is_behind
+
+
+def test_what_was_printed_before_stays_before(pipe: Pipe) -> None:
+    print("first", file=pipe.stream)
+    NonBlockingWriter(pipe.stream).write("second\n")
+    assert pipe.read() == "first\nsecond\n"
+
+
+def test_a_reader_that_does_not_read_holds_up_nobody_and_gets_all_in_the_end(pipe: Pipe) -> None:
+    length = pipe.fill()
+    start_s = time.monotonic()
+    for _ in range(1000):
+        pipe.writer.write(MUCH)
+    assert time.monotonic() - start_s < 1.0
+    got = 0
+    while pipe.writer.is_behind:
+        got += len(pipe.read())
+        pipe.writer.flush()
+    got += len(pipe.read())
+    assert got == length + 1000 * len(MUCH)
+
+
+def test_a_reader_that_has_gone_is_no_error(pipe: Pipe) -> None:
+    os.close(pipe.reader)
+    pipe.writer.write("nobody hears this\n")
+    pipe.writer.finish(never)
+    assert not pipe.writer.is_behind
+
+
+def test_a_reader_that_goes_while_text_waits_is_no_error_either(pipe: Pipe) -> None:
+    pipe.fill()
+    os.close(pipe.reader)
+    pipe.writer.finish(never)
+    assert not pipe.writer.is_behind
+
+
+def test_patience_with_a_reader_ends(pipe: Pipe) -> None:
+    pipe.fill()
+    pipe.writer.finish(never, patience_s=0.1)
+    assert not pipe.writer.is_behind
+
+
+def test_the_user_may_have_had_enough(pipe: Pipe) -> None:
+    pipe.fill()
+    pipe.writer.finish(lambda: True)
+    pipe.writer.write("more\n")
+    assert not pipe.writer.is_behind
+
+
+def test_a_pipe_that_somebody_made_non_blocking_is_fine(pipe: Pipe) -> None:
+    flags = fcntl.fcntl(pipe.stream.fileno(), fcntl.F_GETFL)
+    fcntl.fcntl(pipe.stream.fileno(), fcntl.F_SETFL, flags | os.O_NONBLOCK)
+    pipe.fill()
+    pipe.read()
+    pipe.writer.flush()
+
+
+def test_a_full_disk_is_no_reason_to_lose_the_run() -> None:
+    with open("/dev/full", "w") as full:
+        writer = NonBlockingWriter(full)
+        writer.write("hello\n")
+        assert not writer.is_behind
+
+
+def test_no_output_at_all_is_fine() -> None:
+    writer = NonBlockingWriter(None)
+    writer.write("hello\n")
+    writer.finish(never)
+
+
+def test_a_stream_without_a_file_is_written_to_directly() -> None:
+    stream = io.StringIO()
+    NonBlockingWriter(stream).write("hello\n")
+    assert stream.getvalue() == "hello\n"
+
+
+def test_characters_that_the_terminal_does_not_know_are_shown_as_numbers() -> None:
+    reader, end = os.pipe()
+    with open(end, "w", encoding="ascii") as stream:
+        NonBlockingWriter(stream).write("wörld\n")
+        assert os.read(reader, 100) == b"w\\xf6rld\n"
+    os.close(reader)

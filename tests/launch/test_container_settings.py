@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.container import how_it_ended
 from neuros.launch.docker.images import Image
-from neuros.launch.docker.launcher import user_for
+from neuros.launch.docker.launcher import how_it_ended
 from neuros.launch.docker.layout import as_here, inside, outside
-from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings
+from neuros.launch.docker.settings import DDS_SETTINGS, User, container_settings, user_for
 from neuros.project.model import Folders, Node, NodeFile
 from neuros.project.resources import Access, Resources
 

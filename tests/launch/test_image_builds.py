@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.build_log import BuildLog
-from neuros.launch.docker.context import CERTIFICATES, context_of, surroundings
+from neuros.launch.docker.build_steps import BuildLog
+from neuros.launch.docker.context import CERTIFICATES, context_of, served, surroundings
 from neuros.launch.docker.python_in_image import PythonInImage, chosen
-from neuros.launch.docker.wheelhouse import served
 
 
 class TestBuildLog:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.host import HostProcess
+from neuros.launch.child_processes import RunningProcess
 from neuros.launch.placement import (
     THREAD_VARIABLES,
     children_on,
@@ -47,7 +47,7 @@ def _mask_of(tmp_path: Path, cores: tuple[int, ...] | None) -> set[int]:
     program = "import json, os; print(json.dumps(sorted(os.sched_getaffinity(0))))"
     log = tmp_path / "log"
     log.unlink(missing_ok=True)
-    host = HostProcess(
+    host = RunningProcess(
         ["a"],
         ["python3", "-S", "-c", program],
         log=log,

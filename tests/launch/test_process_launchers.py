@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.host import HostProcess
-from neuros.launch.host_command import host_environment
-from neuros.launch.in_process import InProcessLauncher
-from neuros.launch.process import ProcessLauncher
+from neuros.launch.child_processes import RunningProcess
+from neuros.launch.node_command import process_environment
+from neuros.launch.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.project.model import Folders, Node, NodeFile
 
 # A host that says all that it was given.
@@ -36,7 +35,7 @@ class Run:
         self.folder = folder / "a run"
         self.folder.mkdir()
         self.pids: list[int] = []
-        self.hosts: list[HostProcess] = []
+        self.hosts: list[RunningProcess] = []
 
     def node(self, name: str, script: Path | None = None, **environment: str) -> NodeFile:
         (self.folder / name).mkdir(exist_ok=True)
@@ -51,7 +50,7 @@ class Run:
 
     def start(
         self, program: str, nodes: Sequence[NodeFile], in_process: bool = False
-    ) -> list[HostProcess]:
+    ) -> list[RunningProcess]:
         kind = InProcessLauncher if in_process else ProcessLauncher
         launcher = kind(command(program), self.pids.append)
         self.hosts += launcher.start(nodes, {"NEUROS_RUN_ID": "1234", "SHARED": "run"})
@@ -129,13 +128,13 @@ def test_a_node_has_its_environment_and_that_of_the_run(
 def test_the_restart_of_the_ros_wheels_happens_anew_in_each_host() -> None:
     libraries = os.pathsep.join([f"{sys.prefix}/lib", "/opt/mine", f"{sys.prefix}/a.libs"])
     given = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1", "LD_LIBRARY_PATH": libraries}
-    environment = host_environment(given, {})
+    environment = process_environment(given, {})
     assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in environment
     assert environment["LD_LIBRARY_PATH"] == "/opt/mine"
 
 
 def test_library_paths_of_the_user_stay() -> None:
-    environment = host_environment({"LD_LIBRARY_PATH": f"{sys.prefix}/lib"}, {})
+    environment = process_environment({"LD_LIBRARY_PATH": f"{sys.prefix}/lib"}, {})
     assert environment["LD_LIBRARY_PATH"] == f"{sys.prefix}/lib"
 
 

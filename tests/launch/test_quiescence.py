@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.launch.probing import Probing, Verdict
 from neuros.launch.quiescence import (
+    Probing,
+    Verdict,
     counters,
     cycle,
     is_dead,

@@ -1,4 +1,4 @@
-"""`neuros ps` and `neuros stop`: runs are seen by their guardians."""
+"""`neuros ps` and `neuros stop`: runs are seen by their reapers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import pytest
 from endings import RUNS
 from launching import Running, start
 
-from neuros.launch.guardian import Guardian
-from neuros.launch.sessions import Session, guardian_environment, sessions, this_process
+from neuros.launch.reaper import Reaper
+from neuros.launch.sessions import Session, reaper_environment, sessions, this_process
 
 PLUGIN = f"from neuros.hooks import neuros_tick\n{RUNS}"
 PROJECT = """
@@ -30,37 +30,37 @@ PROJECT = """
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    """A run of this process, that has a guardian and nothing else."""
+    """A run of this process, that has a reaper and nothing else."""
     session = Session(
         *(secrets.token_hex(8), "demo", "process", ("a",), "/runs/1", time.time(), this_process())
     )
-    guardian = Guardian.start(session.run, None, guardian_environment(session))
+    reaper = Reaper.start(session.run, None, reaper_environment(session))
     yield session
-    guardian.finish()
+    reaper.finish()
     assert session not in sessions()
 
 
 def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) -> None:
-    ((variable, text),) = guardian_environment(session).items()
+    ((variable, text),) = reaper_environment(session).items()
     said = json.loads(text)
     newer = {**said, "run": secrets.token_hex(8), "colour": "red"}
     older = {"run": secrets.token_hex(8), "project": "demo"}
-    guardians = [
-        Guardian.start(each["run"], None, {variable: json.dumps(each)}) for each in (newer, older)
+    reapers = [
+        Reaper.start(each["run"], None, {variable: json.dumps(each)}) for each in (newer, older)
     ]
     runs = {each.run for each in sessions()}
-    for guardian in guardians:
-        guardian.finish()
+    for reaper in reapers:
+        reaper.finish()
     assert newer["run"] in runs
     assert older["run"] not in runs
 
 
-def test_a_run_is_its_guardians_users_whatever_that_says(session: Session) -> None:
-    ((variable, text),) = guardian_environment(session).items()
+def test_a_run_is_its_reapers_users_whatever_that_says(session: Session) -> None:
+    ((variable, text),) = reaper_environment(session).items()
     forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}
-    guardian = Guardian.start(forged["run"], None, {variable: json.dumps(forged)})
+    reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
     users = {each.run: each.user for each in sessions()}
-    guardian.finish()
+    reaper.finish()
     assert users[forged["run"]] == os.getuid()
 
 
@@ -90,7 +90,7 @@ def run_of(running: Running) -> Session:
     return next(each for each in sessions() if each.launcher[0] == running.process.pid)
 
 
-def test_a_run_is_there_as_long_as_its_guardian(session: Session) -> None:
+def test_a_run_is_there_as_long_as_its_reaper(session: Session) -> None:
     assert session in sessions()
     assert session.is_led
     assert session.states() == {"a": "not running"}

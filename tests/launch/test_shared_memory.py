@@ -12,16 +12,18 @@ import subprocess
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from neuros.launch.domain import DomainLock, choose_domain
-from neuros.launch.guardian import Guardian
+from neuros.launch.reaper import Reaper
 from neuros.launch.run_processes import RUN_ID
-from neuros.launch.shared_memory import remove_segments, sweep
+from neuros.launch.shared_memory import hold, remove_dead_runs, remove_segments, sweep
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
+from neuros.transport.packet_segment import SegmentWriter
 
 SHM = Path("/dev/shm")
 PORT = ("fastrtps_port7411", "fastrtps_port7411_el", "sem.fastrtps_port7411_mutex")
@@ -108,6 +110,7 @@ def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
 def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
     assert _sweep(tmp_path / "nowhere") == ()
     assert remove_segments("abc", folder=tmp_path / "nowhere") == ()
+    assert remove(tmp_path / "nowhere") == ()
 
 
 def test_segments_for_large_packets_go_with_the_run_that_their_name_tells(tmp_path: Path) -> None:
@@ -120,14 +123,14 @@ def test_segments_for_large_packets_go_with_the_run_that_their_name_tells(tmp_pa
     assert _sweep(tmp_path) == ()
 
 
-def test_the_guardian_removes_the_segments_of_its_run() -> None:
+def test_the_reaper_removes_the_segments_of_its_run() -> None:
     run_id = secrets.token_hex(8)
-    guardian = Guardian.start(run_id)
+    reaper = Reaper.start(run_id)
     segment = SHM / f"neuros_{run_id}_camera_image_1"
     try:
         segment.write_bytes(b"x" * 64)
     finally:
-        guardian.finish()
+        reaper.finish()
     assert not segment.exists()
 
 
@@ -222,7 +225,7 @@ def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
     domain: DomainLock, nodes: list[RosNode]
 ) -> None:
     run_id = secrets.token_hex(8)
-    guardian = Guardian.start(run_id)
+    reaper = Reaper.start(run_id)
     try:
         # The run is there first, so that its neighbours know, and map, its memory.
         nodes.append(RosNode("talker_of_the_run", domain.id, run_id))
@@ -237,7 +240,7 @@ def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
         owned = {name for pid in others for name in _in_use(pid) if name.endswith("_el")}
         os.kill(run, signal.SIGKILL)
     finally:
-        guardian.finish()
+        reaper.finish()
     left = _names(SHM)
     dead = {name for name in of_the_run if f"{name}_el" not in owned}
     assert dead
@@ -255,7 +258,7 @@ def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
     domain: DomainLock, nodes: list[RosNode]
 ) -> None:
     run_id = secrets.token_hex(8)
-    guardian = Guardian.start(run_id)
+    reaper = Reaper.start(run_id)
     try:
         nodes.append(RosNode("listener", domain.id, run_id))
         nodes.append(RosNode("talker", domain.id, run_id))
@@ -263,7 +266,80 @@ def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
         used = set().union(*(_in_use(node.process.pid) for node in nodes))
         assert any(name.startswith("fastrtps_port") for name in used)
     finally:
-        guardian.finish()
+        reaper.finish()
     stays = {name for name in used if name.startswith("lttng")}  # others may be using these
     bases = {name.removesuffix("_el") for name in used - stays}
     assert not {name for name in _names(SHM) for base in bases if base in name}
+
+
+# ------------------------------------------------------------------ dead runs
+
+
+@pytest.fixture
+def run() -> str:
+    """The id of a run that does not exist."""
+    return secrets.token_hex(8)
+
+
+def remove(folder: Path) -> tuple[str, ...]:
+    return remove_dead_runs(folder, look_again_s=0.0)
+
+
+def test_the_folder_of_containers_goes_with_what_is_in_it(tmp_path: Path, run: str) -> None:
+    (tmp_path / f"neuros_{run}").mkdir()
+    (tmp_path / f"neuros_{run}" / "fastrtps_1").touch()
+    assert remove(tmp_path) == (f"neuros_{run}",)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_stays_while_its_launcher_holds_it(tmp_path: Path, run: str) -> None:
+    folder = tmp_path / f"neuros_{run}"
+    folder.mkdir()
+    descriptor = hold(folder)
+    assert remove(tmp_path) == ()
+    os.close(descriptor)
+    assert remove(tmp_path) == (folder.name,)
+
+
+def test_large_packets_stay_while_their_sender_has_mapped_them(tmp_path: Path, run: str) -> None:
+    writer = SegmentWriter(f"{run}_camera", slots=2, folder=tmp_path)
+    writer.write([array("B", bytes(100))])
+    (segment,) = tmp_path.iterdir()
+    assert remove(tmp_path) == ()
+    copy = tmp_path / f"neuros_{run}_of_one_that_was_killed"
+    copy.write_bytes(segment.read_bytes())
+    assert remove(tmp_path) == (copy.name,)
+    assert list(tmp_path.iterdir()) == [segment]
+    writer.close()
+
+
+def test_nothing_goes_while_a_process_of_the_run_is_there(tmp_path: Path, run: str) -> None:
+    (tmp_path / f"neuros_{run}").mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", "input()"],
+        stdin=subprocess.PIPE,
+        env={**os.environ, RUN_ID: run},
+    ) as node:
+        assert remove(tmp_path) == ()
+        node.communicate(b"\n")
+    assert remove(tmp_path) == (f"neuros_{run}",)
+
+
+def test_what_is_called_differently_is_left_alone(tmp_path: Path, run: str) -> None:
+    for name in (f"my_neuros_{run}", f"neuros_{run[:8]}", f"neuros_{run}s", "neuros_lock"):
+        (tmp_path / name).touch()
+    assert remove(tmp_path) == ()
+
+
+def test_what_was_made_anew_between_two_looks_stays(
+    tmp_path: Path, run: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / f"neuros_{run}"
+    folder.mkdir()
+
+    def make_anew(_: float) -> None:
+        folder.rename(tmp_path / "aside")
+        folder.mkdir()
+
+    monkeypatch.setattr("time.sleep", make_anew)
+    assert remove(tmp_path) == ()

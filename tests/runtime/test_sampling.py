@@ -1,4 +1,4 @@
-"""Onlookers see a few packets, as many as they ask for."""
+"""Observers see a few packets, as many as they ask for."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
     assert sampler.ask({}) == {}
 
 
-def test_each_onlooker_gets_what_it_asked_for() -> None:
+def test_each_observer_gets_what_it_asked_for() -> None:
     sampler = Sampler()
     sampler.ask({"imu": {"fields": ["angular_velocity.z"]}}, asker=1)
     sampler.note("imu", imu(1.0))

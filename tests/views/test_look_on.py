@@ -1,4 +1,4 @@
-"""An onlooker asks, and shows what it gets, until the run is over."""
+"""An observer asks, and shows what it gets, until the run is over."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.launch.channels import Channels
-from neuros.views.onlooker import look_on
+from neuros.views.observer import look_on
 from neuros.views.visual_types import Mark, Numbers, VisualTypes
 
 
@@ -15,10 +15,10 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
     channels = Channels(tmp_path)
     shown: list[tuple[str, Sequence[Mark]]] = []
     sources = {"robot.imu": ("robot", "imu", VisualTypes("sensor_msgs/msg/Imu"))}
-    onlooker = threading.Thread(
+    observer = threading.Thread(
         target=look_on, args=(tmp_path, sources, lambda name, _, marks: shown.append((name, marks)))
     )
-    onlooker.start()
+    observer.start()
     asked = []
     while not shown:
         channels.wait(5.0)
@@ -30,8 +30,8 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
                 channels.send_to(lines, "phase", phase="running", is_paused=False)
                 channels.send_to(lines, "node_status", node="robot", samples={"imu": sample})
     channels.close()
-    onlooker.join(5.0)
-    assert not onlooker.is_alive()
+    observer.join(5.0)
+    assert not observer.is_alive()
     assert asked[:2] == ["watch", "look"]
     name, (_, numbers) = shown[0]
     assert name == "robot.imu"

@@ -44,7 +44,7 @@ _NOTHING: Mapping[str, str] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the user wants of the builds.
+    """Options of the user for the builds.
 
     Attributes:
         logs: the folder for what the engine says.
@@ -148,7 +148,7 @@ class ImageBuilder:
         self._report(f"{recipe.name}: built", started_s, self._engine.images.get(recipe.tags[0]))
 
     def _labels(self, recipe: Recipe, base: str, old: Any | None) -> dict[str, str]:
-        """What the image is to be; arguments of last time count again."""
+        """Labels that the image is to have; arguments of last time count again."""
         wanted = old.labels if old is not None else {}
         known = arguments_of(recipe.dockerfile)
         given = {key: value for key, value in self._wishes.arguments.items() if key in known}

@@ -15,12 +15,12 @@ import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 from typing import Any
 
 from docker import DockerClient
 
 from neuros.errors import EnvironmentFault
+from neuros.launch.docker.context import serving
 from neuros.launch.docker.dockerfile import Instruction, has_syntax_line
 from neuros.launch.docker.engine import Abilities, engine_socket
 
@@ -111,7 +111,7 @@ def _is_here(engine: DockerClient) -> bool:
 
 @contextmanager
 def _served(content: bytes) -> Iterator[str]:
-    """Serve this at an address that nobody guesses, to programs of this machine only."""
+    """Serve this at a secret address, to programs of this machine only."""
     secret = f"/{secrets.token_urlsafe()}/context.tar.gz"
 
     class Handler(BaseHTTPRequestHandler):
@@ -127,17 +127,10 @@ def _served(content: bytes) -> Iterator[str]:
             self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
-            """Nobody wants to know."""
+            """Log nothing."""
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}{secret}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with serving(ThreadingHTTPServer(("127.0.0.1", 0), Handler)) as address:
+        yield address + secret
 
 
 def _as_classic(stream: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:

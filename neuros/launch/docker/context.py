@@ -1,16 +1,22 @@
-"""What goes to the engine for one build: files, Dockerfile, arguments, network."""
+"""Input of one image build: files, Dockerfile, arguments, network, wheels."""
 
 from __future__ import annotations
 
 import io
 import tarfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from types import MappingProxyType
 
 from docker import DockerClient
 
+from neuros.errors import EnvironmentFault
 from neuros.launch.docker.recipes import files_of
 
 CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
@@ -25,7 +31,7 @@ _NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What all builds on this machine need, whatever they build.
+    """Needs of this machine that all builds share.
 
     Attributes:
         arguments: build arguments; the engine keeps proxies out of the images' history.
@@ -41,12 +47,12 @@ class Surroundings:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """What has to lie beside every Dockerfile for it."""
+        """Files to lay beside every Dockerfile."""
         return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
 
     @property
     def lines(self) -> str:
-        """What every stage of a Dockerfile has to declare for it."""
+        """Lines to declare in every stage of a Dockerfile."""
         lines = []
         if self.ca_bundle:
             lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
@@ -59,7 +65,7 @@ class Surroundings:
 def surroundings(
     engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
 ) -> Surroundings:
-    """What this machine's environment, and the engine, ask for.
+    """Needs of this machine, from its environment and the engine.
 
     A wheelhouse leaves proxies out, and packages of the operating system.
     """
@@ -100,8 +106,53 @@ def context_of(
 
 
 def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
-    """Readable by all, whatever the umask of whoever wrote it was."""
+    """Make it readable by all, without its owner."""
     entry.uid = entry.gid = 0
     entry.uname = entry.gname = ""
     entry.mode = 0o755 if entry.mode & 0o111 else 0o644
     return entry
+
+
+@contextmanager
+def serving(server: ThreadingHTTPServer) -> Iterator[str]:
+    """Serve as long as the context lasts; yields the address, which ends without a slash."""
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder of wheels while an image is built without a package index; yields the address.
+
+    The classic builder has no mounts, and what is copied into an image stays in its layers. So pip
+    gets the wheels over HTTP from this machine, while the build uses this machine's network; only
+    programs of this machine reach the server.
+
+    Raises:
+        EnvironmentFault: if there are no wheels.
+    """
+    if not any(folder.glob("*.whl")):
+        raise EnvironmentFault(f"--wheelhouse {folder}: there are no wheels (*.whl) in this folder")
+    with serving(_server(folder)) as address:
+        yield f"{address}/"
+
+
+def _server(folder: Path) -> ThreadingHTTPServer:
+    """At the same port for the same folder, if that is free: the builder caches by address."""
+    handler = partial(_Handler, directory=str(folder))
+    try:
+        port = 20000 + zlib.crc32(bytes(folder.resolve())) % 10000
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except OSError:
+        return ThreadingHTTPServer(("127.0.0.1", 0), handler)

@@ -1,4 +1,4 @@
-"""What of a Dockerfile decides about its build: instructions, stages, what they begin from."""
+"""Parses Dockerfiles: instructions, stages, and the images that they begin from."""
 
 from __future__ import annotations
 

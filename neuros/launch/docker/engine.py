@@ -62,7 +62,7 @@ def connect(
 
 @dataclass(frozen=True)
 class Abilities:
-    """What an engine can do, and whose it is.
+    """Abilities of an engine, and its owner.
 
     Attributes:
         is_rootless: whether it runs as an ordinary user, who is root in its containers.
@@ -112,7 +112,7 @@ def engine_socket(engine: DockerClient) -> str:
 
 
 def explain(text: str) -> str:
-    """What the engine said, on one line, with a remedy where there is a known one."""
+    """The engine's message on one line, with a remedy where one is known."""
     said = " ".join(text.split())
     if "no space left on device" in said.lower():
         return f"{said}: the disk is full: make room (docker system df; docker image prune)"

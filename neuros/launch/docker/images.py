@@ -1,4 +1,4 @@
-"""Which image a container stands for: NeuROS and projects build theirs, users have others."""
+"""Finds the image of a container: built by NeuROS or a project, or one that the user has."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def is_current(image: Any, recipe: Recipe) -> bool:
 
 
 def labels_of_python(python: PythonInImage) -> dict[str, str]:
-    """What is written on an image that was built, so that nobody needs to look into it again."""
+    """Labels of a built image that describe its Python, so that it is run only once."""
     return {START: json.dumps(python.start), PYTHON: "{}.{}".format(*python.version)}
 
 
@@ -123,7 +123,7 @@ def _built(recipe: Recipe, project_folder: Path | None, engine: DockerClient) ->
 
 
 def _to_build(recipe: Recipe, project_folder: Path | None) -> Path | str:
-    """What to name for an image to be built; a project can do without a ``project.json``."""
+    """The argument that builds an image; a project can do without a ``project.json``."""
     if project_folder is None or not recipe.folder.is_relative_to(project_folder):
         return recipe.name
     return project_folder if (project_folder / "project.json").is_file() else recipe.folder

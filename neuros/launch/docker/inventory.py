@@ -1,4 +1,4 @@
-"""The images that NeuROS has built: which there are, and how they go away."""
+"""Lists and removes the images that NeuROS has built."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a node in a container finds things: the same paths on every machine."""
+"""Paths that a node finds in its container; they do not depend on the machine."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _INSIDE = re.compile(rf"(?<![\w/.]){ROOT}/({'|'.join(each.name for each in field
 
 
 def inside(file: NodeFile) -> NodeFile:
-    """The same node with all paths as it sees them in its container."""
+    """A node with all paths as it sees them in its container."""
     return replace(
         file,
         node=translated(file.node, lambda path: _inside(path, file)),
@@ -56,7 +56,7 @@ def outside(file: NodeFile, folders: Folders, messages: Path = MESSAGES) -> Node
 
 
 def as_here(text: str, folders: Folders) -> str:
-    """What a node has said, with the names that its paths have on this machine."""
+    """Text of a node, with its paths replaced by those of this machine."""
     here = {each.name: str(getattr(folders, each.name)) for each in fields(Folders)}
     return _INSIDE.sub(lambda match: here[match[1]], text)
 

@@ -1,4 +1,4 @@
-"""Which Python an image has, and whether it can run nodes: found out by running it once."""
+"""Finds the Python of an image, and whether that runs nodes, by running the image once."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PythonInImage:
 
     @property
     def start(self) -> tuple[str, ...]:
-        """How this Python is started; its arguments come behind."""
+        """The command that starts this Python, without arguments."""
         if not self.setup:
             return (self.path,)
         return ("/bin/sh", "-c", f'. {self.setup} && exec "$0" "$@"', self.path)
@@ -113,7 +113,7 @@ def _refuse(found: PythonInImage, answer: Mapping[str, Any], name: str) -> None:
 
 
 def _output(engine: DockerClient, image: str, name: str) -> str:
-    """What the probe prints in a container of its own, which is gone afterwards."""
+    """Output of the probe, in a container that is removed afterwards."""
     try:
         container = engine.containers.create(
             image,

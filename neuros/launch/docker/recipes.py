@@ -1,4 +1,4 @@
-"""How a container's name becomes a recipe for its image: folders, what they hold, and their order.
+"""Recipes of container images: their folders, files, and build order.
 
 A recipe is a folder ``containers/<name>`` with a ``Dockerfile``, or with a ``requirements.txt``
 only. The project's own, beside its project file, come before NeuROS's. Nothing here asks the

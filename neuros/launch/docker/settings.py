@@ -1,4 +1,4 @@
-"""What the engine is told of a container: a pure function of the node, the image and the user.
+"""Settings of a container, from its node, its image and the user.
 
 By default a container is locked down: the caller's user id and no capability, nothing gained by
 programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
@@ -9,23 +9,25 @@ it can only read.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import neuros
+from neuros.errors import EnvironmentFault
+from neuros.launch.containers import PACKAGE
 from neuros.launch.docker.images import Image
 from neuros.launch.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
-from neuros.launch.host_command import (
+from neuros.launch.leftover_containers import RUN_LABEL
+from neuros.launch.node_command import (
     DEFAULTS,
-    host_arguments,
     log_file,
     node_environment,
     node_folder,
+    start_arguments,
     with_messages,
 )
-from neuros.launch.leftover_containers import RUN_LABEL
 from neuros.launch.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.launch.run_processes import RUN_ID
 from neuros.project.model import NodeFile
@@ -77,6 +79,26 @@ class User:
     def display(self) -> str:
         """The X11 display, as in ``DISPLAY``; empty if there is none."""
         return self.environ.get("DISPLAY", "")
+
+
+def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:
+    """The caller, as far as a node is let in to what belongs to the caller.
+
+    A rootless engine calls its user root in containers, with no more rights.
+
+    Raises:
+        EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
+    """
+    groups = {_group_of(file, device) for device in file.node.access.devices}
+    key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
+    return User(
+        0 if is_rootless else os.getuid(),
+        0 if is_rootless else os.getgid(),
+        () if is_rootless else tuple(sorted(groups.intersection(os.getgroups()))),
+        environ,
+        key if file.node.access.display and key.is_file() else None,
+        _dds_settings(environ.get(DDS_SETTINGS)),
+    )
 
 
 def container_settings(
@@ -137,7 +159,7 @@ def container_settings(
 
 
 def container_name(file: NodeFile, run_id: str) -> str:
-    """What a container is called: unique, and to be recognised in ``docker ps``."""
+    """The name of a container: unique, and to be recognised in ``docker ps``."""
     return f"neuros-{file.node.name}-{run_id[:8]}"
 
 
@@ -147,12 +169,12 @@ def shared_memory(run_id: str) -> Path:
 
 
 def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
-    """What a container executes, whatever the image would execute by itself."""
+    """The command of a container, in place of the image's own."""
     seen = inside(file)
     command = [*image.start, "-m", "neuros.cli", "node", *options]
     return [
         *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
-        *host_arguments(command, [seen]),
+        *start_arguments(command, [seen]),
     ]
 
 
@@ -195,10 +217,9 @@ def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
 def _mounts(
     file: NodeFile, user: User, run_id: str, others: Sequence[Path]
 ) -> list[dict[str, Any]]:
-    package = Path(neuros.__file__).resolve().parent
     own = node_folder(file) / "node.json"
     mounts = [
-        _mount(package, LIBRARY / package.name),
+        _mount(PACKAGE, LIBRARY / PACKAGE.name),
         _mount(file.folders.project, FOLDERS.project),
         _mount(file.folders.run, FOLDERS.run, read_only=False),
         # In a folder that it may write to; but what it was told stays as it was.
@@ -229,3 +250,24 @@ def _mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]
 def _gpu_request(gpus: Sequence[str]) -> dict[str, Any]:
     chosen = {"count": -1} if tuple(gpus) == ("all",) else {"device_ids": list(gpus)}
     return {**chosen, "capabilities": [["gpu"]]}
+
+
+def _dds_settings(named: str | None) -> Path | None:
+    if not named:
+        return None
+    path = Path(named).absolute()
+    if not path.is_file():
+        raise EnvironmentFault(
+            f"{DDS_SETTINGS}={named}: there is no such file: unset it, or name one"
+        )
+    return path
+
+
+def _group_of(file: NodeFile, device: str) -> int:
+    try:
+        return os.stat(device).st_gid
+    except OSError as error:
+        raise EnvironmentFault(
+            f"node '{file.node.name}' asks for the device {device}: {error.strerror}: is it plugged"
+            f" in? Another one: --set nodes.{file.node.name}.devices='[\"/dev/...\"]'"
+        ) from error

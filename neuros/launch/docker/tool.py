@@ -13,8 +13,8 @@ from docker.errors import DockerException, ImageNotFound
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.docker.engine import connect, engine_faults, engine_socket
-from neuros.launch.guardian import Guardian
 from neuros.launch.leftover_containers import RUN_LABEL
+from neuros.launch.reaper import Reaper
 from neuros.launch.run_processes import RUN_ID
 
 IMAGE = "neuros_tools"
@@ -69,9 +69,9 @@ class ToolContainer:
                 security_opt=["no-new-privileges"],
             )
 
-    def announce(self, guardian: Guardian) -> None:
+    def announce(self, reaper: Reaper) -> None:
         """Have it removed if the launcher is killed."""
-        guardian.watch_engine(engine_socket(self._engine))
+        reaper.watch_engine(engine_socket(self._engine))
 
     def finish(self) -> None:
         """End it with the run."""

@@ -1,13 +1,11 @@
-"""Which Python each node of the process back end runs on.
+"""Pythons that nodes of the process back end run on.
 
 A node whose container has a ``requirements.txt`` that this environment satisfies runs on this
 Python. Every other container gets a virtual environment of its own, made once and kept in a cache:
 
 - :mod:`~neuros.launch.environments.requirements` reads ``requirements.txt`` and compares;
-- :mod:`~neuros.launch.environments.interpreters` finds the Python that ``.python-version`` names;
-- :mod:`~neuros.launch.environments.choice` decides, without changing anything;
+- :mod:`~neuros.launch.environments.choice` decides, without changing anything, and finds the
+  Python that ``.python-version`` names;
 - :mod:`~neuros.launch.environments.cache` knows what is whole, and who makes what;
-- :mod:`~neuros.launch.environments.making` makes one;
-- :mod:`~neuros.launch.environments.reasons` says why that failed;
-- :mod:`~neuros.launch.environments.pythons` does all that for the nodes of a run.
+- :mod:`~neuros.launch.environments.pythons` makes those of a run, or says why that failed.
 """

@@ -1,4 +1,4 @@
-"""The cache of virtual environments: what is whole, who is making what, what nobody uses.
+"""Cache of virtual environments: made, being made, and unused ones.
 
 ::
 
@@ -29,7 +29,7 @@ from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
 
 
 def cache_folder(environ: Mapping[str, str]) -> Path:
-    """Where environments are kept."""
+    """The folder of all environments."""
     return cache_root(environ) / "environments"
 
 

@@ -1,4 +1,4 @@
-"""Which Python a container needs: decided from its folder, without changing anything."""
+"""Chooses the Python of a container, among those of this machine; changes nothing."""
 
 from __future__ import annotations
 
@@ -6,27 +6,93 @@ import hashlib
 import importlib.metadata
 import json
 import os
+import re
+import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import neuros
 from neuros.caching import KEY_LENGTH
-from neuros.installation.machine import dotted
-from neuros.launch.containers import ContainerFolder
+from neuros.errors import EnvironmentFault
+from neuros.installation.machine import NEWEST, OLDEST, clean_environment, dotted
+from neuros.launch.containers import PACKAGE, ContainerFolder
 from neuros.launch.environments.cache import Entry
-from neuros.launch.environments.interpreters import FILE, Version, find_python, wanted_version
 from neuros.launch.environments.requirements import Requirements, read_requirements, unmet
 
+Version = tuple[int, int]
+FILE = ".python-version"
+_VERSION = re.compile(r"(?:c?python-?)?(\d+)\.(\d+)(?:\.\d+)*")
+_ASK = "import sys; print(sys.implementation.name, *sys.version_info[:2])"
+_ANSWER_TIMEOUT_S = 10.0
 HERE: Version = sys.version_info[:2]
-PACKAGE = Path(neuros.__file__).resolve().parent
 _FORMAT = 1  # of what is made: another one makes all environments anew
+
+
+def wanted_version(folder: Path) -> Version | None:
+    """The version in a container's ``.python-version``, as pyenv and uv read it; or ``None``.
+
+    Raises:
+        EnvironmentFault: if there are no packages of ROS 2 for that Python.
+    """
+    file = folder / FILE
+    try:
+        rows = [row.strip() for row in file.read_text("utf-8").splitlines()]
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise EnvironmentFault(f"{file} cannot be read: {error}") from error
+    text = next((row for row in rows if row and not row.startswith("#")), "")
+    match = _VERSION.fullmatch(text)
+    version = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not OLDEST <= version <= NEWEST:
+        raise EnvironmentFault(
+            f"{file} asks for Python {text!r}: name one that ROS 2 has packages for,"
+            f" {dotted(OLDEST)} to {dotted(NEWEST)}"
+        )
+    return version
+
+
+def find_python(version: Version, environ: Mapping[str, str]) -> Path | None:
+    """A CPython of that version on this machine that runs, or ``None``."""
+    for path in _candidates(f"python{dotted(version)}", environ):
+        if os.access(path, os.X_OK) and _is_version(path, version, environ):
+            return path
+    return None
+
+
+def _candidates(name: str, environ: Mapping[str, str]) -> Iterator[Path]:
+    for folder in environ.get("PATH", os.defpath).split(os.pathsep):
+        if folder:
+            yield Path(folder) / name
+    # A shim of pyenv is on the path, and refuses what its settings do not name.
+    home = Path(environ.get("HOME") or "/")
+    pyenv = Path(environ.get("PYENV_ROOT") or home / ".pyenv") / "versions"
+    data = Path(environ.get("XDG_DATA_HOME") or home / ".local/share")
+    uv = Path(environ.get("UV_PYTHON_INSTALL_DIR") or data / "uv/python")
+    for installations in (pyenv, uv):
+        yield from sorted(installations.glob(f"*/bin/{name}"), reverse=True)
+
+
+def _is_version(path: Path, version: Version, environ: Mapping[str, str]) -> bool:
+    try:
+        answer = subprocess.run(
+            [str(path), "-I", "-S", "-c", _ASK],
+            env=clean_environment(environ),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_ANSWER_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return answer.stdout.split() == ["cpython", *map(str, version)]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a container needs.
+    """The Python and the packages of a container.
 
     Attributes:
         version: the Python that it is to run on.
@@ -69,7 +135,7 @@ class Choice:
 
 
 def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) -> Choice:
-    """What a container with a ``requirements.txt`` needs.
+    """Choose for a container with a ``requirements.txt``.
 
     Raises:
         EnvironmentFault: if its files cannot be read, or ask for a Python without ROS 2.
@@ -91,7 +157,7 @@ def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) 
 
 
 def choose_here(container: ContainerFolder, cache: Path) -> Choice:
-    """The same where it runs on this version of Python in any case.
+    """Choose for a container that runs on this version of Python.
 
     Raises:
         EnvironmentFault: if its files cannot be read.
@@ -108,7 +174,7 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
 
 
 def own_needs() -> list[str]:
-    """What NeuROS itself needs, as requirements; empty if it is not installed here."""
+    """The requirements of NeuROS itself; empty if it is not installed here."""
     try:
         needs = importlib.metadata.requires("neuros") or []
     except importlib.metadata.PackageNotFoundError:

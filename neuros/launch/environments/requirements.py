@@ -50,7 +50,7 @@ class Requirements:
 
     @property
     def has_hashes(self) -> bool:
-        """Whether pip will refuse whatever has no hash."""
+        """Whether pip refuses packages without a hash."""
         return any("--hash" in line.text for line in self.lines)
 
 
@@ -99,7 +99,7 @@ def _rows(text: str) -> Iterator[str]:
 
 
 def unmet(requirements: Requirements, *, any_version: bool = False) -> list[str]:
-    """What this environment lacks, in words; empty if it satisfies the requirements.
+    """Requirements that this environment lacks, in words; empty if it lacks none.
 
     Args:
         any_version: whether it is enough that a package is there.

@@ -25,7 +25,7 @@ from neuros.launch.docker.engine import engine_socket
 from neuros.launch.docker.launcher import DockerLauncher, find_containers
 from neuros.launch.docker.settings import container_name, shared_memory
 from neuros.launch.run_processes import RUN_ID, environ_of
-from neuros.launch.sessions import Session, guardian_environment
+from neuros.launch.sessions import Session, reaper_environment
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split
@@ -359,13 +359,13 @@ def test_no_paused_container_outlives_a_killed_launcher_either(
 
 
 @pytest.mark.acceptance
-def test_killed_together_with_its_guardian_what_is_left_goes_with_the_next_run(
+def test_killed_together_with_its_reaper_what_is_left_goes_with_the_next_run(
     bench: ContainerBench,
 ) -> None:
     bench.project({"a": RUNS})
     running = bench.start_and_wait("a")
     session = bench.session(running)
-    for pid in (guardian_of(session), running.process.pid):
+    for pid in (reaper_of(session), running.process.pid):
         os.kill(pid, signal.SIGKILL)
     running.process.wait()
     memory, control = shared_memory(session.run), Path(session.folder, SOCKET_NAME)
@@ -554,9 +554,9 @@ def pause(bench: ContainerBench, running: Running) -> None:
         container.pause()
 
 
-def guardian_of(session: Session) -> int:
+def reaper_of(session: Session) -> int:
     """The number of the process whose environment describes the run."""
-    mark = next(f"{key}={value}" for key, value in guardian_environment(session).items()).encode()
+    mark = next(f"{key}={value}" for key, value in reaper_environment(session).items()).encode()
     (pid,) = [
         pid for pid in map(int, filter(str.isdigit, os.listdir("/proc"))) if mark in environ_of(pid)
     ]

@@ -1,4 +1,4 @@
-"""How a run comes to its end: the phases it goes through, and what makes it go on to the next.
+"""Shutdown of a run: its phases, and the events that end each of them.
 
 Running, then perhaps draining, then stopping, and at worst killed; never back.
 """
@@ -11,20 +11,20 @@ import time
 from neuros.launch.channels import Channels
 from neuros.launch.declarations import Declarations
 from neuros.launch.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Output, Phase
-from neuros.launch.probing import Probing, Verdict
+from neuros.launch.peers import Peers
 from neuros.launch.processes import Processes, names_of
-from neuros.launch.sides import Sides
-from neuros.launch.watch import Watch, with_stack
+from neuros.launch.quiescence import Probing, Verdict
+from neuros.launch.stall_detector import StallDetector, with_stack
 from neuros.ports import RunningNode
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
 
-# What closing a node that other sides have heard may take, before it would be killed.
+# What closing a node that peers have heard may take, before it would be killed.
 _CLOSING_S = 1.0
 
 
-class Ending:
+class Shutdown:
     """The phase of a run.
 
     Args:
@@ -35,10 +35,10 @@ class Ending:
         self,
         channels: Channels,
         processes: Processes,
-        watch: Watch,
+        detector: StallDetector,
         declarations: Declarations,
         probing: Probing,
-        sides: Sides,
+        peers: Peers,
         outcome: Outcome,
         output: Output,
         signals: list[int],
@@ -47,17 +47,17 @@ class Ending:
         self._deadline_s = 0.0
         self._channels = channels
         self._processes = processes
-        self._watch = watch
+        self._detector = detector
         self._declarations = declarations
         self._probing = probing
-        self._sides = sides
+        self._peers = peers
         self._outcome = outcome
         self._output = output
         self._signals = signals
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether something outlasts even SIGKILL; the guardian will try on for a while."""
+        """Whether something outlasts even SIGKILL; the reaper will try on for a while."""
         return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
 
     def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
@@ -73,7 +73,7 @@ class Ending:
         self._outcome.reason = reason
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
-        self._sides.drain(reason, drain_s)
+        self._peers.drain(reason, drain_s)
         # A node that is still loading has sent nothing, and nobody could send to it yet.
         for process in self._processes.not_loaded():
             self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
@@ -104,11 +104,11 @@ class Ending:
                 self._outcome.is_signalled = True
                 self._output.log("INFO", f"{name}: already ending (once more kills at once)")
 
-    def heed_sides(self) -> None:
+    def heed_peers(self) -> None:
         """End where the project has ended elsewhere, and as it did there."""
         if self.phase not in (Phase.RUNNING, Phase.DRAINING):
             return
-        end = self._sides.end(time.monotonic())
+        end = self._peers.end(time.monotonic())
         if end is None:
             return
         if end.exit_code == 0:
@@ -137,8 +137,8 @@ class Ending:
             for process in self._processes:
                 self._fail_to_end(process)
             self._kill_all()
-        elif self._sides.exist and self._processes.have_reported():
-            may_go = self._sides.finish(self._outcome.reports, now_s)
+        elif self._peers.exist and self._processes.have_reported():
+            may_go = self._peers.finish(self._outcome.reports, now_s)
             if may_go or self._deadline_s - now_s < _CLOSING_S:
                 self._channels.send("leave")
 
@@ -150,7 +150,7 @@ class Ending:
             if self._outcome.has_final_report(name):
                 continue
             otherwise = "it did not come to its end"
-            hook = self._watch.executing(name)
+            hook = self._detector.executing(name)
             if hook and not self._declarations.is_finalising(name):
                 unfinished.append(f"'{name}' was still executing '{hook}'")
             unfinished += self._declarations.unfinished(name)
@@ -168,7 +168,7 @@ class Ending:
         now_s = time.monotonic()
         self._outcome.begin_to_end(now_s)
         self._deadline_s = now_s + STOP_S
-        self._sides.stop(self._outcome.exit_code, self._outcome.reason)
+        self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send("stop")
         for process in self._processes.not_loaded():
             self._processes.kill(process)  # it has not come as far as anything worth finalising
@@ -179,11 +179,13 @@ class Ending:
         for process in self._processes:
             first, stacks = process.names[0], self._outcome.stacks
             for name in process.names:
-                if stack := self._watch.stack_of(name):
+                if stack := self._detector.stack_of(name):
                     stacks[name] = stack.text
                     text = f"{name} was at this point when it was killed"
                     self._output.log("ERROR", with_stack(text, stack))
-            if stacks.keys().isdisjoint(process.names) and (text := self._watch.threads_of(first)):
+            if stacks.keys().isdisjoint(process.names) and (
+                text := self._detector.threads_of(first)
+            ):
                 stacks[first] = text
                 where = f"{names_of(process)} stood when killed, the most recent call first"
                 self._output.log("ERROR", f"where the threads of {where}:\n{text}")

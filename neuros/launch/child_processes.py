@@ -1,7 +1,8 @@
-"""A host: a process that runs nodes.
+"""Child processes of a launcher: node processes, and sidecar processes beside them.
 
-It leads a session of its own, so that Ctrl+C reaches only the launcher, and writes its log itself,
-so that nothing passes through the launcher and nothing is lost when that dies.
+A node process runs one node, or all. It leads a session of its own, so that Ctrl+C reaches only
+the launcher, and writes its log itself, so that nothing passes through the launcher and nothing is
+lost when that dies.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.launch.host_command import script_failure
+from neuros.launch.node_command import process_environment, script_failure, with_libraries
 from neuros.launch.placement import Cores, children_on
 
+_NICENESS = 10
 
-class HostProcess:
-    """A host that was started, and the nodes in it (:class:`neuros.ports.RunningNode`)."""
+
+class RunningProcess:
+    """A node process that was started, and the nodes in it (:class:`neuros.ports.RunningNode`)."""
 
     def __init__(
         self,
@@ -90,16 +93,16 @@ class HostProcess:
                 os.killpg(self._process.pid, signal.SIGKILL)
 
 
-def end_now(hosts: Sequence[HostProcess]) -> None:
-    """Kill hosts and wait until they are gone."""
-    for host in hosts:
-        host.kill()
-    for host in hosts:
-        host.wait(5.0)
+def end_now(processes: Sequence[RunningProcess]) -> None:
+    """Kill processes and wait until they are gone."""
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.wait(5.0)
 
 
 def signal_in_words(number: int) -> str:
-    """What a signal has done to a process."""
+    """The effect of a signal on a process, in words."""
     try:
         return f"killed by {signal.Signals(number).name}"
     except ValueError:  # a real-time signal
@@ -108,3 +111,43 @@ def signal_in_words(number: int) -> str:
 
 def _in_words(code: int) -> str:
     return f"exit code {code}" if code >= 0 else signal_in_words(-code)
+
+
+def start_sidecar(
+    what: str,
+    command: Sequence[str],
+    run: Path,
+    log: Path,
+    environment: Mapping[str, str],
+    pass_fds: Sequence[int] = (),
+    *,
+    is_ours: bool = True,
+) -> subprocess.Popen[bytes]:
+    """Start a program in the run folder, in a session of its own, at lower priority than nodes.
+
+    Args:
+        what: its name, for messages.
+        log: where its standard error goes; input and output are pipes.
+        environment: what is added to that of this process.
+        is_ours: whether it is a program of this Python; others do not get the libraries of ours.
+
+    Raises:
+        EnvironmentFault: if it cannot be started.
+    """
+    whole = process_environment(os.environ, environment)
+    try:
+        with open(log, "ab") as file:
+            process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=file,
+                cwd=run,
+                env=with_libraries(whole) if is_ours else whole,
+                start_new_session=True,
+                pass_fds=tuple(pass_fds),
+            )
+    except OSError as error:
+        raise EnvironmentFault(f"the {what} cannot be started: {error}") from error
+    os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+    return process

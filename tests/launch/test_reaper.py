@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from neuros.launch.domain import choose_domain
-from neuros.launch.guardian import Guardian
+from neuros.launch.reaper import Reaper
 from neuros.launch.run_processes import RUN_ID
 
 IGNORES_SIGTERM = """
@@ -44,17 +44,17 @@ HELLO = "import os; print(os.getpid(), flush=True)\n"
 LAUNCHER = """
 import os, subprocess, sys, time
 from pathlib import Path
-from neuros.launch.guardian import Guardian
-from neuros.launch.host_command import host_environment
-guardian = Guardian.start(sys.argv[1])
-print(guardian.pid, flush=True)
-guardian.remove_later(Path(sys.argv[2]))
+from neuros.launch.reaper import Reaper
+from neuros.launch.node_command import process_environment
+reaper = Reaper.start(sys.argv[1])
+print(reaper.pid, flush=True)
+reaper.remove_later(Path(sys.argv[2]))
 environment = {**os.environ, "NEUROS_RUN_ID": sys.argv[1]}
 for program in sys.argv[3:]:
     host = subprocess.Popen(
         [sys.executable, "-S", "-c", program], env=environment, start_new_session=True
     )
-    guardian.watch(host.pid)
+    reaper.watch(host.pid)
     print(host.pid, flush=True)
 print("started", flush=True)
 time.sleep(60)
@@ -70,10 +70,10 @@ def run_id() -> Iterator[str]:
 
 
 @pytest.fixture
-def guardian(run_id: str) -> Iterator[Guardian]:
-    guardian = Guardian.start(run_id)
-    yield guardian
-    guardian.finish()
+def reaper(run_id: str) -> Iterator[Reaper]:
+    reaper = Reaper.start(run_id)
+    yield reaper
+    reaper.finish()
 
 
 def _processes_of(run_id: str) -> list[int]:
@@ -139,7 +139,7 @@ def test_nothing_is_left_six_seconds_after_the_launcher_was_killed(
     )
     assert launcher.stdout is not None
     with launcher.stdout as output:
-        guardian, *hosts = [int(line) for line in iter(output.readline, "started\n")]
+        reaper, *hosts = [int(line) for line in iter(output.readline, "started\n")]
     sessions = set(hosts)
     # two hosts that stay, the double fork in its own session, the child with no environment
     _wait_until(lambda: len(_processes_of(run_id)) == 3 and _has_orphan(sessions))
@@ -148,7 +148,7 @@ def test_nothing_is_left_six_seconds_after_the_launcher_was_killed(
     launcher.kill()
     launcher.wait(5)
     killed_at = time.monotonic()
-    everything = [guardian, *hosts, *orphans]
+    everything = [reaper, *hosts, *orphans]
     _wait_until(
         lambda: not any(map(_is_alive, everything)) and not _processes_of(run_id), deadline_s=6
     )
@@ -177,63 +177,63 @@ def _has_orphan(sessions: set[int]) -> bool:
     return False
 
 
-def test_finish_kills_at_once_what_is_left(run_id: str, guardian: Guardian) -> None:
+def test_finish_kills_at_once_what_is_left(run_id: str, reaper: Reaper) -> None:
     process = _start(run_id, IGNORES_SIGTERM)
-    guardian.finish()
+    reaper.finish()
     assert _end(process) == -signal.SIGKILL
-    assert not guardian.is_on_duty
+    assert not reaper.is_on_duty
 
 
 def test_processes_that_end_within_the_grace_period_are_not_killed(
-    run_id: str, guardian: Guardian
+    run_id: str, reaper: Reaper
 ) -> None:
     process = _start(run_id, "import time; time.sleep(0.3)")
-    guardian.finish(grace_s=10)
+    reaper.finish(grace_s=10)
     assert _end(process) == 0
 
 
-def test_the_grace_period_ends_early_when_all_are_gone(guardian: Guardian) -> None:
+def test_the_grace_period_ends_early_when_all_are_gone(reaper: Reaper) -> None:
     begin = time.monotonic()
-    guardian.finish(grace_s=10)
+    reaper.finish(grace_s=10)
     assert time.monotonic() - begin < 5
 
 
-def test_processes_of_other_runs_are_left_alone(run_id: str, guardian: Guardian) -> None:
+def test_processes_of_other_runs_are_left_alone(run_id: str, reaper: Reaper) -> None:
     other = _start(f"{run_id}0", "import time; print(flush=True); time.sleep(60)")
     try:
-        guardian.finish()
+        reaper.finish()
         assert other.poll() is None
     finally:
         other.kill()
         _end(other)
 
 
-def test_a_guardian_ignores_the_signals_of_terminals_and_service_managers(
-    run_id: str, guardian: Guardian
+def test_a_reaper_ignores_the_signals_of_terminals_and_service_managers(
+    run_id: str, reaper: Reaper
 ) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        os.kill(guardian.pid, number)
+        os.kill(reaper.pid, number)
     process = _start(run_id, IGNORES_SIGTERM)
-    guardian.finish()
+    reaper.finish()
     assert _end(process) == -signal.SIGKILL
 
 
-def test_the_launcher_does_the_work_of_a_guardian_that_was_killed(
-    run_id: str, guardian: Guardian, tmp_path: Path
+def test_the_launcher_does_the_work_of_a_reaper_that_was_killed(
+    run_id: str, reaper: Reaper, tmp_path: Path
 ) -> None:
     left = tmp_path / "socket"
     left.touch()
-    os.kill(guardian.pid, signal.SIGKILL)
-    _wait_until(lambda: not guardian.is_on_duty)
-    guardian.remove_later(left)
+    os.kill(reaper.pid, signal.SIGKILL)
+    _wait_until(lambda: not reaper.is_on_duty)
+    reaper.remove_later(left)
     process = _start(run_id, IGNORES_SIGTERM)
-    guardian.finish()
+    reaper.finish()
     assert _end(process) == -signal.SIGKILL
     assert not left.exists()
 
 
 def test_files_are_removed_after_the_processes_whatever_their_names(
-    guardian: Guardian, tmp_path: Path
+    reaper: Reaper, tmp_path: Path
 ) -> None:
     odd = tmp_path / os.fsdecode(b"a b\n\xff")
     odd.touch()
@@ -241,30 +241,30 @@ def test_files_are_removed_after_the_processes_whatever_their_names(
     target = tmp_path / "target"
     target.mkdir()
     link.symlink_to(target)
-    guardian.remove_later(odd)
-    guardian.remove_later(link)
-    guardian.remove_later(tmp_path / "never existed")
-    guardian.finish()
+    reaper.remove_later(odd)
+    reaper.remove_later(link)
+    reaper.remove_later(tmp_path / "never existed")
+    reaper.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["target"]
 
 
-def test_a_guardian_holds_the_domain_and_removes_the_lock_file(run_id: str, tmp_path: Path) -> None:
+def test_a_reaper_holds_the_domain_and_removes_the_lock_file(run_id: str, tmp_path: Path) -> None:
     lock = choose_domain(None, {}, False, folder=tmp_path)
-    guardian = Guardian.start(run_id, lock)
+    reaper = Reaper.start(run_id, lock)
     descriptor = lock.fileno()
     assert descriptor is not None
     os.close(descriptor)  # as if the launcher were dead
     lock._descriptor = None
     with choose_domain(None, {}, False, folder=tmp_path) as other:
         assert other.id != lock.id
-    guardian.finish()
+    reaper.finish()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_launcher_waits_for_no_import_that_only_removing_files_needs() -> None:
     root = str(Path(__file__).resolve().parents[2])
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import neuros.launch.guardian_program;"
+        "import sys; sys.path.insert(0, sys.argv[1]); import neuros.launch.reaper_program;"
         " print(*sorted({'dataclasses', 'pathlib', 'shutil', 'subprocess'} & {*sys.modules}))"
     )
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""What the guardian process does; see :mod:`neuros.launch.guardian` for why.
+"""Program of the reaper process; :mod:`neuros.launch.reaper` explains it.
 
 It is on duty as soon as it can find and kill the processes of the run: the launcher waits for
 that, and for nothing else. So what takes longer to import, and only removes files, comes after.
@@ -26,7 +26,7 @@ _REMOVE_S = 5.0
 
 
 class Orders:
-    """What the launcher has told the guardian so far."""
+    """Orders of the launcher to the reaper so far."""
 
     def __init__(self, started_s: float) -> None:
         self.started_s = started_s
@@ -51,7 +51,7 @@ class Orders:
 
 
 def main(run_id: str) -> None:
-    """What the guardian process does: wait for the pipe on standard input to close, clean up."""
+    """Wait for the pipe on standard input to close, clean up."""
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
         signal.signal(name, signal.SIG_IGN)
     orders = Orders(started_s=time.time())
@@ -81,7 +81,6 @@ def _import_the_rest() -> None:
     with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
         import shutil  # noqa: F401
 
-        import neuros.launch.dead_runs
         import neuros.launch.domain
         import neuros.launch.leftover_containers
         import neuros.launch.shared_memory  # noqa: F401
@@ -98,9 +97,8 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
 
     from pathlib import Path
 
-    from neuros.launch.dead_runs import remove_dead_runs
     from neuros.launch.domain import remove_lock
-    from neuros.launch.shared_memory import remove_segments, sweep
+    from neuros.launch.shared_memory import remove_dead_runs, remove_segments, sweep
 
     remove_segments(run_id)
     sweep(orders.started_s)
@@ -138,7 +136,7 @@ def _resume_containers(run_id: str, orders: Orders) -> None:
 
 
 def _remove_containers(run_id: str, orders: Orders) -> None:
-    """What a killed launcher had asked the engine for may still be on its way."""
+    """Containers that a killed launcher had asked for may still be on their way."""
     for engine in orders.engines:
         from neuros.launch.leftover_containers import remove_containers
 

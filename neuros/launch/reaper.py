@@ -1,18 +1,18 @@
-"""The guardian: a process that outlives the launcher, and sees to it that nothing else does.
+"""The reaper: a process that outlives the launcher and ends what is left of its run.
 
 It holds the read end of a pipe whose write end only the launcher has. When the pipe closes, the
-launcher has ended, also by SIGKILL. Then the guardian lets the nodes end by themselves for a grace
+launcher has ended, also by SIGKILL. Then the reaper lets the nodes end by themselves for a grace
 period, kills what is left of the run, again and again until nothing is, and removes what killed
 nodes leave: shared memory, sockets, temporary folders.
 
 A process belongs to the run if the environment it was started with names the run
 (``NEUROS_RUN_ID``): children inherit that through double forks and new sessions. Further, if it is
-in the session of a host that the launcher announced, or a child of a process of the run: that
+in the session of a process that the launcher announced, or a child of a process of the run: that
 finds those that were started with an empty environment.
 
-The guardian is started first, without site-packages, ignores the signals that a terminal or a
+The reaper is started first, without site-packages, ignores the signals that a terminal or a
 service manager sends, and needs nothing but the standard library. This is the launcher's end;
-:mod:`neuros.launch.guardian_program` is what the guardian itself does.
+:mod:`neuros.launch.reaper_program` is the program of the process itself.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
 from neuros.launch.domain import DomainLock
-from neuros.launch.guardian_program import KILL_DEADLINE_S, READY, Orders, clean_up
+from neuros.launch.reaper_program import KILL_DEADLINE_S, READY, Orders, clean_up
 from neuros.launch.run_processes import RUN_ID
 
 _PROGRAM = (
     "import sys; sys.path.insert(0, sys.argv[1]); "
-    "from neuros.launch.guardian_program import main; main(sys.argv[2])"
+    "from neuros.launch.reaper_program import main; main(sys.argv[2])"
 )
 _START_DEADLINE_S = 10.0
 
 
-class Guardian:
-    """The launcher's handle on its guardian.
+class Reaper:
+    """The launcher's handle on its reaper.
 
     Example::
 
-        guardian = Guardian.start(run_id, domain_lock)
-        guardian.remove_later(socket_path)
-        ...  # start nodes with NEUROS_RUN_ID=run_id, announce each: guardian.watch(pid)
-        guardian.finish()
+        reaper = Reaper.start(run_id, domain_lock)
+        reaper.remove_later(socket_path)
+        ...  # start nodes with NEUROS_RUN_ID=run_id, announce each: reaper.watch(pid)
+        reaper.finish()
     """
 
     def __init__(self, run_id: str, process: subprocess.Popen[bytes], pipe: int) -> None:
@@ -63,10 +63,10 @@ class Guardian:
         run_id: str,
         lock: DomainLock | None = None,
         environment: Mapping[str, str] = MappingProxyType({}),
-    ) -> Guardian:
-        """Start a guardian and wait until it is on duty.
+    ) -> Reaper:
+        """Start a reaper and wait until it is on duty.
 
-        It holds ``lock``, too, so that nobody takes the domain before the last node is gone, and
+        It holds ``lock``, too, so that no run takes the domain before the last node is gone, and
         removes the lock file in the end. ``environment`` is added to its own. Raises
         ``EnvironmentFault``.
         """
@@ -87,18 +87,18 @@ class Guardian:
             )
         except OSError as error:
             os.close(write_end)
-            raise EnvironmentFault(f"the guardian process cannot be started: {error}") from error
+            raise EnvironmentFault(f"the reaper process cannot be started: {error}") from error
         finally:
             os.close(read_end)
-        guardian = cls(run_id, process, write_end)
+        reaper = cls(run_id, process, write_end)
         try:
-            guardian._await_ready()
+            reaper._await_ready()
         except BaseException:
-            guardian._kill()
+            reaper._kill()
             raise
         if lock and lock.path and descriptor is not None:
-            guardian._tell("lock", [descriptor, str(lock.path)])
-        return guardian
+            reaper._tell("lock", [descriptor, str(lock.path)])
+        return reaper
 
     @property
     def pid(self) -> int:
@@ -107,11 +107,11 @@ class Guardian:
 
     @property
     def is_on_duty(self) -> bool:
-        """Whether it is there; somebody may have killed it."""
+        """Whether it runs; it may have been killed."""
         return self._process.poll() is None
 
     def watch(self, pid: int) -> None:
-        """Announce a host: a process that leads a session of its own."""
+        """Announce a process that leads a session of its own."""
         self._tell("session", pid)
 
     def remove_later(self, path: Path) -> None:
@@ -128,7 +128,7 @@ class Guardian:
         self.remove_later(folder)
 
     def finish(self, grace_s: float = 0.0) -> None:
-        """Leave the rest to the guardian and wait for it.
+        """Leave the rest to the reaper and wait for it.
 
         What still runs gets ``grace_s`` seconds to end by itself. A second call has no effect.
         """
@@ -159,7 +159,7 @@ class Guardian:
             if ready and answer.read(len(READY)) == READY:
                 return
         raise EnvironmentFault(
-            f"the guardian process did not start ({sys.executable}): nothing was started, since "
+            f"the reaper process did not start ({sys.executable}): nothing was started, since "
             "without it a killed launcher would leave nodes behind"
         )
 

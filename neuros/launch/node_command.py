@@ -1,4 +1,11 @@
-"""What a host executes: its command line, its environment, and the scripts that run before it."""
+"""Command line, environment and scripts of a node process, with the ROS wheel environment.
+
+The ROS wheels from PyPI install a ``.pth`` file: each Python of their environment looks for their
+libraries and restarts itself once, with ``LD_LIBRARY_PATH`` and a mark in the environment. Two
+things follow. A child that runs another environment's Python must not inherit the mark: it would
+find no libraries. And a child that runs this Python can be given both, so that it need not start
+twice.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuros.launch.placement import THREAD_VARIABLES
-from neuros.launch.wheels import with_libraries, without_mark
 from neuros.project.model import NodeFile
 
 # One thread each: more threads than free cores make numerical libraries slower, not faster, and
@@ -22,8 +28,8 @@ DEFAULTS = {
 }
 # Runs the scripts one after another, each with the log of its node for output, by themselves where
 # they may be executed (seen from where they run, which may be a container); the shell passes
-# SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the host of it: same
-# process id, nothing in between.
+# SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the node process of it:
+# same process id, nothing in between.
 _SCRIPTS = """\
 run() {
   name=$1 script=$2 log=$3; shift 3
@@ -41,6 +47,9 @@ _SCRIPT_FAILED = re.compile(
     r"script (?P<script>.*) failed: (?P<how>exit code \d+)"
 )
 _TAIL_BYTES = 8192
+_MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+_LIBRARIES = "LD_LIBRARY_PATH"
+_BOOTSTRAPPER = "ros_wheels_bootstrapper"
 
 
 def node_folder(node: NodeFile) -> Path:
@@ -49,17 +58,17 @@ def node_folder(node: NodeFile) -> Path:
 
 
 def log_file(node: NodeFile) -> Path:
-    """Where the output of a node goes."""
+    """The file for the output of a node."""
     return node_folder(node) / "node.log"
 
 
 def node_environment(node: NodeFile) -> dict[str, str]:
-    """What a node finds in its environment besides what all find there."""
+    """Environment variables of one node only."""
     return {**node.node.environment, "NEUROS_RUN_DIR": str(node_folder(node))}
 
 
-def host_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a host: ``base`` (the launcher's own) with ``added`` on top."""
+def process_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a node process: ``base`` (the launcher's own) with ``added`` on top."""
     return {**DEFAULTS, **without_mark(base), **added}
 
 
@@ -75,7 +84,7 @@ def with_messages(environment: Mapping[str, str], messages: Sequence[Path]) -> d
 def start_environment(
     command: Sequence[str], nodes: Sequence[NodeFile], environment: Mapping[str, str]
 ) -> dict[str, str]:
-    """``environment`` so that a host that is this very Python starts in it without a restart.
+    """``environment`` so that a node process of this Python starts in it without a restart.
 
     Not where scripts run first: they may run any Python.
     """
@@ -85,27 +94,27 @@ def start_environment(
     return with_libraries(environment)
 
 
-def host_command(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
-    """The host program for these nodes, without their scripts."""
+def node_command(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """The node program for these nodes, without their scripts."""
     return [*command, *(str(node_folder(node) / "node.json") for node in nodes)]
 
 
-def host_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
-    """What to execute for these nodes: their scripts, one after another, and then the host.
+def start_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """The command for these nodes: their scripts, one after another, and then the program.
 
     A script runs in a process of its own in its node's environment; what it changes there does
     not reach the node. What it prints goes to the log of its node.
     """
-    host = host_command(command, nodes)
+    program = node_command(command, nodes)
     scripts = [_script_line(node, node.node.script) for node in nodes if node.node.script]
     if not scripts:
-        return host
-    program = [_SCRIPTS.rstrip("\n"), *scripts, "trap - TERM", f"exec {shlex.join(host)}"]
-    return ["/bin/sh", "-c", "\n".join(program)]
+        return program
+    lines = [_SCRIPTS.rstrip("\n"), *scripts, "trap - TERM", f"exec {shlex.join(program)}"]
+    return ["/bin/sh", "-c", "\n".join(lines)]
 
 
 def script_failure(log: Path) -> str | None:
-    """What the last line of a host's log says of a script that failed, if that is what it says."""
+    """The failed script that the last line of a log names, ``None`` if it names none."""
     match = _SCRIPT_FAILED.fullmatch(last_line(log))
     return match and f"script {match['script']} of '{match['node']}' failed: {match['how']}"
 
@@ -122,3 +131,44 @@ def last_line(log: Path) -> str:
 def _script_line(node: NodeFile, script: Path) -> str:
     variables = [f"{key}={value}" for key, value in node_environment(node).items()]
     return shlex.join(["run", node.node.name, str(script), str(log_file(node)), "env", *variables])
+
+
+def without_mark(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment for any program: as it was before this Python restarted itself."""
+    given = dict(environment)
+    if given.pop(_MARK, None) is not None:
+        kept = [path for path in _paths(given.pop(_LIBRARIES, "")) if not _is_ours(path)]
+        if kept:
+            given[_LIBRARIES] = os.pathsep.join(kept)
+    return given
+
+
+def with_libraries(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment for this Python, which need not restart itself in it.
+
+    It is the one that the restart would make. Where the wheels do not restart Python, or not as we
+    know it, nothing is added.
+    """
+    libraries = _library_paths()
+    if not libraries:
+        return dict(environment)
+    given = [path for path in _paths(environment.get(_LIBRARIES, "")) if path not in libraries]
+    return {**environment, _LIBRARIES: os.pathsep.join([*libraries, *given]), _MARK: "1"}
+
+
+def _library_paths() -> list[str]:
+    """The folders that the wheels put in front, or none."""
+    # Each start of this Python has imported it. If not, importing it here would restart us.
+    find = getattr(sys.modules.get(_BOOTSTRAPPER), "get_ros_paths", None)
+    if find is None or _MARK not in os.environ:
+        return []
+    return sorted(path for path in _paths(str(find())) if _is_ours(path))
+
+
+def _paths(text: str) -> list[str]:
+    return [path for path in text.split(os.pathsep) if path]
+
+
+def _is_ours(path: str) -> bool:
+    prefixes = (str(Path(sys.prefix)), os.path.realpath(sys.prefix))
+    return any(path == inside or path.startswith(f"{inside}{os.sep}") for inside in prefixes)

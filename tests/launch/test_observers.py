@@ -10,12 +10,12 @@ import pytest
 
 from neuros.control import Lines, connect
 from neuros.launch.channels import Channels
-from neuros.launch.onlookers import Onlookers, Pause
+from neuros.launch.observers import Observers, Pause
 from neuros.launch.outcome import Outcome, Phase
 
 
 class Run:
-    """Onlookers of a run that is not there."""
+    """Observers of a run that is not there."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -24,7 +24,7 @@ class Run:
         self.pause = Pause(self.channels.send, lambda: self.now_s)
         self.ends: list[str] = []
         self.is_driven = True
-        self.onlookers = Onlookers(
+        self.observers = Observers(
             self.channels, self.pause, lambda: self.is_driven, self.ends.append
         )
 
@@ -39,7 +39,7 @@ class Run:
         while count:
             self.channels.wait(5.0)
             for lines, message in self.channels.receive():
-                self.onlookers.handlers[message["kind"]](lines, message)
+                self.observers.handlers[message["kind"]](lines, message)
                 count -= 1
 
 
@@ -59,14 +59,14 @@ def told(lines: Lines, count: int) -> list[dict[str, Any]]:
     return found
 
 
-def test_an_onlooker_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
+def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines = run.join()
     lines.send("watch")
     run.hear()
-    run.onlookers.look_at(Phase.RUNNING)
-    run.onlookers.look_at(Phase.RUNNING)
-    run.onlookers.look_at(Phase.DRAINING)
-    run.onlookers.part(Outcome(3, "why"))
+    run.observers.look_at(Phase.RUNNING)
+    run.observers.look_at(Phase.RUNNING)
+    run.observers.look_at(Phase.DRAINING)
+    run.observers.part(Outcome(3, "why"))
     assert told(lines, 3) == [
         {"kind": "phase", "phase": "running", "is_paused": False},
         {"kind": "phase", "phase": "draining", "is_paused": False},
@@ -75,22 +75,22 @@ def test_an_onlooker_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines.close()
 
 
-def test_what_nodes_show_goes_to_the_onlooker_that_asked(run: Run) -> None:
+def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
     node, first, second = run.join(), run.join(), run.join()
-    for onlooker in (first, second):
-        onlooker.send("watch")
+    for observer in (first, second):
+        observer.send("watch")
         run.hear()
-    for onlooker, wanted in ((first, {"a": {"x": {}}}), (second, {})):
-        onlooker.send("look", wanted=wanted)
+    for observer, wanted in ((first, {"a": {"x": {}}}), (second, {})):
+        observer.send("look", wanted=wanted)
         run.hear()
     looks = told(node, 2)
     assert [look["wanted"] for look in looks] == [{"a": {"x": {}}}, {}]
     for look in looks:
         node.send("node_status", node="a", asker=look["asker"], samples=look["wanted"].get("a", {}))
     run.hear(2)
-    for onlooker, samples in ((first, {"x": {}}), (second, {})):
-        run.onlookers.tell("log", severity="INFO", text="that is all")
-        found = [each for each in told(onlooker, 3) if each["kind"] in ("node_status", "log")]
+    for observer, samples in ((first, {"x": {}}), (second, {})):
+        run.observers.tell("log", severity="INFO", text="that is all")
+        found = [each for each in told(observer, 3) if each["kind"] in ("node_status", "log")]
         assert [each["kind"] for each in found[:2]] == ["node_status", "log"]
         assert found[0]["samples"] == samples
     for lines in (node, first, second):
@@ -98,7 +98,7 @@ def test_what_nodes_show_goes_to_the_onlooker_that_asked(run: Run) -> None:
 
 
 def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> None:
-    onlooker = run.join()
+    observer = run.join()
     for kind, fields in (
         ("step", {"count": 1}),  # it does not stand still: nothing happens
         ("pause", {}),
@@ -106,49 +106,49 @@ def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> Non
         ("step", {"count": 3}),
         ("step", {"count": -1}),
     ):
-        onlooker.send(kind, **fields)
+        observer.send(kind, **fields)
     run.hear(5)
     run.now_s += 7.0
     assert run.pause.is_on
     assert run.pause.total_s == 7.0
-    onlooker.send("resume")
+    observer.send("resume")
     run.hear()
     run.now_s += 1.0
     assert not run.pause.is_on
     assert run.pause.total_s == 7.0
-    assert told(onlooker, 3) == [
+    assert told(observer, 3) == [
         {"kind": "pause"},
         {"kind": "step", "count": 3, "is_driven": True},
         {"kind": "resume"},
     ]
-    onlooker.close()
+    observer.close()
 
 
 def test_a_run_goes_on_when_nobody_is_left_to_resume_it(run: Run) -> None:
-    onlooker = run.join()
-    onlooker.send("watch")
-    onlooker.send("pause")
+    observer = run.join()
+    observer.send("watch")
+    observer.send("pause")
     run.hear(2)
-    run.onlookers.look_at(Phase.RUNNING)
+    run.observers.look_at(Phase.RUNNING)
     assert run.pause.is_on
-    onlooker.close()
+    observer.close()
     while run.pause.is_on:
         run.channels.wait(5.0)
         assert list(run.channels.receive()) == []
-        run.onlookers.look_at(Phase.RUNNING)
+        run.observers.look_at(Phase.RUNNING)
 
 
 def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
     run.pause.begin()
     run.now_s += 2.0
-    run.onlookers.look_at(Phase.DRAINING)
+    run.observers.look_at(Phase.DRAINING)
     run.now_s += 2.0
     assert (run.pause.is_on, run.pause.total_s) == (False, 2.0)
 
 
-def test_an_onlooker_may_end_the_run(run: Run) -> None:
-    onlooker = run.join()
-    onlooker.send("end", reason="enough")
+def test_an_observer_may_end_the_run(run: Run) -> None:
+    observer = run.join()
+    observer.send("end", reason="enough")
     run.hear()
     assert run.ends == ["enough"]
-    onlooker.close()
+    observer.close()

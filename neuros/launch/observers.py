@@ -1,6 +1,6 @@
-"""Those who watch a run through its control channel, and may pause, step and end it.
+"""Observers of a run: programs on its control channel that may pause, step and end it.
 
-They see what nodes show when asked (nobody asks unless somebody looks), and take no part in the
+They see what nodes show when asked (they ask while a user looks), and take no part in the
 run: when the last one has gone, a run that was paused goes on.
 """
 
@@ -15,7 +15,7 @@ from neuros.launch.outcome import Outcome, Output, Phase
 
 
 class Pause:
-    """Whether a run stands still, and for how long it has in all.
+    """The pause of a run, and the time that it has been paused in all.
 
     Args:
         send: to all nodes.
@@ -40,7 +40,7 @@ class Pause:
 
     @property
     def total_s(self) -> float:
-        """How long it has stood still so far."""
+        """Seconds of pause so far."""
         since_s = self._since_s
         return self._before_s + (0.0 if since_s is None else self._clock() - since_s)
 
@@ -57,7 +57,7 @@ class Pause:
             self._send("resume")
 
     def forget(self) -> None:
-        """It is over without anybody's doing: nodes that drain go on by themselves."""
+        """The pause is over without a request: nodes that drain go on by themselves."""
         self._before_s, self._since_s = self.total_s, None
 
     def step(self, count: int, *, is_driven: bool) -> None:
@@ -66,8 +66,8 @@ class Pause:
             self._send("step", count=count, is_driven=is_driven)
 
 
-class Onlookers:
-    """All onlookers of a run.
+class Observers:
+    """The observers of one run.
 
     Args:
         is_driven: whether some node starts hooks unasked, and so drives the project.
@@ -99,7 +99,7 @@ class Onlookers:
         }
 
     def tell(self, kind: str, **fields: Any) -> None:
-        """Send to all onlookers."""
+        """Send to all observers."""
         for lines in self._lines.values():
             self._channels.send_to(lines, kind, **fields)
 
@@ -147,7 +147,7 @@ class Onlookers:
 
 
 class Overheard:
-    """An output for people whose records onlookers see, too: ``tell(kind, **fields)``."""
+    """An output for people whose records observers see, too: ``tell(kind, **fields)``."""
 
     def __init__(self, output: Output, tell: Callable[..., object]) -> None:
         self._output = output

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from neuros.launch.wheels import with_libraries, without_mark
+from neuros.launch.node_command import with_libraries, without_mark
 
 MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 BOOTSTRAPPER = "ros_wheels_bootstrapper"

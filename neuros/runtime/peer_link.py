@@ -1,7 +1,7 @@
-"""What passes between a launcher and nodes that another launcher has started, through this process.
+"""Link between a launcher and its peers, through the nodes of this process.
 
-The launcher knows no ROS. So each of its nodes says for it what it has to say, and tells it what
-nodes elsewhere say; only in a project that is started in parts.
+The launcher knows no ROS. So each of its nodes publishes the launcher's state, and tells it what
+nodes elsewhere publish; only in a project that is started in parts.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ ELSEWHERE_VARIABLE = "NEUROS_ELSEWHERE"
 _LEAVE_S = 4.0
 
 
-class SideLink:
-    """One process's part in it; without nodes elsewhere, none.
+class PeerLink:
+    """The part of one process; without nodes elsewhere, none.
 
     Args:
         names: the nodes of this process.
@@ -32,23 +32,23 @@ class SideLink:
         self._tell = tell
         self._lock = threading.Lock()
         self._voice: Voice | None = None
-        self._last_word = ""
+        self._last_state = ""
         self._may_leave = threading.Event()
 
     def open(self, middleware: Middleware) -> None:
         """Speak and listen from now on."""
         if not self._elsewhere:
             return
-        voice = middleware.join_sides(self._names, self._elsewhere, self._hear)
+        voice = middleware.join_peers(self._names, self._elsewhere, self._hear)
         with self._lock:
             self._voice = voice
-            if self._last_word:
-                voice.say(self._last_word)
+            if self._last_state:
+                voice.say(self._last_state)
 
     def say(self, text: str) -> None:
         """Pass on what the launcher says, as soon as that is possible. Any thread."""
         with self._lock:
-            self._last_word = text
+            self._last_state = text
             if self._voice is not None:
                 self._voice.say(text)
 

@@ -1,4 +1,4 @@
-"""Onlooker of a run that shows packets in a viewer."""
+"""Observer of a run that shows packets in a viewer."""
 
 from __future__ import annotations
 

@@ -1,14 +1,16 @@
-"""Watching a run from its reports: has anything moved, and what should the user hear of?
+"""Detects from the reports of nodes that a run stalls, or that a node falls behind.
 
 Reports come once per second, so what is said here is up to a second late.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuros.project.model import Connection
 from neuros.stacks import LONG_S, Stack, held_stack, held_threads
 
 STALL_S = 5.0
@@ -16,10 +18,14 @@ STALL_S = 5.0
 
 _FIRST_REMARK_S = 5.0
 _NEXT_REMARK_S = 10.0
+BEHIND_S = 5.0
+"""A packet that has waited for so long is old."""
+
+_Samples = deque[tuple[float, int]]
 
 
-class Watch:
-    """Keeps what the supervisor needs to know of the nodes between their reports.
+class StallDetector:
+    """Finds standstills, long hooks and silent nodes.
 
     Args:
         names: the nodes.
@@ -109,7 +115,7 @@ class Watch:
         return True
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """What to tell the user now, as ``(severity, text)``."""
+        """Remarks for the user now, as ``(severity, text)``."""
         if now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             if self._silent:
@@ -155,14 +161,14 @@ class Watch:
                 yield "WARN", with_stack(text, held)
 
     def stack_of(self, name: str) -> Stack | None:
-        """Where a node stands in its plugin, as far as is known."""
+        """The stack of a node in its plugin, as far as is known."""
         if held := self._held(name):
             return held
         stack = self._reports.get(name, {}).get("stack")
         return Stack(*stack) if stack else None
 
     def threads_of(self, name: str) -> str:
-        """Where the threads of a node's process were if that has not reported for seconds."""
+        """The threads of a node's process if that has not reported for seconds."""
         return held_threads(self._run_folder / self._hosts.get(name, name))
 
     def executing(self, name: str) -> str:
@@ -174,12 +180,12 @@ class Watch:
         return held.hook if held else ""
 
     def last_seen(self, name: str) -> str:
-        """What a node was doing when it reported last: ``", last seen executing 'step'"``."""
+        """The hook of a node at its last report: ``", last seen executing 'step'"``."""
         hook = self.executing(name)
         return f", last seen executing '{hook}'" if hook else ""
 
     def _held(self, name: str) -> Stack | None:
-        """Where a node stands that holds Python's global lock."""
+        """The stack of a node that holds Python's global lock."""
         held = held_stack(self._run_folder / self._hosts.get(name, name))
         return held if held is not None and held.node == name else None
 
@@ -200,3 +206,83 @@ class Watch:
 def with_stack(text: str, stack: Stack | None) -> str:
     """A sentence, and where the plugin stands, below it."""
     return f"{text}:\n{stack.text}" if stack else text
+
+
+class Backlog:
+    """Finds nodes that fall behind: packets wait for long, though nothing else is missing.
+
+    A node that works on old packets looks busy and healthy. It falls behind where a long queue
+    feeds a slow hook, or where a callback of its plugin runs for long, so that nothing is taken in
+    meanwhile. How long the oldest packet has waited follows from the counters of the reports: it
+    arrived before the first report that counts it.
+
+    Args:
+        connections: those among the nodes whose reports are taken.
+    """
+
+    def __init__(self, connections: Sequence[Connection]) -> None:
+        self._connections = {str(connection): connection for connection in connections}
+        self._received: dict[str, _Samples] = {key: deque() for key in self._connections}
+        self._sent: dict[str, _Samples] = {key: deque() for key in self._connections}
+        self._counted: dict[str, int] = dict.fromkeys(self._connections, 0)
+        self._takers: dict[str, tuple[str, int]] = {}
+        self._named: set[str] = set()
+
+    def report(self, report: Mapping[str, Any], now_s: float) -> None:
+        """Take a report of a node."""
+        metrics = report["metrics"]
+        if metrics is None:
+            return
+        for key, counts in metrics["outgoing"].items():
+            if key in self._sent and counts["is_reliable"]:
+                self._sent[key].append((now_s, counts["sent"]))
+        for key, counts in metrics["incoming"].items():
+            if key not in self._received:
+                continue
+            self._counted[key] = counts["received"]
+            self._received[key].append((now_s, counts["received"]))
+            _drop(self._received[key], counts["received"] - counts["unread"])
+            if counts["taker"] is None:
+                self._takers.pop(key, None)
+            else:
+                self._takers[key] = counts["taker"], counts["unread"]
+
+    def begin_anew(self) -> None:
+        """Something has kept the nodes still: what waited meanwhile is not behind."""
+        for samples in (*self._received.values(), *self._sent.values()):
+            samples.clear()
+
+    def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
+        """Remarks for the user now, as ``(severity, text)``: each connection once."""
+        for key, connection in self._connections.items():
+            if key in self._named:
+                continue
+            node = connection.destination_node
+            _drop(self._sent[key], self._counted[key])
+            if key in self._takers and _age_s(self._received[key], now_s) >= BEHIND_S:
+                self._named.add(key)
+                hook, unread = self._takers[key]
+                yield (
+                    "WARN",
+                    f"{node} has fallen behind: the oldest of {unread} unread packets on `{key}`"
+                    f" has waited for over {BEHIND_S:g} s, and hook '{hook}' is ready for it."
+                    " A smaller queue_size, or a discard_limit, keeps packets fresh",
+                )
+            elif _age_s(self._sent[key], now_s) >= BEHIND_S:
+                self._named.add(key)
+                yield (
+                    "WARN",
+                    f"{node} has fallen behind: it has taken nothing in for over {BEHIND_S:g} s,"
+                    f" though packets wait on `{key}`. A callback of its plugin (of a subscription,"
+                    " timer or service) runs for long, or its process gets no processor time",
+                )
+
+
+def _drop(samples: _Samples, settled: int) -> None:
+    """Forget the reports that count no packet beyond the first ``settled``."""
+    while samples and samples[0][1] <= settled:
+        samples.popleft()
+
+
+def _age_s(samples: _Samples, now_s: float) -> float:
+    return now_s - samples[0][0] if samples else 0.0

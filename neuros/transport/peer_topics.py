@@ -1,8 +1,8 @@
-"""How a project that is started in parts is held together: what its sides say to each other.
+"""Topics on which the launchers of one project hear each other's state.
 
-A *side* is what one launcher has started. Its nodes say what their launcher has them say, each on a
+The nodes of a launcher publish its state (:class:`neuros.launch.peers.PeerState`), each on a
 topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
-``std_msgs/msg/String``, so that the last word also reaches who comes later. That a node goes
+``std_msgs/msg/String``, so that the last state also reaches who comes later. That a node goes
 on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no
 Python: a plugin that holds its global lock for seconds does not pass for dead.
 """
@@ -38,14 +38,14 @@ _OFFERED_S = 0.6
 _HEARD_S = 0.5
 
 
-class SideVoice:
+class PeerVoice:
     """Speaks for nodes of this process, and listens to nodes elsewhere, in a thread of its own.
 
     Args:
         names: the nodes of this process.
         elsewhere: nodes that other launchers start.
-        heard: called from the thread with a node elsewhere and its word, or ``None`` when it is
-            gone.
+        heard: called from the thread with a node elsewhere and its launcher's state, or
+            ``None`` when it is gone.
         namespace: that of the project.
     """
 
@@ -90,7 +90,7 @@ class SideVoice:
             publisher.publish(String(data=text))
 
     def close(self) -> None:
-        """Let the last word arrive, then be silent."""
+        """Let the last state arrive, then be silent."""
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
         self._executor.shutdown(_HEARD_S)
