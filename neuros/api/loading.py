@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from neuros.api.workspace import WORKSPACE
+from neuros.distribution import WORKSPACE
 from neuros.errors import Problem, ProjectError
 from neuros.launch.containers import find_container, misspelt
 from neuros.messages.needed import Messages

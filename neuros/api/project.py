@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.back_end import default_back_end
-from neuros.api.environments import make_environments
 from neuros.api.live import LiveRun
 from neuros.api.loading import load_with_messages
-from neuros.api.plan import make_plan
+from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request, parse_duration
 from neuros.api.run import Run
-from neuros.api.settings import override_texts, seed_texts
 from neuros.api.validation import model_problems
-from neuros.errors import Problem, ProjectError
+from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.project.graph import graph_mermaid, graph_text
@@ -282,3 +280,49 @@ def _recording(record: bool | Sequence[str]) -> RecordingRequest | None:
         return RecordingRequest(everything=True) if record else None
     names = (record,) if isinstance(record, str) else tuple(record)
     return RecordingRequest(everything=False, topics=names) if names else None
+
+
+_ENVIRONMENT = "environment"
+
+
+def override_texts(settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """As the texts of ``--set``: ``{"nodes.a.environment.RATE": 0.5}``. ``None`` removes a key."""
+    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
+
+
+def value_text(path: str, value: Any) -> str:
+    """A value as ``--set`` has it; in ``environment`` all is text.
+
+    Raises:
+        UsageError: if it is nothing that JSON knows.
+    """
+    if value is None:
+        return ""
+    if isinstance(value, str) and path.split(".")[2:3] == [_ENVIRONMENT]:
+        return value
+    try:
+        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
+def seed_texts(project: Described, seed: int) -> tuple[str, ...]:
+    """Overrides that give this seed to every node that has one.
+
+    A seed is a variable in the ``environment`` of a node whose name contains SEED.
+
+    Raises:
+        UsageError: if no node has one.
+    """
+    places = [
+        f"nodes.{node.name}.{_ENVIRONMENT}.{name}"
+        for node in project.nodes
+        for name in node.environment
+        if "SEED" in name.upper()
+    ]
+    if not places:
+        raise UsageError(
+            f"seed {seed}: no node of {project.name} has a variable with SEED in its name in its"
+            " environment: add one there, or set what its plugin takes for a seed"
+        )
+    return tuple(f"{place}={int(seed)}" for place in places)

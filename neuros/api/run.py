@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.api.frames import frame_of
-from neuros.errors import RunError
+from neuros.errors import EnvironmentFault, RunError
 from neuros.observe.past_run import open_run
 from neuros.observe.report import run_table
 
@@ -173,3 +173,19 @@ _SUMMED = ("executing", "waiting", "blocked")
 
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
+
+
+def frame_of(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any:
+    """A ``pandas.DataFrame``, one row each; ``index``: the column that names them.
+
+    Raises:
+        EnvironmentFault: if pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise EnvironmentFault(
+            f"pandas is not installed for {sys.executable}: pip install pandas"
+        ) from error
+    frame = pd.DataFrame(list(rows))
+    return frame if index is None or frame.empty else frame.set_index(index)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import hashlib
+import io
+import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from neuros.api.frames import frame_of
 from neuros.api.grid import Point, points_of, short_names
 from neuros.api.live import LiveRun
 from neuros.api.project import Project
-from neuros.api.run import Run
-from neuros.api.sweep_folder import alone_in, set_aside, sweep_folder
-from neuros.api.sweep_table import CSV_NAME, failed_row, row_of, table_of, write_csv
+from neuros.api.run import Run, frame_of
+from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
+from neuros.observe.report import consumed_percent
 
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
@@ -210,3 +215,144 @@ def _check_all(project: Project, points: Sequence[Point]) -> None:
 
 
 __all__ = ["CSV_NAME", "Sweep", "sweep"]
+
+
+_PLAN_NAME = "sweep.json"
+_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
+
+
+def sweep_folder(
+    project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
+) -> Path:
+    """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
+    stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
+    folder = Path(output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
+    plan = {
+        "project": str(project.file),
+        "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
+        **{name: str(options[name]) for name in ("backend", "duration", "record")},
+    }
+    file = folder / _PLAN_NAME
+    try:
+        if file.exists():
+            _check_same(json.loads(file.read_text("utf-8")), plan, folder)
+            return folder
+        if folder.exists() and any(folder.iterdir()):
+            raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(plan, indent=2) + "\n", "utf-8")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
+    return folder
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
+    with contextlib.ExitStack() as stack:
+        try:
+            is_alone = stack.enter_context(locked(folder / _LOCK_NAME, wait=False))
+        except OSError as error:
+            raise UsageError(
+                f"{folder} cannot be used ({error}): name another one with -o"
+            ) from error
+        if not is_alone:
+            raise UsageError(f"{folder}: a sweep goes on there; wait for its end, or name another")
+        yield
+
+
+def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
+    for name, value in now.items():
+        if before.get(name) != value:
+            what = "the project's files" if name == "project_sha256" else f"its {name}"
+            raise UsageError(
+                f"{folder} holds a sweep that is not this one ({what} differ):"
+                " name another folder with -o"
+            )
+
+
+def set_aside(folder: Path) -> None:
+    """Rename what a run has left that was cut off."""
+    number = 1
+    while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
+        number += 1
+    folder.rename(aside)
+
+
+CSV_NAME = "sweep.csv"
+_REASON_CHARACTERS = 50
+_COUNTS = (": sent", ": consumed")
+_SHARE = ": consumed / %"
+
+
+def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
+    """What came of a run, behind the values that it was made with."""
+    row = {
+        **values,
+        "exit_code": run.exit_code,
+        "reason": run.reason,
+        "wall_s": run.wall_s,
+        "sim_s": run.sim_s,
+        "real_time_factor": run.real_time_factor,
+    }
+    for name, connection in run.connections.items():
+        sent, consumed = connection["sent"], connection["consumed"]
+        row[f"{name}: sent"] = sent
+        row[f"{name}: consumed"] = consumed
+        row[f"{name}{_SHARE}"] = consumed_percent(connection)
+    for node, results in run.node_results.items():
+        row |= {f"{node}.{name}": value for name, value in results.items()}
+    return {**row, "folder": str(run.folder)}
+
+
+def failed_row(values: Mapping[str, Any], error: Exception, folder: Path) -> dict[str, Any]:
+    """The row of a run that could not begin."""
+    return {**values, "exit_code": None, "reason": f"not started: {error}", "folder": str(folder)}
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The columns of all rows; that of the folder is the last."""
+    found = dict.fromkeys(name for row in rows for name in row)
+    found.pop("folder", None)
+    return [*found, "folder"]
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    """Write ``sweep.csv``; whoever reads it never finds half of it. Raises ``OSError``."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    new = folder / f"{CSV_NAME}.new"
+    new.write_text(text.getvalue(), "utf-8")
+    os.replace(new, folder / CSV_NAME)
+
+
+def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """For people: without folders, times and counts."""
+    from tabulate import tabulate
+
+    hidden = ("folder", "wall_s", "sim_s")
+    names = [n for n in columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
+    names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
+    table: str = tabulate(
+        [[_cell(name, row.get(name)) for name in names] for row in rows],
+        headers=[name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
+        disable_numparse=True,
+    )
+    return table
+
+
+def _is_shown(value: Any) -> bool:
+    return value is not None and not isinstance(value, (list, dict))
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None or isinstance(value, (list, dict)):
+        return ""
+    if name.endswith(_SHARE):
+        return f"{value:.1f}"
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    if name == "reason" and len(text) > _REASON_CHARACTERS:
+        return text[: _REASON_CHARACTERS - 3] + "..."
+    return text

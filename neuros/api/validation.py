@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.api.environments import make_environments
+from neuros.api.plan import make_environments
 from neuros.errors import Problem
 from neuros.launch.environments.pythons import Pythons
 from neuros.launch.host import signal_in_words

@@ -16,8 +16,8 @@ from neuros.api.recording import recording_of
 from neuros.api.request import Request, parse_duration
 from neuros.api.run_folder import folders_of, run_folder_path
 from neuros.cli.environments import make_shown_environments
+from neuros.cli.launch_options import recording_request
 from neuros.cli.projects import load_with_messages
-from neuros.cli.recording_options import recording_request
 from neuros.cli.views import Views
 
 

@@ -16,7 +16,7 @@ from test_transports import RosNetwork
 
 from neuros.launch.domain import choose_domain
 from neuros.project.model import NodeFile
-from neuros.testing.transport_bench import SERIES, TransportBench
+from neuros.testing.transports import SERIES, TransportBench
 from neuros.testing.wiring import wire
 from neuros.transport import large_carriers
 
