@@ -1,4 +1,4 @@
-"""What the user sees of a run: the launcher's own records, and the lines that nodes log."""
+"""Console output of a run: the launcher's records, the log lines of nodes, and the progress."""
 
 from __future__ import annotations
 

@@ -44,7 +44,9 @@ class LiveRun:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
-        self._claim = threading.Lock()  # of whoever comes first: to execute it, or never to
+        self._claim = (
+            threading.Lock()
+        )  # held by the first of two: the thread that executes it, or the call that cancels it
         self._error: BaseException | None = None
         try:
             self._execution = Execution(
@@ -149,7 +151,7 @@ class LiveRun:
             return
         try:
             self._execution.run()
-        except BaseException as error:  # for whoever waits
+        except BaseException as error:  # raised again by wait()
             self._error = error
         finally:
             self._finish()
@@ -173,7 +175,7 @@ class LiveRun:
 
 
 class _Through:
-    """Writes to whatever ``sys.stdout`` is: a cell of a notebook, or what pytest captures."""
+    """Writes to the current ``sys.stdout``: a cell of a notebook, or what pytest captures."""
 
     encoding = "utf-8"
 

@@ -1,4 +1,4 @@
-"""Loads a project together with the message packages that it sees."""
+"""Loading of a project, together with the message packages that it sees."""
 
 from __future__ import annotations
 

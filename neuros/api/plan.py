@@ -1,4 +1,4 @@
-"""What is to be run: project and request, put together and checked before a start."""
+"""Plan of a run: project and request, checked before the start, and the environments they need."""
 
 from __future__ import annotations
 

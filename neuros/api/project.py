@@ -157,7 +157,7 @@ class Project:
             nodes: start only these.
             domain_id: the ROS domain.
             monitor_system_load: write ``system_load.csv``.
-            digests: keep digests of packets with ``in-process``, too, whatever they cost.
+            digests: keep digests of packets with ``in-process``, too, at any cost.
             show: print what ``neuros launch`` prints.
             check: raise ``RunError`` unless it ends normally.
 

@@ -1,4 +1,4 @@
-"""The recording of a run, as its launcher sees it: planned before, reported after."""
+"""The recording of a run: planned before the start, reported after the end."""
 
 from __future__ import annotations
 

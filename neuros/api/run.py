@@ -26,7 +26,7 @@ class Run:
         record: the content of ``run.json``, which has all that is here and more.
 
     Args:
-        folder: of a run that has ended, whoever started it.
+        folder: of a run that has ended.
 
     Raises:
         UsageError: if it is none, or another version of NeuROS wrote it.

@@ -1,4 +1,4 @@
-"""Sweeps: a project run with every combination of values and seeds, one table of what came out."""
+"""Sweeps: runs of a project with every combination of values and seeds, and their table."""
 
 from __future__ import annotations
 
@@ -318,7 +318,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write ``sweep.csv``; whoever reads it never finds half of it. Raises ``OSError``."""
+    """Write ``sweep.csv``; a reader never finds half of it. Raises ``OSError``."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
     writer.writeheader()

@@ -1,4 +1,4 @@
-"""What is checked of a project only when somebody asks: its models, and whether plugins import.
+"""Slow checks of a project: timesteps of its MuJoCo models, and imports of its plugins.
 
 A run finds these out by itself, a moment later.
 """

@@ -54,7 +54,7 @@ def build_messages(messages: Messages) -> int:
 
 
 class _Output:
-    """Standard output. A run goes on if nobody reads it any more, and so does this."""
+    """Standard output. It may be closed: then nothing is written, and no error is raised."""
 
     def isatty(self) -> bool:
         return os.isatty(1)

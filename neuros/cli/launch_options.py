@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
 
 from neuros.cli.dashboard import add_dashboard_options
 from neuros.cli.views import add_view_options
-from neuros.errors import UsageError
-
-if TYPE_CHECKING:
-    from neuros.observe.recording.selection import Request
 
 EXIT_CODES = """\
 exit codes:
@@ -202,23 +197,6 @@ def _add_recording_options(launch: argparse.ArgumentParser) -> None:
         default="mcap",
         help="the format of the bag's file (default: mcap)",
     )
-
-
-def recording_request(options: argparse.Namespace) -> Request | None:
-    """What the command line has recorded, ``None``: nothing. Raises ``UsageError``."""
-    from neuros.observe.recording.selection import Request
-
-    if options.record or options.record_topics:
-        return Request(
-            everything=options.record,
-            topics=tuple(options.record_topics),
-            exclude=tuple(options.exclude),
-            storage=options.storage,
-        )
-    if options.exclude or options.storage != "mcap":
-        name = "--exclude" if options.exclude else "--storage"
-        raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
-    return None
 
 
 def add_recorder(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -219,7 +219,7 @@ def _node(options: argparse.Namespace) -> int:
 
 
 def _complain(text: str) -> None:
-    with contextlib.suppress(OSError):  # nobody reads it
+    with contextlib.suppress(OSError):  # its reader has gone
         print(text, file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""``neuros replay``: what was recorded, once more: to one node, or on the ROS graph."""
+"""``neuros replay``: a recorded run replayed to one node, or published on the ROS graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What runs need of the machine itself: Python, packages, memory, a domain, screens, OpenGL."""
+"""Checks of Python, packages, memory, ROS domain, display, OpenGL and Docker on this machine."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def prepare_tests(root: Path) -> None:
 
 
 def _agrees(folder: Path) -> bool:
-    """Ask once, where there is somebody to answer."""
+    """Ask once, on a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         return True
     answer = input(f"This fills {folder} (0.6 GB) with packages from PyPI. Go on? [Y/n] ")

@@ -1,4 +1,4 @@
-"""From files to a project: read, override, judge, build. All problems at once."""
+"""Loading of a project: read, override, check, build; all problems are reported at once."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import Problem, ProjectError
-from neuros.project.budgets import budgets_of
 from neuros.project.checks import mistakes, remarks
-from neuros.project.draft import Draft, read_draft
 from neuros.project.gazebo import container_in_place_of, is_for_gazebo
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
-from neuros.project.model import Connection, Node, Port, Project, Value
-from neuros.project.outside import names_of
+from neuros.project.model import Budgets, Connection, Node, Port, Project, Value
 from neuros.project.overrides import apply_namespace, apply_override, apply_remaps
 from neuros.project.parameters import parameters_of
+from neuros.project.parsed import ParsedProject, names_of, parse_project
 from neuros.project.paths import PathError, Roots
 from neuros.project.plugin_checks import plugin_problems, unread_variables
 from neuros.project.qos import Qos, qos_of
@@ -39,8 +37,8 @@ class Builder:
             left out of the nodes, which are of no use then.
     """
 
-    def __init__(self, draft: Draft) -> None:
-        self._roots = draft.roots
+    def __init__(self, parsed: ParsedProject) -> None:
+        self._roots = parsed.roots
         self.problems: list[Problem] = []
 
     def node(self, element: Element) -> Node:
@@ -223,50 +221,50 @@ def load_project(
     file = _project_file(path)
     roots = Roots((folder or file.parent).resolve(), workspace.resolve(), packages)
     try:
-        draft = read_draft(file, roots)
+        parsed = parse_project(file, roots)
     except SourceError as error:
         raise ProjectError([error.problem]) from None
     for text in overrides:
-        draft.problems += apply_override(draft, text)
+        parsed.problems += apply_override(parsed, text)
     if namespace is not None:
-        apply_namespace(draft, namespace)
-    draft.problems += apply_remaps(draft, remap)
-    builder = Builder(draft)
-    names = names_of(draft)
-    nodes = tuple(builder.node(element) for element in draft.nodes)
-    problems = [*draft.problems, *_judgements(draft), *builder.problems]
+        apply_namespace(parsed, namespace)
+    parsed.problems += apply_remaps(parsed, remap)
+    builder = Builder(parsed)
+    names = names_of(parsed)
+    nodes = tuple(builder.node(element) for element in parsed.nodes)
+    problems = [*parsed.problems, *_judgements(parsed), *builder.problems]
     connections = (
         ()
         if problems
         else tuple(
-            connection(c, index, names.namespace) for index, c in enumerate(draft.connections)
+            connection(c, index, names.namespace) for index, c in enumerate(parsed.connections)
         )
     )
     doubts: list[Problem] = []
     if reads_plugins:
-        mistakes, doubts = plugin_problems(draft, nodes, None if problems else connections)
+        mistakes, doubts = plugin_problems(parsed, nodes, None if problems else connections)
         problems += mistakes
     if problems:
         raise ProjectError(problems)
     if reads_plugins:
-        doubts += unread_variables(draft, nodes, overrides)
+        doubts += unread_variables(parsed, nodes, overrides)
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
         connections=connections,
         file=roots.project / file.name,
-        description=draft.root.string("description") or "",
-        budgets=budgets_of(draft),
+        description=parsed.root.string("description") or "",
+        budgets=_budgets_of(parsed),
         names=names,
     )
-    return Loaded(project, (*remarks(draft), *doubts))
+    return Loaded(project, (*remarks(parsed), *doubts))
 
 
-def _judgements(draft: Draft) -> list[Problem]:
-    # Imported here, so that whoever imports this module does not pay for jsonschema.
+def _judgements(parsed: ParsedProject) -> list[Problem]:
+    # Imported late: importing this module must not load jsonschema.
     from neuros.project.validate import violations
 
-    return [*violations(draft), *mistakes(draft)]
+    return [*violations(parsed), *mistakes(parsed)]
 
 
 def _project_file(path: Path) -> Path:
@@ -295,3 +293,14 @@ def _name(folder: Path, file: Path) -> str:
     """What a run of the project is called: the folder, and the file where it is a variant."""
     name = folder.name or "project"
     return name if file.name == PROJECT_FILE else f"{name}-{file.stem}"
+
+
+def _budgets_of(parsed: ParsedProject) -> Budgets:
+    """The budgets of a valid project."""
+    element = parsed.root.member("budgets")
+    values: dict[str, Any] = {} if element is None else element.plain
+    return Budgets(
+        lost_packets={name: int(most) for name, most in values.get("lost_packets", {}).items()},
+        real_time_factor=values.get("real_time_factor"),
+        tick_error_ms=values.get("tick_error_ms"),
+    )

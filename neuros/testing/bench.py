@@ -1,4 +1,4 @@
-"""One node on a bench: the real runtime and engine, with time and events under control."""
+"""Test bench of one node: the real runtime and engine, stepped by the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``PluginHarness``: one plugin on the real engine, where the test is everybody else."""
+"""``PluginHarness``: one plugin on the real engine; the test plays all other nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plugin under test finds in place of ROS: real messages, a logger that remembers."""
+"""Stand-ins for ROS in tests of plugins: node, logger, transport, event loop and clock."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ class StepLoop:
         self._events.append(event)
 
     def post_loop_back(self, event: Event) -> None:
-        """The same."""
+        """Handle ``event`` after all that already wait."""
         self._events.append(event)
 
     def note_execution(self) -> None:
         """Nothing has arrived meanwhile."""
 
     def post_from_thread(self, event: Event) -> None:
-        """The same, from any thread; nobody is woken, since nobody waits."""
+        """Handle ``event`` after all that wait; callable from any thread."""
         self._events.append(event)
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
@@ -245,7 +245,7 @@ class Topics:
         self.published.setdefault(port.name, []).append(decode(encode(packet)))
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Nobody else listens."""
+        """There are no other listeners."""
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""
