@@ -44,9 +44,8 @@ class LiveRun:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
-        self._claim = (
-            threading.Lock()
-        )  # held by the first of two: the thread that executes it, or the call that cancels it
+        # Held by the thread that executes the run, or by the call that cancels it before.
+        self._claim = threading.Lock()
         self._error: BaseException | None = None
         try:
             self._execution = Execution(

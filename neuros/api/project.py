@@ -25,6 +25,8 @@ from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
 
+_ENVIRONMENT = "environment"
+
 
 class Project:
     """A project, which can be run again and again::
@@ -235,15 +237,15 @@ class Project:
         return LiveRun(plan, request, is_shown=show)
 
     def _load(self) -> Loaded:
-        return load_with_messages(self._path, override_texts(self.settings))[0]
+        return load_with_messages(self._path, _override_texts(self.settings))[0]
 
     def _load_for_run(
         self, settings: Mapping[str, Any], seed: int | None
     ) -> tuple[Described, Messages]:
-        texts = override_texts({**self.settings, **settings})
+        texts = _override_texts({**self.settings, **settings})
         loaded, messages = load_with_messages(self._path, texts)
         if seed is not None:
-            seeds = seed_texts(loaded.project, seed)
+            seeds = _seed_texts(loaded.project, seed)
             loaded, messages = load_with_messages(self._path, [*texts, *seeds])
         for warning in loaded.warnings:
             if warning not in self._said:
@@ -282,10 +284,7 @@ def _recording(record: bool | Sequence[str]) -> RecordingRequest | None:
     return RecordingRequest(everything=False, topics=names) if names else None
 
 
-_ENVIRONMENT = "environment"
-
-
-def override_texts(settings: Mapping[str, Any]) -> tuple[str, ...]:
+def _override_texts(settings: Mapping[str, Any]) -> tuple[str, ...]:
     """As the texts of ``--set``: ``{"nodes.a.environment.RATE": 0.5}``. ``None`` removes a key."""
     return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
 
@@ -306,7 +305,7 @@ def value_text(path: str, value: Any) -> str:
         raise UsageError(f"{path}: {error}") from error
 
 
-def seed_texts(project: Described, seed: int) -> tuple[str, ...]:
+def _seed_texts(project: Described, seed: int) -> tuple[str, ...]:
     """Overrides that give this seed to every node that has one.
 
     A seed is a variable in the ``environment`` of a node whose name contains SEED.

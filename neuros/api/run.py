@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from neuros.observe.bag.opened import Bag
 
 
+_LATENCIES = ("p50", "p90", "p99", "max")
+_SUMMED = ("executing", "waiting", "blocked")
+
+
 class Run:
     """What a run has left behind: how it ended, its figures, its packets, its logs.
 
@@ -152,9 +156,7 @@ def connection_figures(connection: Mapping[str, Any]) -> dict[str, Any]:
     """A connection in one row: of its latency each figure, without its digests."""
     latency = connection.get("latency_ms") or {}
     plain = {k: v for k, v in connection.items() if k not in ("latency_ms", "digests", "index")}
-    return plain | {
-        f"latency_{name}_ms": latency.get(name) for name in ("p50", "p90", "p99", "max")
-    }
+    return plain | {f"latency_{name}_ms": latency.get(name) for name in _LATENCIES}
 
 
 def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
@@ -165,10 +167,6 @@ def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
     hooks = node.get("hooks") or {}
     executions = sum(hook["executions"] for hook in hooks.values())
     return {"node": name, **sums, **idle, "executions": executions, **node.get("results", {})}
-
-
-_LATENCIES = ("p50", "p90", "p99", "max")
-_SUMMED = ("executing", "waiting", "blocked")
 
 
 def _number(value: Any) -> float | None:

@@ -25,6 +25,12 @@ from neuros.observe.report import consumed_percent
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
 _LOOK_S = 0.05
+_PLAN_NAME = "sweep.json"
+_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
+CSV_NAME = "sweep.csv"
+_REASON_CHARACTERS = 50
+_COUNTS = (": sent", ": consumed")
+_SHARE = ": consumed / %"
 
 
 class Sweep:
@@ -51,7 +57,7 @@ class Sweep:
         return [Run(folder) for folder in folders if (folder / "run.json").exists()]
 
     def __str__(self) -> str:
-        return table_of(self.rows)
+        return _table_of(self.rows)
 
     def __repr__(self) -> str:
         return f"<Sweep of {len(self.rows)} runs in {self.folder}>"
@@ -100,9 +106,9 @@ def sweep(
         raise UsageError(f"jobs {jobs}: give 1 or more")
     _check_all(project, points)
     options = {"backend": backend, "duration": duration, "record": record}
-    folder = sweep_folder(project, output, options)
+    folder = _sweep_folder(project, output, options)
     names = short_names(list(values))
-    with alone_in(folder):
+    with _locked_folder(folder):
         return _Sweeping(project, points, names, folder, options, on_row).run(jobs)
 
 
@@ -154,9 +160,9 @@ class _Sweeping:
         except UsageError:
             run = None
         if run is None or run.exit_code not in _FINISHED:
-            set_aside(folder)
+            _set_aside(folder)
             return False
-        self._rows[name] = row_of(self._points[name].values(self._names), run)
+        self._rows[name] = _row_of(self._points[name].values(self._names), run)
         return True
 
     def _start(self, name: str) -> None:
@@ -166,7 +172,7 @@ class _Sweeping:
                 set=point.settings, seed=point.seed, output=folder, **self._options
             )
         except EnvironmentFault as error:
-            self._note(name, failed_row(point.values(self._names), error, folder))
+            self._note(name, _failed_row(point.values(self._names), error, folder))
 
     def _collect(self) -> None:
         """Take what has ended, after a moment."""
@@ -177,9 +183,9 @@ class _Sweeping:
             del self._live[name]
             values = self._points[name].values(self._names)
             try:
-                row = row_of(values, live.wait())
+                row = _row_of(values, live.wait())
             except NeurosError as error:
-                row = failed_row(values, error, live.folder)
+                row = _failed_row(values, error, live.folder)
             self._note(name, row)
 
     def _note(self, name: str, row: dict[str, Any]) -> None:
@@ -191,7 +197,7 @@ class _Sweeping:
     def _save(self) -> None:
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
         try:
-            write_csv(self._sweep.rows, self._sweep.folder)
+            _write_csv(self._sweep.rows, self._sweep.folder)
         except OSError as error:
             file = self._sweep.folder / CSV_NAME
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
@@ -214,14 +220,7 @@ def _check_all(project: Project, points: Sequence[Point]) -> None:
         raise ProjectError(problems)
 
 
-__all__ = ["CSV_NAME", "Sweep", "sweep"]
-
-
-_PLAN_NAME = "sweep.json"
-_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
-
-
-def sweep_folder(
+def _sweep_folder(
     project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
 ) -> Path:
     """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
@@ -247,7 +246,7 @@ def sweep_folder(
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def _locked_folder(folder: Path) -> Iterator[None]:
     """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
     with contextlib.ExitStack() as stack:
         try:
@@ -271,7 +270,7 @@ def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path)
             )
 
 
-def set_aside(folder: Path) -> None:
+def _set_aside(folder: Path) -> None:
     """Rename what a run has left that was cut off."""
     number = 1
     while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
@@ -279,13 +278,7 @@ def set_aside(folder: Path) -> None:
     folder.rename(aside)
 
 
-CSV_NAME = "sweep.csv"
-_REASON_CHARACTERS = 50
-_COUNTS = (": sent", ": consumed")
-_SHARE = ": consumed / %"
-
-
-def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
+def _row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
     """What came of a run, behind the values that it was made with."""
     row = {
         **values,
@@ -305,22 +298,22 @@ def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
     return {**row, "folder": str(run.folder)}
 
 
-def failed_row(values: Mapping[str, Any], error: Exception, folder: Path) -> dict[str, Any]:
+def _failed_row(values: Mapping[str, Any], error: Exception, folder: Path) -> dict[str, Any]:
     """The row of a run that could not begin."""
     return {**values, "exit_code": None, "reason": f"not started: {error}", "folder": str(folder)}
 
 
-def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The columns of all rows; that of the folder is the last."""
     found = dict.fromkeys(name for row in rows for name in row)
     found.pop("folder", None)
     return [*found, "folder"]
 
 
-def write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+def _write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
     """Write ``sweep.csv``; a reader never finds half of it. Raises ``OSError``."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
+    writer = csv.DictWriter(text, _columns_of(rows), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     new = folder / f"{CSV_NAME}.new"
@@ -328,12 +321,12 @@ def write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
     os.replace(new, folder / CSV_NAME)
 
 
-def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
+def _table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """For people: without folders, times and counts."""
     from tabulate import tabulate
 
     hidden = ("folder", "wall_s", "sim_s")
-    names = [n for n in columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
+    names = [n for n in _columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
     names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
     table: str = tabulate(
         [[_cell(name, row.get(name)) for name in names] for row in rows],

@@ -11,6 +11,23 @@ from typing import Any
 from neuros.distribution import ROOT
 from neuros.errors import EnvironmentFault, UsageError
 
+_BENCHMARK_EPILOG = """\
+exit codes:
+  0    measured (whether the targets are met or not)
+  1    a measurement failed
+  2    wrong usage
+  4    there are no benchmarks: neuros is not installed from a source checkout
+  130  ended by Ctrl+C: what was measured is kept
+"""
+_REPRODUCE_EPILOG = """\
+exit codes:
+  0    done (whether the figures are like those that were published or not)
+  1    a run failed; the others were made
+  2    wrong usage
+  4    something is missing: Matplotlib, or the source checkout
+  130  ended by Ctrl+C: the runs that had ended are kept and shown
+"""
+
 
 def checkout_command(name: str) -> Any:
     """The module of a command, such as ``benchmarks.command``.
@@ -34,16 +51,6 @@ def positive_number(text: str) -> int:
     if number < 1:
         raise ValueError(text)
     return number
-
-
-_BENCHMARK_EPILOG = """\
-exit codes:
-  0    measured (whether the targets are met or not)
-  1    a measurement failed
-  2    wrong usage
-  4    there are no benchmarks: neuros is not installed from a source checkout
-  130  ended by Ctrl+C: what was measured is kept
-"""
 
 
 def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -84,16 +91,6 @@ def _benchmark(options: argparse.Namespace) -> int:
     if options.subjects and (options.files or options.compare or options.list):
         raise UsageError("--from, --compare and --list measure nothing: name no SUBJECT")
     return int(checkout_command("benchmarks.command").run(options))
-
-
-_REPRODUCE_EPILOG = """\
-exit codes:
-  0    done (whether the figures are like those that were published or not)
-  1    a run failed; the others were made
-  2    wrong usage
-  4    something is missing: Matplotlib, or the source checkout
-  130  ended by Ctrl+C: the runs that had ended are kept and shown
-"""
 
 
 def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

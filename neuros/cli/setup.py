@@ -13,8 +13,24 @@ from typing import TYPE_CHECKING
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
-    from neuros.doctor.checks import Finding
+    from neuros.doctor.machine_checks import Finding
     from neuros.launch.docker.recipes import Recipe
+
+STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
+"""What the examples need."""
+_CONTAINERS_EPILOG = """\
+exit codes:
+  0    done
+  2    wrong usage
+  3    invalid project
+  4    no engine, or an image cannot be built: nothing half-built gets a name
+  130  ended by Ctrl+C
+"""
+_DOCTOR_EPILOG = """\
+exit codes:
+  0    nothing is wrong
+  4    something is: the lines that begin with PROBLEM say what, and what to do
+"""
 
 
 def add_build(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -72,19 +88,6 @@ def _build(options: argparse.Namespace) -> int:
         folder = project if project.is_dir() else project.parent
         print(f"no message packages in {folder / 'workspace'} and {WORKSPACE}")
     return 0
-
-
-STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
-"""What the examples need."""
-
-_CONTAINERS_EPILOG = """\
-exit codes:
-  0    done
-  2    wrong usage
-  3    invalid project
-  4    no engine, or an image cannot be built: nothing half-built gets a name
-  130  ended by Ctrl+C
-"""
 
 
 def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -262,13 +265,6 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"
 
 
-_DOCTOR_EPILOG = """\
-exit codes:
-  0    nothing is wrong
-  4    something is: the lines that begin with PROBLEM say what, and what to do
-"""
-
-
 def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the grammar."""
     doctor = commands.add_parser(
@@ -286,7 +282,7 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from neuros.doctor.checks import State
+    from neuros.doctor.machine_checks import State
 
     is_well = True
     for finding in _findings(proves=not options.no_delivery):
@@ -296,8 +292,13 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _findings(*, proves: bool) -> Iterator[Finding]:
-    from neuros.doctor.checks import State, look_at_containers, look_at_machine, prove_rendering
     from neuros.doctor.delivery import prove_delivery
+    from neuros.doctor.machine_checks import (
+        State,
+        look_at_containers,
+        look_at_machine,
+        prove_rendering,
+    )
 
     yield from look_at_machine(os.environ)
     yield prove_rendering(os.environ)

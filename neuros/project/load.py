@@ -27,6 +27,7 @@ STANDARD_CONTAINERS = frozenset(
     {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
 )
 """NeuROS's own images: they have the message packages that this machine has."""
+PROJECT_FILE = "project.json"
 
 
 class Builder:
@@ -178,9 +179,6 @@ def connection(element: Element, index: int, namespace: str) -> Connection:
         index=index,
         namespace=namespace,
     )
-
-
-PROJECT_FILE = "project.json"
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,12 @@ from neuros.project.suggest import did_you_mean
 _NODE_FORM = "nodes.NAME.KEY=VALUE"
 _CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
 _BUDGET_FORM = "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE"
+_REMAP_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
+_SPECIAL_NAMES = {
+    "__ns": "use --namespace",
+    "__node": "a node keeps the name that the project gives it",
+    "__name": "a node keeps the name that the project gives it",
+}
 
 
 def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
@@ -132,14 +138,6 @@ class _Override:
         return Element(value, self.source, self._value_start, len(self.source.text), pointer)
 
 
-_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
-_SPECIAL = {
-    "__ns": "use --namespace",
-    "__node": "a node keeps the name that the project gives it",
-    "__name": "a node keeps the name that the project gives it",
-}
-
-
 def apply_namespace(parsed: ParsedProject, text: str) -> None:
     """Apply ``--namespace`` to a parsed project, in the place of the project's own."""
     if isinstance(parsed.root.value, dict):
@@ -155,9 +153,9 @@ def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
         source = Source(f"--remap {text}", parsed.roots.project, text)
         old, sign, new = text.partition(":=")
         if not (sign and old and new):
-            problems.append(source.problem(0, "/remap", "is no rule", _FORM))
-        elif old.rpartition(":")[2] in _SPECIAL:
-            hint = _SPECIAL[old.rpartition(":")[2]]
+            problems.append(source.problem(0, "/remap", "is no rule", _REMAP_FORM))
+        elif old.rpartition(":")[2] in _SPECIAL_NAMES:
+            hint = _SPECIAL_NAMES[old.rpartition(":")[2]]
             problems.append(source.problem(0, "/remap", f"'{old}' is not remapped", hint))
         else:
             start = len(old) + len(sign)

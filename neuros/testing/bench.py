@@ -23,6 +23,10 @@ from neuros.transport.memory import MemoryHub
 from neuros.transport.messages import decode, encode
 from neuros.transport.plain_node import without_spinning
 
+_MANY = 10_000
+"""Hook executions after which :meth:`NodeBench.run` takes it that they will never end."""
+_Bench = TypeVar("_Bench", bound="NodeBench")
+
 
 class Neighbours:
     """All nodes around one node (:class:`neuros.ports.Inbox` of each).
@@ -90,12 +94,6 @@ class Neighbours:
             outlet.spend(0)
             node = self._hub.inboxes[connection.destination_node]
             self._hub.post(partial(node.on_packet, connection, waiting.popleft()))
-
-
-_MANY = 10_000
-"""Hook executions after which :meth:`NodeBench.run` takes it that they will never end."""
-
-_Bench = TypeVar("_Bench", bound="NodeBench")
 
 
 class NodeBench:

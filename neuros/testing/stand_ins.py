@@ -18,6 +18,14 @@ from neuros.transport.plain_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.values import checker
 
 Event = Callable[[], None]
+_LEVELS = {
+    "DEBUG": logging.DEBUG,
+    "INFO": logging.INFO,
+    "WARN": logging.WARNING,
+    "ERROR": logging.ERROR,
+    "FATAL": logging.CRITICAL,
+}
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class ManualClock:
@@ -100,15 +108,6 @@ class StepLoop:
         self._is_stopping = True
 
 
-_LEVELS = {
-    "DEBUG": logging.DEBUG,
-    "INFO": logging.INFO,
-    "WARN": logging.WARNING,
-    "ERROR": logging.ERROR,
-    "FATAL": logging.CRITICAL,
-}
-
-
 class Record(NamedTuple):
     """One line that a node has logged; ``severity`` is DEBUG, INFO, WARN, ERROR or FATAL."""
 
@@ -152,9 +151,6 @@ class RecordingLogger:
         self._records.append(Record(severity, str(message)))
         self._python.log(_LEVELS[severity], "%s", message)
         return True
-
-
-_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class RosNodeStandIn:

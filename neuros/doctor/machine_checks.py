@@ -20,6 +20,17 @@ from neuros.installation.machine import Machine, install_opengl, offscreen_openg
 from neuros.launch.domain import choose_domain
 from neuros.launch.placement import usable_cores
 
+SHARED_MEMORY = Path("/dev/shm")
+_LEAST_SHARED_BYTES = 64 * 2**20
+"""What Docker gives a container, too, if it is not asked for more."""
+_EXTRAS = (
+    ("MuJoCo", "mujoco", "./install.py --extras mujoco"),
+    ("NEST", "nest-simulator", "./install.py --extras nest"),
+    ("Matplotlib", "matplotlib", "./install.py --extras plot"),
+)
+_GPU_TIMEOUT_S = 10.0
+_RENDERING_TIMEOUT_S = 60.0
+
 
 class State(Enum):
     """How good a finding is."""
@@ -63,18 +74,6 @@ def absent(subject: str, text: str, remedy: str = "") -> Finding:
 def bad(subject: str, text: str, remedy: str = "") -> Finding:
     """Projects do not run, or not well, because of it."""
     return Finding(State.BAD, subject, text, remedy)
-
-
-SHARED_MEMORY = Path("/dev/shm")
-_LEAST_SHARED_BYTES = 64 * 2**20
-"""What Docker gives a container, too, if it is not asked for more."""
-_EXTRAS = (
-    ("MuJoCo", "mujoco", "./install.py --extras mujoco"),
-    ("NEST", "nest-simulator", "./install.py --extras nest"),
-    ("Matplotlib", "matplotlib", "./install.py --extras plot"),
-)
-_GPU_TIMEOUT_S = 10.0
-_RENDERING_TIMEOUT_S = 60.0
 
 
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
