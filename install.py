@@ -28,7 +28,7 @@ if __name__ == "__main__":
         sys.exit(4)
     sys.path.insert(0, ROOT)
     try:
-        from neuros.installation import main
+        from neuros.installation.command import main
 
         sys.exit(main(sys.argv[1:], ROOT))
     except KeyboardInterrupt:

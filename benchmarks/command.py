@@ -1,4 +1,4 @@
-"""What ``neuros benchmark`` does, after its options were read by :mod:`neuros.cli.benchmark`."""
+"""What ``neuros benchmark`` does, after its options were read by :mod:`neuros.cli.checkout`."""
 
 from __future__ import annotations
 

@@ -7,12 +7,13 @@ and look at what comes out with :class:`Run`.
 
 from typing import TYPE_CHECKING, Any
 
+from neuros.distribution import __version__
+
 if TYPE_CHECKING:
     from neuros.api.project import Project
     from neuros.api.run import Run
     from neuros.api.sweep import sweep
 
-__version__ = "2.0.0"
 __all__ = ["Project", "Run", "__version__", "sweep"]
 
 

@@ -1,4 +1,4 @@
-"""What a run has recorded, as NumPy arrays and pandas frames.
+"""Recorded packets of a run, as NumPy arrays and pandas frames.
 
 ::
 

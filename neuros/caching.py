@@ -1,4 +1,4 @@
-"""What is made once and kept: where it lies, and who makes it."""
+"""Cached folders: built once under a lock, used by many runs, removed when unused."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Kept:
     def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
         """Be the only one who makes or removes it. Raises ``OSError``.
 
-        The context is False if somebody else is, and ``wait`` is false.
+        The context is False if another process is, and ``wait`` is false.
         """
         return locked(self.beside(".lock"), wait=wait)
 
@@ -65,14 +65,14 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Hold the lock that a file stands for, which is there only meanwhile. Raises ``OSError``.
 
     Yields:
-        False if somebody else holds it, and ``wait`` is false.
+        False if another process holds it, and ``wait`` is false.
     """
     descriptor = _lock(path, wait)
     try:
         yield descriptor is not None
     finally:
         if descriptor is not None:
-            # While it is locked: whoever waits for it then sees that it is no longer the file.
+            # Removed while locked: a process that waits then sees that its file is gone.
             path.unlink(missing_ok=True)
             os.close(descriptor)
 

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import pytest
 
-from neuros import installation
 from neuros.cli.main import parser
 from neuros.errors import EnvironmentFault
-from neuros.installation.containers import build_arguments, build_containers
-from neuros.installation.documentation import build_documentation
+from neuros.installation import command
+from neuros.installation.command import build_arguments, build_containers, build_documentation
 from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
@@ -294,7 +293,7 @@ class TestContainers:
     """The options of ``install.py`` are those of the command that it hands over to."""
 
     def arguments(self, *given: str) -> list[str]:
-        parsed = installation.parse_options(given, ["mujoco", "nest", "plot"])
+        parsed = command.parse_options(given, ["mujoco", "nest", "plot"])
         return list(build_arguments(parsed))
 
     def test_where_none_is_named_a_machine_without_docker_is_all_right(self) -> None:
@@ -316,7 +315,7 @@ class TestContainers:
     def test_a_wheelhouse_and_certificates_are_for_pip_as_well(self, tmp_path: Path) -> None:
         (tmp_path / "ca.pem").touch()
         given = ["--wheelhouse", str(tmp_path), "--ca-bundle", str(tmp_path / "ca.pem")]
-        settings = pip_settings(installation.parse_options(given, ["mujoco", "nest", "plot"]))
+        settings = pip_settings(command.parse_options(given, ["mujoco", "nest", "plot"]))
         assert settings == {
             "PIP_NO_INDEX": "1",
             "PIP_FIND_LINKS": str(tmp_path),
@@ -327,15 +326,13 @@ class TestContainers:
         python = tmp_path / "python"
         python.write_text('#!/bin/sh\necho "$@"; exit 4\n')
         python.chmod(0o755)
-        parsed = installation.parse_options([], ["mujoco", "nest", "plot"])
+        parsed = command.parse_options([], ["mujoco", "nest", "plot"])
         assert build_containers(python, parsed) == 4
 
 
 class TestDocumentation:
     def extras_for(self, *given: str) -> list[str]:
-        return list(
-            installation.parse_options(given, ["mujoco", "nest", "plot", "dev", "docs"]).extras
-        )
+        return list(command.parse_options(given, ["mujoco", "nest", "plot", "dev", "docs"]).extras)
 
     def test_only_who_asks_for_it_gets_what_builds_it(self) -> None:
         assert self.extras_for() == ["mujoco", "nest", "plot"]

@@ -1,4 +1,4 @@
-"""What ``neuros reproduce`` does, after its options were read by :mod:`neuros.cli.reproduce`."""
+"""What ``neuros reproduce`` does, after its options were read by :mod:`neuros.cli.checkout`."""
 
 from __future__ import annotations
 

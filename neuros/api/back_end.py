@@ -1,4 +1,4 @@
-"""Where nodes run: the choice of ``--backend``, and the launcher that follows from it."""
+"""Back ends: the choice of ``--backend``, and the launcher that each of them needs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class BackEnd:
 
 
 def default_back_end(environ: Mapping[str, str]) -> str:
-    """What is used where nobody names one."""
+    """The back end where no option names one."""
     return environ.get(_VARIABLE) or "auto"
 
 
@@ -133,7 +133,7 @@ def _without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[
 def _without_display(
     nodes: Sequence[Node], environ: Mapping[str, str]
 ) -> Sequence[tuple[str, str]]:
-    """One line on windows that nobody will see."""
+    """One line on nodes that ask for a display where there is none."""
     asking = [node.name for node in nodes if node.access.display]
     if not asking or environ.get("DISPLAY"):
         return ()
@@ -149,7 +149,7 @@ def _why_not(fault: EnvironmentFault) -> tuple[str, str]:
 
 
 def _ignored(nodes: Sequence[Node]) -> Sequence[tuple[str, str]]:
-    """One line on limits that nobody keeps."""
+    """One line on limits that this back end does not enforce."""
     limited = [node.name for node in nodes if any(vars(node.resources).values())]
     if not limited:
         return ()

@@ -61,7 +61,7 @@ class Execution:
     Args:
         request: what it was planned from.
         stream: where to show what goes on, ``None``: nowhere.
-        signals: numbers of the signals that have arrived; whoever notes one appends it.
+        signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here whenever a signal does, or a wish.
         wishes: reasons for which this program wants the run to end, drained.
         views: what it is to be looked at with.
@@ -165,7 +165,7 @@ class Execution:
             if self._views is not None:
                 self._views.finish()
             reaper.finish()
-            # Whoever has ended the run is not made to wait for a reader that does not read.
+            # A user who has ended the run does not wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             outcome.reason = self._as_here(outcome.reason)
             outcome.failures = [self._as_here(text) for text in outcome.failures]
@@ -289,7 +289,7 @@ class Execution:
         return f" (started by -n, with the same nodes and connections, {' and '.join(options)})"
 
     def _environment(self) -> dict[str, str]:
-        """What every node gets, whatever the shell that NeuROS was started from has sourced."""
+        """The environment of every node; it overrides what the shell has sourced."""
         return {
             **self._plan.network.environment(os.environ),
             ELSEWHERE_VARIABLE: ",".join(self._plan.elsewhere),

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.api.settings import value_text
+from neuros.api.project import value_text
 from neuros.errors import UsageError
 
 _MOST_CHARACTERS = 80

@@ -44,7 +44,8 @@ class LiveRun:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
-        self._claim = threading.Lock()  # of whoever comes first: to execute it, or never to
+        # Held by the thread that executes the run, or by the call that cancels it before.
+        self._claim = threading.Lock()
         self._error: BaseException | None = None
         try:
             self._execution = Execution(
@@ -149,7 +150,7 @@ class LiveRun:
             return
         try:
             self._execution.run()
-        except BaseException as error:  # for whoever waits
+        except BaseException as error:  # raised again by wait()
             self._error = error
         finally:
             self._finish()
@@ -173,7 +174,7 @@ class LiveRun:
 
 
 class _Through:
-    """Writes to whatever ``sys.stdout`` is: a cell of a notebook, or what pytest captures."""
+    """Writes to the current ``sys.stdout``: a cell of a notebook, or what pytest captures."""
 
     encoding = "utf-8"
 

@@ -1,4 +1,4 @@
-"""Loads a project together with the message packages that it sees."""
+"""Loading of a project, together with the message packages that it sees."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from neuros.api.workspace import WORKSPACE
+from neuros.distribution import WORKSPACE
 from neuros.errors import Problem, ProjectError
 from neuros.launch.containers import find_container, misspelt
 from neuros.messages.needed import Messages

@@ -1,4 +1,4 @@
-"""What a run is watched with."""
+"""Load monitor and provenance of a run: started with it, written into its record."""
 
 from __future__ import annotations
 

@@ -1,20 +1,25 @@
-"""What is to be run: project and request, put together and checked before a start."""
+"""Plan of a run: project and request, checked before the start, and the environments they need."""
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import re
+import socket
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 from neuros.api.back_end import BackEnd, choose_back_end
-from neuros.api.network import THIS_MACHINE, Network, chosen_network
 from neuros.api.request import Duration, Request
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
+from neuros.installation.progress import Progress, Stream
 from neuros.launch.environments.pythons import Pythons, require_one_python
+from neuros.launch.node_command import without_mark
 from neuros.launch.placement import place, usable_cores
 from neuros.launch.reaper import Reaper
+from neuros.launch.run_processes import RUN_ID
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.ports import Launcher
@@ -22,7 +27,79 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS, RANGE_VARIABLE
+from neuros.transport.dds_profile import (
+    MOST_LOCAL_PARTICIPANTS,
+    PEERS_VARIABLE,
+    RANGE_VARIABLE,
+    as_asked,
+)
+
+_HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
+_LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
+
+
+@dataclass(frozen=True)
+class Network:
+    """How far nodes look for others.
+
+    Attributes:
+        is_wide: whether beyond this machine.
+        peers: IPv4 addresses of machines that multicast does not reach.
+    """
+
+    is_wide: bool = False
+    peers: tuple[str, ...] = ()
+
+    def environment(self, environ: Mapping[str, str]) -> dict[str, str]:
+        """What the nodes get; without a wish, what the launcher's own environment says."""
+        if not self.is_wide:
+            return {RANGE_VARIABLE: as_asked(environ).get(RANGE_VARIABLE) or "LOCALHOST"}
+        peers = {PEERS_VARIABLE: ";".join(self.peers)} if self.peers else {}
+        return {RANGE_VARIABLE: "SUBNET", **peers}
+
+
+THIS_MACHINE = Network()
+
+
+def chosen_network(network: bool, peers: str | None) -> Network:
+    """What the options say.
+
+    Raises:
+        UsageError: if a peer is neither an IPv4 address nor a host name.
+        EnvironmentFault: if a name is not known here.
+    """
+    if peers is None:
+        return Network(network)
+    wanted = [part.strip() for part in peers.split(",")]
+    nonsense = [part for part in wanted if not _is_possible(part)]
+    if nonsense:
+        raise UsageError(
+            f"--peers {peers}: {', '.join(map(repr, nonsense))} is neither an IPv4 address nor the"
+            " name of a host: give them as in --peers 10.0.0.7,robot.local"
+        )
+    return Network(True, tuple(dict.fromkeys(map(_address, wanted))))
+
+
+def _is_possible(text: str) -> bool:
+    if _LOOKS_LIKE_AN_ADDRESS.fullmatch(text):
+        try:
+            address = ipaddress.IPv4Address(text)
+        except ValueError:
+            return False
+        return not (address.is_unspecified or address.is_multicast)
+    return _HOST_NAME.fullmatch(text) is not None
+
+
+def _address(host: str) -> str:
+    """The IPv4 address of a host: found here, since a node's container may not know the name."""
+    try:
+        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+    except OSError as error:
+        raise EnvironmentFault(
+            f"--peers: the host '{host}' cannot be found from here ({error.strerror}): give its"
+            " IPv4 address"
+        ) from error
+    return str(found[0][4][0])
 
 
 @dataclass(frozen=True)
@@ -219,3 +296,31 @@ def _time_problems(plan: Plan) -> Sequence[Problem]:
             "a node owns time if a port of it has mujoco, or its output is a Clock",
         )
     ]
+
+
+def make_environments(pythons: Pythons, messages: Messages | None, output: Stream) -> None:
+    """Make what is missing, and say so; ``KeyboardInterrupt`` ends it at any time.
+
+    Raises:
+        EnvironmentFault: with all that failed.
+    """
+    pythons.note_use()
+    if messages is not None:
+        messages.note_use()
+    if are_made(pythons, messages):
+        return
+    # pip, the compiler, and what they start must not outlive a launcher that is killed.
+    run_id = os.urandom(8).hex()
+    reaper = Reaper.start(run_id)
+    try:
+        progress = Progress(output)
+        if messages is not None:
+            messages.make(progress, {**without_mark(os.environ), RUN_ID: run_id})
+        pythons.make(progress, {RUN_ID: run_id})
+    finally:
+        reaper.finish()
+
+
+def are_made(pythons: Pythons, messages: Messages | None) -> bool:
+    """Whether nothing is missing."""
+    return pythons.is_made and (messages is None or messages.is_made)

@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.back_end import default_back_end
-from neuros.api.environments import make_environments
 from neuros.api.live import LiveRun
 from neuros.api.loading import load_with_messages
-from neuros.api.plan import make_plan
+from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request, parse_duration
 from neuros.api.run import Run
-from neuros.api.settings import override_texts, seed_texts
 from neuros.api.validation import model_problems
-from neuros.errors import Problem, ProjectError
+from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
+
+_ENVIRONMENT = "environment"
 
 
 class Project:
@@ -159,7 +159,7 @@ class Project:
             nodes: start only these.
             domain_id: the ROS domain.
             monitor_system_load: write ``system_load.csv``.
-            digests: keep digests of packets with ``in-process``, too, whatever they cost.
+            digests: keep digests of packets with ``in-process``, too, at any cost.
             show: print what ``neuros launch`` prints.
             check: raise ``RunError`` unless it ends normally.
 
@@ -237,15 +237,15 @@ class Project:
         return LiveRun(plan, request, is_shown=show)
 
     def _load(self) -> Loaded:
-        return load_with_messages(self._path, override_texts(self.settings))[0]
+        return load_with_messages(self._path, _override_texts(self.settings))[0]
 
     def _load_for_run(
         self, settings: Mapping[str, Any], seed: int | None
     ) -> tuple[Described, Messages]:
-        texts = override_texts({**self.settings, **settings})
+        texts = _override_texts({**self.settings, **settings})
         loaded, messages = load_with_messages(self._path, texts)
         if seed is not None:
-            seeds = seed_texts(loaded.project, seed)
+            seeds = _seed_texts(loaded.project, seed)
             loaded, messages = load_with_messages(self._path, [*texts, *seeds])
         for warning in loaded.warnings:
             if warning not in self._said:
@@ -282,3 +282,46 @@ def _recording(record: bool | Sequence[str]) -> RecordingRequest | None:
         return RecordingRequest(everything=True) if record else None
     names = (record,) if isinstance(record, str) else tuple(record)
     return RecordingRequest(everything=False, topics=names) if names else None
+
+
+def _override_texts(settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """As the texts of ``--set``: ``{"nodes.a.environment.RATE": 0.5}``. ``None`` removes a key."""
+    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
+
+
+def value_text(path: str, value: Any) -> str:
+    """A value as ``--set`` has it; in ``environment`` all is text.
+
+    Raises:
+        UsageError: if it is nothing that JSON knows.
+    """
+    if value is None:
+        return ""
+    if isinstance(value, str) and path.split(".")[2:3] == [_ENVIRONMENT]:
+        return value
+    try:
+        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
+def _seed_texts(project: Described, seed: int) -> tuple[str, ...]:
+    """Overrides that give this seed to every node that has one.
+
+    A seed is a variable in the ``environment`` of a node whose name contains SEED.
+
+    Raises:
+        UsageError: if no node has one.
+    """
+    places = [
+        f"nodes.{node.name}.{_ENVIRONMENT}.{name}"
+        for node in project.nodes
+        for name in node.environment
+        if "SEED" in name.upper()
+    ]
+    if not places:
+        raise UsageError(
+            f"seed {seed}: no node of {project.name} has a variable with SEED in its name in its"
+            " environment: add one there, or set what its plugin takes for a seed"
+        )
+    return tuple(f"{place}={int(seed)}" for place in places)

@@ -1,4 +1,4 @@
-"""The recording of a run, as its launcher sees it: planned before, reported after."""
+"""The recording of a run: planned before the start, reported after the end."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from neuros import __version__
 from neuros.api.plan import Plan
 from neuros.api.request import Request
 from neuros.api.run_folder import run_folder_path
+from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.launch.reaper import Reaper
 from neuros.launch.recording import Recorded, RecorderProcess

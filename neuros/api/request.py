@@ -1,4 +1,4 @@
-"""What is asked for of a run, whoever asks."""
+"""Request for a run: the options of ``neuros launch``, as Python values."""
 
 from __future__ import annotations
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.api.frames import frame_of
-from neuros.errors import RunError
+from neuros.errors import EnvironmentFault, RunError
 from neuros.observe.run_record import open_run, run_table
 
 if TYPE_CHECKING:
     from neuros.observe.bag.bag_reader import Bag
+
+
+_LATENCIES = ("p50", "p90", "p99", "max")
+_SUMMED = ("executing", "waiting", "blocked")
 
 
 class Run:
@@ -25,7 +29,7 @@ class Run:
         record: the content of ``run.json``, which has all that is here and more.
 
     Args:
-        folder: of a run that has ended, whoever started it.
+        folder: of a run that has ended.
 
     Raises:
         UsageError: if it is none, or another version of NeuROS wrote it.
@@ -151,9 +155,7 @@ def connection_figures(connection: Mapping[str, Any]) -> dict[str, Any]:
     """A connection in one row: of its latency each figure, without its digests."""
     latency = connection.get("latency_ms") or {}
     plain = {k: v for k, v in connection.items() if k not in ("latency_ms", "digests", "index")}
-    return plain | {
-        f"latency_{name}_ms": latency.get(name) for name in ("p50", "p90", "p99", "max")
-    }
+    return plain | {f"latency_{name}_ms": latency.get(name) for name in _LATENCIES}
 
 
 def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,9 +168,21 @@ def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
     return {"node": name, **sums, **idle, "executions": executions, **node.get("results", {})}
 
 
-_LATENCIES = ("p50", "p90", "p99", "max")
-_SUMMED = ("executing", "waiting", "blocked")
-
-
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
+
+
+def frame_of(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any:
+    """A ``pandas.DataFrame``, one row each; ``index``: the column that names them.
+
+    Raises:
+        EnvironmentFault: if pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise EnvironmentFault(
+            f"pandas is not installed for {sys.executable}: pip install pandas"
+        ) from error
+    frame = pd.DataFrame(list(rows))
+    return frame if index is None or frame.empty else frame.set_index(index)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.plan import Plan
-from neuros.api.workspace import WORKSPACE
+from neuros.distribution import WORKSPACE
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile
 from neuros.project.split import node_file_to_json, project_to_json

@@ -1,25 +1,36 @@
-"""Sweeps: a project run with every combination of values and seeds, one table of what came out."""
+"""Sweeps: runs of a project with every combination of values and seeds, and their table."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import hashlib
+import io
+import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from neuros.api.frames import frame_of
 from neuros.api.grid import Point, points_of, short_names
 from neuros.api.live import LiveRun
 from neuros.api.project import Project
-from neuros.api.run import Run
-from neuros.api.sweep_folder import alone_in, set_aside, sweep_folder
-from neuros.api.sweep_table import CSV_NAME, failed_row, row_of, table_of, write_csv
+from neuros.api.run import Run, frame_of
+from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
+from neuros.observe.run_record import consumed_percent
 
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
 _LOOK_S = 0.05
+_PLAN_NAME = "sweep.json"
+_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
+CSV_NAME = "sweep.csv"
+_REASON_CHARACTERS = 50
+_COUNTS = (": sent", ": consumed")
+_SHARE = ": consumed / %"
 
 
 class Sweep:
@@ -46,7 +57,7 @@ class Sweep:
         return [Run(folder) for folder in folders if (folder / "run.json").exists()]
 
     def __str__(self) -> str:
-        return table_of(self.rows)
+        return _table_of(self.rows)
 
     def __repr__(self) -> str:
         return f"<Sweep of {len(self.rows)} runs in {self.folder}>"
@@ -95,9 +106,9 @@ def sweep(
         raise UsageError(f"jobs {jobs}: give 1 or more")
     _check_all(project, points)
     options = {"backend": backend, "duration": duration, "record": record}
-    folder = sweep_folder(project, output, options)
+    folder = _sweep_folder(project, output, options)
     names = short_names(list(values))
-    with alone_in(folder):
+    with _locked_folder(folder):
         return _Sweeping(project, points, names, folder, options, on_row).run(jobs)
 
 
@@ -149,9 +160,9 @@ class _Sweeping:
         except UsageError:
             run = None
         if run is None or run.exit_code not in _FINISHED:
-            set_aside(folder)
+            _set_aside(folder)
             return False
-        self._rows[name] = row_of(self._points[name].values(self._names), run)
+        self._rows[name] = _row_of(self._points[name].values(self._names), run)
         return True
 
     def _start(self, name: str) -> None:
@@ -161,7 +172,7 @@ class _Sweeping:
                 set=point.settings, seed=point.seed, output=folder, **self._options
             )
         except EnvironmentFault as error:
-            self._note(name, failed_row(point.values(self._names), error, folder))
+            self._note(name, _failed_row(point.values(self._names), error, folder))
 
     def _collect(self) -> None:
         """Take what has ended, after a moment."""
@@ -172,9 +183,9 @@ class _Sweeping:
             del self._live[name]
             values = self._points[name].values(self._names)
             try:
-                row = row_of(values, live.wait())
+                row = _row_of(values, live.wait())
             except NeurosError as error:
-                row = failed_row(values, error, live.folder)
+                row = _failed_row(values, error, live.folder)
             self._note(name, row)
 
     def _note(self, name: str, row: dict[str, Any]) -> None:
@@ -186,7 +197,7 @@ class _Sweeping:
     def _save(self) -> None:
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
         try:
-            write_csv(self._sweep.rows, self._sweep.folder)
+            _write_csv(self._sweep.rows, self._sweep.folder)
         except OSError as error:
             file = self._sweep.folder / CSV_NAME
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
@@ -209,4 +220,132 @@ def _check_all(project: Project, points: Sequence[Point]) -> None:
         raise ProjectError(problems)
 
 
-__all__ = ["CSV_NAME", "Sweep", "sweep"]
+def _sweep_folder(
+    project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
+) -> Path:
+    """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
+    stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
+    folder = Path(output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
+    plan = {
+        "project": str(project.file),
+        "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
+        **{name: str(options[name]) for name in ("backend", "duration", "record")},
+    }
+    file = folder / _PLAN_NAME
+    try:
+        if file.exists():
+            _check_same(json.loads(file.read_text("utf-8")), plan, folder)
+            return folder
+        if folder.exists() and any(folder.iterdir()):
+            raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(plan, indent=2) + "\n", "utf-8")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
+    return folder
+
+
+@contextlib.contextmanager
+def _locked_folder(folder: Path) -> Iterator[None]:
+    """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
+    with contextlib.ExitStack() as stack:
+        try:
+            is_alone = stack.enter_context(locked(folder / _LOCK_NAME, wait=False))
+        except OSError as error:
+            raise UsageError(
+                f"{folder} cannot be used ({error}): name another one with -o"
+            ) from error
+        if not is_alone:
+            raise UsageError(f"{folder}: a sweep goes on there; wait for its end, or name another")
+        yield
+
+
+def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
+    for name, value in now.items():
+        if before.get(name) != value:
+            what = "the project's files" if name == "project_sha256" else f"its {name}"
+            raise UsageError(
+                f"{folder} holds a sweep that is not this one ({what} differ):"
+                " name another folder with -o"
+            )
+
+
+def _set_aside(folder: Path) -> None:
+    """Rename what a run has left that was cut off."""
+    number = 1
+    while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
+        number += 1
+    folder.rename(aside)
+
+
+def _row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
+    """What came of a run, behind the values that it was made with."""
+    row = {
+        **values,
+        "exit_code": run.exit_code,
+        "reason": run.reason,
+        "wall_s": run.wall_s,
+        "sim_s": run.sim_s,
+        "real_time_factor": run.real_time_factor,
+    }
+    for name, connection in run.connections.items():
+        sent, consumed = connection["sent"], connection["consumed"]
+        row[f"{name}: sent"] = sent
+        row[f"{name}: consumed"] = consumed
+        row[f"{name}{_SHARE}"] = consumed_percent(connection)
+    for node, results in run.node_results.items():
+        row |= {f"{node}.{name}": value for name, value in results.items()}
+    return {**row, "folder": str(run.folder)}
+
+
+def _failed_row(values: Mapping[str, Any], error: Exception, folder: Path) -> dict[str, Any]:
+    """The row of a run that could not begin."""
+    return {**values, "exit_code": None, "reason": f"not started: {error}", "folder": str(folder)}
+
+
+def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The columns of all rows; that of the folder is the last."""
+    found = dict.fromkeys(name for row in rows for name in row)
+    found.pop("folder", None)
+    return [*found, "folder"]
+
+
+def _write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    """Write ``sweep.csv``; a reader never finds half of it. Raises ``OSError``."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, _columns_of(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    new = folder / f"{CSV_NAME}.new"
+    new.write_text(text.getvalue(), "utf-8")
+    os.replace(new, folder / CSV_NAME)
+
+
+def _table_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """For people: without folders, times and counts."""
+    from tabulate import tabulate
+
+    hidden = ("folder", "wall_s", "sim_s")
+    names = [n for n in _columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
+    names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
+    table: str = tabulate(
+        [[_cell(name, row.get(name)) for name in names] for row in rows],
+        headers=[name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
+        disable_numparse=True,
+    )
+    return table
+
+
+def _is_shown(value: Any) -> bool:
+    return value is not None and not isinstance(value, (list, dict))
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None or isinstance(value, (list, dict)):
+        return ""
+    if name.endswith(_SHARE):
+        return f"{value:.1f}"
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    if name == "reason" and len(text) > _REASON_CHARACTERS:
+        return text[: _REASON_CHARACTERS - 3] + "..."
+    return text

@@ -1,4 +1,4 @@
-"""What is checked of a project only when somebody asks: its models, and whether plugins import.
+"""Slow checks of a project: timesteps of its MuJoCo models, and imports of its plugins.
 
 A run finds these out by itself, a moment later.
 """
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.api.environments import make_environments
+from neuros.api.plan import make_environments
 from neuros.errors import Problem
 from neuros.launch.child_processes import signal_in_words
 from neuros.launch.environments.pythons import Pythons

@@ -1,4 +1,4 @@
-"""The console script ``neuros``, and ``python -m neuros.cli``, which is the same.
+"""The console script ``neuros``, and the program of ``python -m neuros.cli``.
 
 Ctrl+C waits while the commands are imported: then they can end as they should.
 """

@@ -1,15 +1,32 @@
-"""Commands that belong to the source checkout, and not to the package: found where it is."""
+"""``neuros benchmark`` and ``neuros reproduce``, whose programs are in the source checkout."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
+import math
 import sys
-from pathlib import Path
 from typing import Any
 
-from neuros.errors import EnvironmentFault
+from neuros.distribution import ROOT
+from neuros.errors import EnvironmentFault, UsageError
 
-ROOT = Path(__file__).resolve().parents[2]
+_BENCHMARK_EPILOG = """\
+exit codes:
+  0    measured (whether the targets are met or not)
+  1    a measurement failed
+  2    wrong usage
+  4    there are no benchmarks: neuros is not installed from a source checkout
+  130  ended by Ctrl+C: what was measured is kept
+"""
+_REPRODUCE_EPILOG = """\
+exit codes:
+  0    done (whether the figures are like those that were published or not)
+  1    a run failed; the others were made
+  2    wrong usage
+  4    something is missing: Matplotlib, or the source checkout
+  130  ended by Ctrl+C: the runs that had ended are kept and shown
+"""
 
 
 def checkout_command(name: str) -> Any:
@@ -34,3 +51,112 @@ def positive_number(text: str) -> int:
     if number < 1:
         raise ValueError(text)
     return number
+
+
+def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    benchmark = commands.add_parser(
+        "benchmark",
+        help="measure what NeuROS costs, against the same thing without it",
+        description="Measure what NeuROS costs, side by side with the same thing without it.",
+        epilog=_BENCHMARK_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = benchmark.add_argument
+    add("subjects", nargs="*", metavar="SUBJECT", help="what to measure (default: everything)")
+    add("--list", action="store_true", help="show the subjects, and measure nothing")
+    add("-k", "--rows", metavar="TEXT", default="", help="only rows whose name contains TEXT")
+    add(
+        "--rounds",
+        type=positive_number,
+        metavar="N",
+        help="rounds (default: 10 where a target is held)",
+    )
+    add("--quick", action="store_true", help="few and short rounds: no figures to quote")
+    add("-o", "--output", metavar="FILE", help="default: build/benchmarks/<utc time>.json")
+    add(
+        "--from",
+        dest="files",
+        nargs="+",
+        metavar="FILE",
+        help="measure nothing, but show these results; of rows in several files, the last",
+    )
+    add("--compare", nargs=2, metavar=("A", "B"), help="show what differs between two results")
+    add("--figures", metavar="DIR", help="draw figures of the results (SVG)")
+    add("--write-docs", action="store_true", help="put tables and figures into docs/numbers.md")
+    benchmark.set_defaults(command=_benchmark)
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    if options.subjects and (options.files or options.compare or options.list):
+        raise UsageError("--from, --compare and --list measure nothing: name no SUBJECT")
+    return int(checkout_command("benchmarks.command").run(options))
+
+
+def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="make the published experiments again",
+        description="Make a published experiment again, one run after the other, and write its"
+        " tables and figures, with the published numbers beside them.",
+        epilog=_REPRODUCE_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = reproduce.add_argument
+    add(
+        "experiment",
+        choices=("whiskeye", "tick", "voting", "elevator"),
+        help="whiskeye: the robot in its seven orchestrations; tick: how regular ticks are, beside"
+        " a timer of rclpy; voting: what is added to three tasks of 5 s at once; elevator: how fast"
+        " a simulation is in three orchestrations",
+    )
+    add("--repeat", type=positive_number, metavar="N", help="runs of each part (default: 1)")
+    add(
+        "--only",
+        nargs="+",
+        metavar="NAME",
+        help="only these parts: tick_20ms, tick_60ms, tick_100ms, the same with _1ms behind it,"
+        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); neuros, rclpy (tick); strict,"
+        " no_discard_limit, asynchronous (elevator)",
+    )
+    add(
+        "--duration",
+        type=_seconds,
+        metavar="SECONDS",
+        help="of a run: simulated seconds of whiskeye, else wall seconds (default: 20 for whiskeye"
+        " and elevator, 60 for tick and voting)",
+    )
+    add(
+        "--backend",
+        choices=("auto", "docker", "process", "in-process"),
+        help="where nodes run, as for launch (default: NEUROS_BACKEND, else auto)",
+    )
+    add(
+        "-o",
+        "--output",
+        metavar="DIR",
+        help="a new folder, or one of an earlier call: runs are added to it"
+        " (default: build/reproduce/<experiment>/<utc time>)",
+    )
+    add(
+        "--from",
+        dest="source",
+        metavar="DIR",
+        help="run nothing; make tables and figures in this folder again",
+    )
+    reproduce.set_defaults(command=_reproduce)
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    given = (options.repeat, options.only, options.duration, options.backend, options.output)
+    if options.source is not None and any(each is not None for each in given):
+        raise UsageError("--from runs nothing: no other option goes with it")
+    return int(checkout_command("benchmarks.reproduce.command").run(options))
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not (seconds > 0 and math.isfinite(seconds)):
+        raise ValueError(text)
+    return seconds

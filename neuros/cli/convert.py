@@ -1,4 +1,4 @@
-"""``neuros convert``: from SDF or URDF to MuJoCo's own format."""
+"""``neuros convert``: converts SDF or URDF to MJCF, MuJoCo's own format."""
 
 from __future__ import annotations
 

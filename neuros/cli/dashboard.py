@@ -98,7 +98,7 @@ def _run_dashboard(options: argparse.Namespace) -> int:
 
 
 def _is_looked_at(listening: socket.socket) -> bool:
-    """Wait for somebody who opens the page; False if the run ends before."""
+    """Wait until a browser opens the page; False if the run ends before."""
     readable, _, _ = select.select([listening, sys.stdin], [], [])
     return listening in readable
 

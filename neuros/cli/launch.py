@@ -17,8 +17,9 @@ from neuros.api.request import Request, parse_duration
 from neuros.api.run_folder import folders_of, run_folder_path
 from neuros.cli.environments import make_shown_environments
 from neuros.cli.projects import load_with_messages
-from neuros.cli.recording_options import recording_request
 from neuros.cli.views import Views
+from neuros.errors import UsageError
+from neuros.observe.recording.selection import Request as RecordingRequest
 
 
 def launch(options: argparse.Namespace) -> int:
@@ -50,9 +51,24 @@ def _request(options: argparse.Namespace) -> Request:
         has_digests=options.digests,
         monitors_load=options.monitor_system_load,
         shows_progress=options.progress,
-        recording=recording_request(options),
+        recording=_recording_request(options),
         is_verbose=options.verbose,
     )
+
+
+def _recording_request(options: argparse.Namespace) -> RecordingRequest | None:
+    """What the command line has recorded, ``None``: nothing. Raises ``UsageError``."""
+    if options.record or options.record_topics:
+        return RecordingRequest(
+            everything=options.record,
+            topics=tuple(options.record_topics),
+            exclude=tuple(options.exclude),
+            storage=options.storage,
+        )
+    if options.exclude or options.storage != "mcap":
+        name = "--exclude" if options.exclude else "--storage"
+        raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+    return None
 
 
 def _dry_run(plan: Plan, request: Request) -> int:

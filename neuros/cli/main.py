@@ -25,40 +25,26 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from neuros import __version__
-from neuros.cli.bag import add_bag
-from neuros.cli.benchmark import add_benchmark
-from neuros.cli.build import add_build
-from neuros.cli.containers import add_containers
+from neuros.cli.checkout import add_benchmark, add_reproduce
 from neuros.cli.convert import add_convert
-from neuros.cli.dashboard import add_dashboard, add_dashboard_options
-from neuros.cli.doctor import add_doctor
-from neuros.cli.network import add_network
-from neuros.cli.observation import add_observation
-from neuros.cli.recording_options import add_recorder, add_recording_options
+from neuros.cli.dashboard import add_dashboard
+from neuros.cli.launch_options import (
+    EXIT_CODES,
+    add_launch,
+    add_project,
+    add_recorder,
+    launch_project,
+)
 from neuros.cli.replay import add_replay
-from neuros.cli.report import add_report
-from neuros.cli.reproduce import add_reproduce
-from neuros.cli.sessions import add_sessions
+from neuros.cli.runs import add_bag, add_report, add_sessions, add_verify
+from neuros.cli.setup import add_build, add_containers, add_doctor
 from neuros.cli.sweep import add_sweep
-from neuros.cli.verify import add_verify
-from neuros.cli.views import add_view, add_view_options
+from neuros.cli.views import add_view
+from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.project.suggest import did_you_mean
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
-
-_EXIT_CODES = """\
-exit codes:
-  0    ended normally
-  1    a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
-  2    wrong usage
-  3    invalid project: every problem is listed with its file and line
-  4    something is missing on this machine, or a record could not be written
-  5    the run broke a budget of its project
-  130  ended by Ctrl+C (a second one kills at once)
-  143  ended by SIGTERM, or because the terminal was closed
-"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -90,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
         return EXIT_USAGE
     try:
         options = parser().parse_args(arguments)
-        if options.command is not _launch:  # that has Ctrl+C wait until it can heed it
+        if options.command is not launch_project:  # that has Ctrl+C wait until it can heed it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
         if sys.stdout is not None:
@@ -123,12 +109,12 @@ def parser() -> argparse.ArgumentParser:
     result: argparse.ArgumentParser = _Parser(
         prog="neuros",
         description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
-        epilog=_EXIT_CODES,
+        epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument("--version", action="version", version=f"neuros {__version__}")
     commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_launch(commands)
+    add_launch(commands)
     _add_validate(commands)
     _add_graph(commands)
     add_build(commands)
@@ -151,71 +137,6 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
-def _add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    launch = commands.add_parser(
-        "launch",
-        help="run a project",
-        description="Run a project: start its nodes, connect them, and stay until all have ended.",
-        epilog=_EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    _add_project(launch)
-    launch.add_argument(
-        "-n",
-        "--node",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="start only this node (repeatable); the others may run elsewhere",
-    )
-    launch.add_argument(
-        "-d",
-        "--domain-id",
-        type=int,
-        metavar="ID",
-        help="ROS domain (default: ROS_DOMAIN_ID; else 0 where the project has external topics"
-        ", or -n or --network is used; else the first free one of 1 to 101)",
-    )
-    add_network(launch)
-    launch.add_argument(
-        "--backend",
-        choices=("auto", "docker", "process", "in-process"),
-        default=os.environ.get("NEUROS_BACKEND") or "auto",
-        help="where nodes run: each in a container, each in a process, or all in one process"
-        " (default: NEUROS_BACKEND, else auto: docker where an engine has the images, and else"
-        " process)",
-    )
-    launch.add_argument(
-        "--duration",
-        metavar="SECONDS",
-        help="end after this time from the first hook on, drained: 30, or 30sim in simulated time",
-    )
-    launch.add_argument(
-        "-o",
-        "--output",
-        metavar="DIR",
-        help="the run folder; new or empty (default: runs/<project>/<utc time>)",
-    )
-    launch.add_argument(
-        "--no-placement",
-        action="store_true",
-        help="ignore affinity: the kernel chooses the cores of every node",
-    )
-    add_observation(launch)
-    add_dashboard_options(launch)
-    add_view_options(launch)
-    add_recording_options(launch)
-    launch.add_argument(
-        "--progress",
-        action=argparse.BooleanOptionalAction,
-        help="show how far the run has come: a line that stays, or, where standard output is no"
-        " terminal, a line every 10 s (default: if it is known when the run ends)",
-    )
-    launch.add_argument("--dry-run", action="store_true", help="print what would be started")
-    launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
-    launch.set_defaults(command=_launch)
-
-
 def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     validate = commands.add_parser(
         "validate",
@@ -223,7 +144,7 @@ def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         description="Check a project and list every problem with its file, line and column."
         " Plugins are read, and not run.",
     )
-    _add_project(validate)
+    add_project(validate)
     validate.add_argument(
         "--import",
         dest="imports",
@@ -240,7 +161,7 @@ def _add_graph(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="show the nodes and connections of a project",
         description="Show the nodes and connections of a project without running it.",
     )
-    _add_project(graph)
+    add_project(graph)
     graph.add_argument(
         "--format",
         choices=("text", "mermaid", "svg"),
@@ -273,44 +194,6 @@ def _add_import_plugin(commands: argparse._SubParsersAction[argparse.ArgumentPar
     command.set_defaults(command=_import_plugin)
 
 
-def _add_project(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
-    )
-    command.add_argument(
-        "-p", "--project", dest="project_option", metavar="PROJECT", help="the same, as an option"
-    )
-    command.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="PATH=VALUE",
-        help="change a key of the project: nodes.NAME.KEY...=VALUE,"
-        " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE (JSON if it parses; always text"
-        " in environment; nothing removes the key)",
-    )
-    command.add_argument(
-        "--namespace",
-        metavar="NS",
-        help="where nodes, connections and relative topics are on the ROS graph, as in /left, so"
-        " that two copies of a project share a domain (default: the project's)",
-    )
-    command.add_argument(
-        "--remap",
-        action="append",
-        default=[],
-        metavar="FROM:=TO",
-        help="another name for an external topic, or for a topic or service of a plugin, as in ROS"
-        " (repeatable); NODE:FROM:=TO for one node alone",
-    )
-
-
-def _launch(options: argparse.Namespace) -> int:
-    from neuros.cli.launch import launch
-
-    return launch(options)
-
-
 def _validate(options: argparse.Namespace) -> int:
     from neuros.cli.projects import validate
 
@@ -324,7 +207,7 @@ def _import_plugin(options: argparse.Namespace) -> int:
 
 
 def _graph(options: argparse.Namespace) -> int:
-    from neuros.cli.graph import write_graph
+    from neuros.cli.projects import write_graph
 
     return write_graph(options)
 
@@ -336,7 +219,7 @@ def _node(options: argparse.Namespace) -> int:
 
 
 def _complain(text: str) -> None:
-    with contextlib.suppress(OSError):  # nobody reads it
+    with contextlib.suppress(OSError):  # its reader has gone
         print(text, file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""The program of a node's process or container: composes runtime and transport."""
+"""Program of a node process: composes runtime and transport."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding and loading the project that a command names."""
+"""``neuros validate`` and ``neuros graph``, and the loading of the project that a command names."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import os
 import sys
 from pathlib import Path
 
-from neuros.api import loading
+from neuros.api.loading import load_with_messages as load_by_path
 from neuros.api.validation import import_problems, model_problems
 from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.project.model import Project
 
 EXIT_NODE = 1
+_GRAPH_SUFFIXES = {".svg": "svg", ".mmd": "mermaid", ".mermaid": "mermaid"}
 
 
 def project_path(options: argparse.Namespace) -> Path:
@@ -43,7 +44,7 @@ def load_with_messages(
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
-    loaded, messages = loading.load_with_messages(
+    loaded, messages = load_by_path(
         project_path(options),
         options.set,
         options.namespace,
@@ -85,3 +86,25 @@ def import_plugin(options: argparse.Namespace) -> int:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def write_graph(options: argparse.Namespace) -> int:
+    """Write the graph of a project to the terminal, or to a file.
+
+    Raises:
+        UsageError: if the file cannot be written.
+    """
+    from neuros.project.graph import graph_mermaid, graph_text
+    from neuros.project.graph_svg import graph_svg
+
+    makers = {"text": graph_text, "mermaid": graph_mermaid, "svg": graph_svg}
+    kind = options.format or _GRAPH_SUFFIXES.get(Path(options.output or "").suffix, "text")
+    text = makers[kind](load(options, reads_plugins=False))
+    if options.output is None:
+        print(text)
+        return 0
+    try:
+        Path(options.output).write_text(text, "utf-8")
+    except OSError as error:
+        raise UsageError(f"-o {options.output}: cannot be written ({error.strerror})") from error
+    return 0

@@ -1,4 +1,4 @@
-"""The program of the recorder process; ``launch`` starts it, not people."""
+"""Program of the recorder process, which ``launch`` starts."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _in_bag(topic: FoundTopic) -> Topic:
 def _listening(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object]
 ) -> Iterator[Callable[[], list[str]]]:
-    """Listen in a thread; yields what stops it, and tells which wanted topics nobody published."""
+    """Listen in a thread; yields what stops it, and tells which wanted topics had no publisher."""
     if not plan.listen:
         yield list
         return

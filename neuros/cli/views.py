@@ -1,4 +1,4 @@
-"""``--node-graph`` and ``--visualisations``: the best view of a run that this machine can show."""
+"""``--node-graph`` and ``--visualisations``: viewers of a run, the best that this machine has."""
 
 from __future__ import annotations
 

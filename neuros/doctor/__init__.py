@@ -1,1 +1,1 @@
-"""``neuros doctor``: whether this machine has what runs need, each remedy in the same line."""
+"""``neuros doctor``: checks of this machine, each problem with its remedy in one line."""

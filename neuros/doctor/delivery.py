@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from neuros.doctor.findings import Finding, bad, good
+from neuros.doctor.machine_checks import Finding, bad, good
 
 PROJECT = Path(__file__).with_name("delivery")
 _TIMEOUT_S = 60.0

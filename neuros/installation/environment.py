@@ -1,4 +1,4 @@
-"""``.venv``: made, filled, proved, and recognised the next time."""
+"""The virtual environment ``.venv``: made, filled, tested, and reused by the next installation."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class Environment:
         self.compile()
 
     def compile(self) -> None:
-        """Compile NeuROS's modules, so that no start has to, whoever may write here by then.
+        """Compile NeuROS's modules, so that no start has to; the folder may be read-only by then.
 
         What cannot be compiled, or written, Python compiles at each start: no fault.
         """

@@ -1,4 +1,4 @@
-"""The machine that NeuROS is to be installed on: what it must have, and how to mend it."""
+"""Requirements of this machine for an installation, and commands that install what is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""pip: run where it can be watched, and explained where it fails."""
+"""pip: its command, its progress, and explanations of its errors."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def explain_failure(text: str) -> str | None:
 
 
 def explain_machine(text: str, again: str = "install.py") -> str | None:
-    """The same, where the cause is this machine or its network; ``again`` is what to run then."""
+    """One sentence for a failure of this machine or its network; ``again`` is what to run then."""
     for pattern, sentence in (
         ("No space left on device|Disk quota exceeded", "the disk is full: make room (df -h)"),
         (

@@ -1,4 +1,4 @@
-"""Progress that is visible on a terminal and readable in a log."""
+"""Progress lines for a terminal or a log file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _QUIET_S = 10.0
 
 
 class Stream(Protocol):
-    """Where progress goes: a text file, or what can do the same."""
+    """Output of progress: a text file, or an object with these methods."""
 
     def isatty(self) -> bool: ...
     def write(self, text: str, /) -> object: ...

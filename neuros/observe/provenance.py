@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros import __version__
+from neuros.distribution import __version__
 from neuros.project.model import Node
 
 _GIT_PATIENCE_S = 5.0

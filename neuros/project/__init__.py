@@ -1,1 +1,1 @@
-"""What a project is: its model, and how it is loaded, validated and split."""
+"""Projects: the model, and the functions that load, validate and split it."""

@@ -1,4 +1,4 @@
-"""What a schema cannot express: whether the parts of a project fit together.
+"""Checks that a schema cannot express: the parts of a project fit together.
 
 All of it works on files that violate the schema elsewhere: what has the wrong form is passed over
 here, as the schema has reported it, and what depends on it is not guessed.
@@ -11,17 +11,16 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from neuros.errors import Problem
-from neuros.project.budgets import budget_mistakes
-from neuros.project.draft import Draft
 from neuros.project.gazebo import remarks_on_gazebo
 from neuros.project.message_types import normalised
+from neuros.project.names import INTERNAL, MOST_CHARACTERS, Names
 from neuros.project.parameters import parameter_mistakes
-from neuros.project.ros_graph_checks import ros_graph_mistakes, ros_graph_remarks
+from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
 from neuros.project.source import Element
 from neuros.project.suggest import did_you_mean
 
 Side = Literal["inputs", "outputs"]
-_ENDS = ("source_node", "source_output", "destination_node", "destination_input")
+_LONGEST_PART = len("/data")
 
 
 @dataclass
@@ -32,27 +31,27 @@ class _Ports:
     incomplete: set[Side] = field(default_factory=set)
 
 
-def mistakes(draft: Draft) -> list[Problem]:
+def mistakes(parsed: ParsedProject) -> list[Problem]:
     """Everything that does not fit together."""
     return [
-        *_duplicate_nodes(draft),
-        *_duplicate_ports(draft),
-        *_duplicate_connections(draft),
-        *_connection_ends(draft),
-        *budget_mistakes(draft),
-        *ros_graph_mistakes(draft),
-        *parameter_mistakes(draft),
+        *_duplicate_nodes(parsed),
+        *_duplicate_ports(parsed),
+        *_duplicate_connections(parsed),
+        *_connection_ends(parsed),
+        *_budget_mistakes(parsed),
+        *_ros_graph_mistakes(parsed),
+        *parameter_mistakes(parsed),
     ]
 
 
-def remarks(draft: Draft) -> list[Problem]:
+def remarks(parsed: ParsedProject) -> list[Problem]:
     """What is allowed, but may be a mistake. For a project without mistakes."""
-    return sorted([*remarks_on_gazebo(draft), *_unconnected(draft), *ros_graph_remarks(draft)])
+    return sorted([*remarks_on_gazebo(parsed), *_unconnected(parsed), *_ros_graph_remarks(parsed)])
 
 
-def _duplicate_nodes(draft: Draft) -> Iterator[Problem]:
+def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
     first: dict[str, tuple[Element, Element]] = {}
-    for node, entry in zip(draft.nodes, draft.entries, strict=True):
+    for node, entry in zip(parsed.nodes, parsed.entries, strict=True):
         name = node.string("name")
         if name is None:
             continue
@@ -69,8 +68,8 @@ def _duplicate_nodes(draft: Draft) -> Iterator[Problem]:
         yield node.value["name"].problem(text, _where(other, "name"))
 
 
-def _duplicate_ports(draft: Draft) -> Iterator[Problem]:
-    for node in draft.nodes:
+def _duplicate_ports(parsed: ParsedProject) -> Iterator[Problem]:
+    for node in parsed.nodes:
         for side in ("inputs", "outputs"):
             first: dict[str, Element] = {}
             for port in node.items(side):
@@ -81,20 +80,20 @@ def _duplicate_ports(draft: Draft) -> Iterator[Problem]:
                     )
 
 
-def _duplicate_connections(draft: Draft) -> Iterator[Problem]:
+def _duplicate_connections(parsed: ParsedProject) -> Iterator[Problem]:
     first: dict[tuple[str | None, ...], Element] = {}
-    for connection in draft.connections:
-        ends = tuple(connection.string(end) for end in _ENDS)
+    for connection in parsed.connections:
+        ends = tuple(connection.string(end) for end in ENDS)
         if None not in ends and first.setdefault(ends, connection) is not connection:
             yield connection.problem(
                 f"the connection {_named(ends)} occurs twice", _where(first[ends])
             )
 
 
-def _connection_ends(draft: Draft) -> Iterator[Problem]:
-    nodes = _ports_by_node(draft)
-    all_known = draft.is_complete and all(node.string("name") for node in draft.nodes)
-    for connection in draft.connections:
+def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
+    nodes = _ports_by_node(parsed)
+    all_known = parsed.is_complete and all(node.string("name") for node in parsed.nodes)
+    for connection in parsed.connections:
         found: list[Element] = []
         sides: tuple[tuple[str, str, Side], ...] = (
             ("source_node", "source_output", "outputs"),
@@ -146,13 +145,13 @@ def _different_types(connection: Element, ends: list[Element]) -> Iterator[Probl
         )
 
 
-def _unconnected(draft: Draft) -> Iterator[Problem]:
+def _unconnected(parsed: ParsedProject) -> Iterator[Problem]:
     used = {
         (side, connection.string(node), connection.string(port))
-        for connection in draft.connections
-        for side, node, port in (("outputs", *_ENDS[:2]), ("inputs", *_ENDS[2:]))
+        for connection in parsed.connections
+        for side, node, port in (("outputs", *ENDS[:2]), ("inputs", *ENDS[2:]))
     }
-    for node in draft.nodes:
+    for node in parsed.nodes:
         for side in ("inputs", "outputs"):
             for port in node.items(side):
                 key = (side, node.string("name"), port.string("name"))
@@ -164,9 +163,9 @@ def _unconnected(draft: Draft) -> Iterator[Problem]:
                     )
 
 
-def _ports_by_node(draft: Draft) -> dict[str, _Ports]:
+def _ports_by_node(parsed: ParsedProject) -> dict[str, _Ports]:
     nodes: dict[str, _Ports] = {}
-    for node in draft.nodes:
+    for node in parsed.nodes:
         ports = nodes.setdefault(node.string("name") or "", _Ports())
         sides: tuple[Side, ...] = ("inputs", "outputs")
         for side in sides:
@@ -190,3 +189,107 @@ def _where(element: Element, key: str = "") -> str:
     place = element.value[key] if key else element
     line, column = place.source.place(place.start)
     return f"see {place.source.name}:{line}:{column}"
+
+
+# ---------------------------------------------------------------------- budgets
+
+
+def _budget_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
+    """Budgets for connections that the project has not."""
+    budgets = parsed.root.member("budgets")
+    limits = None if budgets is None else budgets.member("lost_packets")
+    if limits is None or not isinstance(limits.value, dict):
+        return
+    names = [_connection_name(connection) for connection in parsed.connections]
+    known = [name for name in names if name is not None]
+    for name, member in limits.value.items():
+        if name not in known and len(known) == len(names):
+            hint = did_you_mean(name, known) or "write 'a.out -> b.in', as `neuros launch` does"
+            yield member.key_problem(f"there is no connection '{name}'", hint)
+
+
+def _connection_name(connection: Element) -> str | None:
+    """``a.out -> b.in``, ``None`` if an end is missing."""
+    source, output, destination, input_ = (connection.string(end) for end in ENDS)
+    if None in (source, output, destination, input_):
+        return None
+    return f"{source}.{output} -> {destination}.{input_}"
+
+
+# ---------------------------------------------------------------------- ROS graph
+
+
+def _ros_graph_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
+    """QoS where there is none to choose, rules for nothing, and names that are too long."""
+    names = names_of(parsed)
+    yield from _qos_of_connections(parsed)
+    yield from _rules_without_sense(parsed, names)
+    yield from _long_names(parsed, names)
+
+
+def _ros_graph_remarks(parsed: ParsedProject) -> Iterator[Problem]:
+    """QoS that does not do what it seems to."""
+    for port, _, _ in _all_ports(parsed):
+        qos = port.member("qos")
+        if qos is None or qos.string("durability") != "transient_local":
+            continue
+        if qos.string("reliability") == "best_effort":
+            yield qos.problem(
+                "transient_local has no effect with best_effort: who comes later gets nothing",
+                "make it reliable",
+            )
+
+
+def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
+    for port, side, _ in _all_ports(parsed):
+        qos = port.member("qos")
+        if qos is not None and port.member("external_topic") is None:
+            yield qos.key_problem(
+                f"'qos' is for external topics, and this {side[:-1]} has none",
+                "the QoS of a connection follows from its discard_limit and queue_size",
+            )
+
+
+def _rules_without_sense(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
+    nodes = {node.string("name") or "": node for node in parsed.nodes}
+    remap = parsed.root.member("remap")
+    for rule in rules_of(remap):
+        assert remap is not None
+        only, _, old = rule.rpartition(":")
+        if only and only not in nodes and parsed.is_complete:
+            yield remap.value[rule].key_problem(
+                f"there is no node '{only}'", did_you_mean(only, nodes)
+            )
+        if names.full(old, only).startswith(f"{names.namespace}{INTERNAL}"):
+            yield remap.value[rule].key_problem(
+                f"'{old}' is a topic of NeuROS's own, which keeps its name",
+                "a namespace moves all of them",
+            )
+
+
+def _long_names(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
+    for port, _, node in _all_ports(parsed):
+        topic = port.string("external_topic")
+        if topic is not None:
+            full = names.resolve(topic, node)
+            if len(full) > MOST_CHARACTERS:
+                yield port.value["external_topic"].problem(_too_long(full))
+    for connection in parsed.connections:
+        ends = [connection.string(end) or "" for end in ENDS]
+        full = f"{names.namespace}{INTERNAL}{'/'.join(ends)}"
+        if len(full) + _LONGEST_PART > MOST_CHARACTERS:
+            yield connection.problem(
+                _too_long(full), "choose shorter names, or a shorter namespace"
+            )
+
+
+def _too_long(topic: str) -> str:
+    return f"the topic {topic} is longer than the {MOST_CHARACTERS} characters that ROS allows"
+
+
+def _all_ports(parsed: ParsedProject) -> Iterator[tuple[Element, str, str]]:
+    """Every port with its side and the name of its node."""
+    for node in parsed.nodes:
+        for side in ("inputs", "outputs"):
+            for port in node.items(side):
+                yield port, side, node.string("name") or ""

@@ -1,4 +1,4 @@
-"""What project files of NeuROS 1.0 say to Gazebo: read, and named in a warning.
+"""Gazebo keys of project files of NeuROS 1.0: read, and named in a warning.
 
 MuJoCo stands in for Gazebo. None of this is a mistake, and none of it may pass unnoticed.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from neuros.errors import Problem
-from neuros.project.draft import Draft
+from neuros.project.parsed import ParsedProject
 from neuros.project.source import Element
 
 _STAND_INS: Mapping[str, str] = {"neuros_gazebo": "neuros_mujoco"}
@@ -26,20 +26,20 @@ def is_for_gazebo(variable: str) -> bool:
     return variable.startswith(_PREFIXES)
 
 
-def remarks_on_gazebo(draft: Draft) -> Iterator[Problem]:
+def remarks_on_gazebo(parsed: ParsedProject) -> Iterator[Problem]:
     """What has no meaning here, by node: its container, its environment, its ports."""
-    for node in draft.nodes:
+    for node in parsed.nodes:
         container = node.string("container") or ""
         if container in _STAND_INS:
             yield node.value["container"].problem(
                 f"Gazebo is not supported: the node runs in '{_STAND_INS[container]}' instead of"
                 f" '{container}'"
             )
-        yield from _variables(draft, node)
+        yield from _variables(parsed, node)
         yield from _ports(node)
 
 
-def _variables(draft: Draft, node: Element) -> Iterator[Problem]:
+def _variables(parsed: ParsedProject, node: Element) -> Iterator[Problem]:
     environment = node.member("environment")
     if environment is None or not isinstance(environment.value, dict):
         return
@@ -48,7 +48,7 @@ def _variables(draft: Draft, node: Element) -> Iterator[Problem]:
             continue
         if name not in _RESOURCES:
             yield member.key_problem(f"'{name}' is for Gazebo and has no effect")
-        elif not draft.roots.finds(member.value, member.source.folder):
+        elif not parsed.roots.finds(member.value, member.source.folder):
             yield member.problem(f"'{name}' is left out: there is no folder '{member.value}'")
 
 

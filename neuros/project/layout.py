@@ -1,4 +1,4 @@
-"""Where the nodes and connections of a project go in a picture: in columns, from left to right.
+"""Layout of a project's graph: nodes in columns, connections from left to right.
 
 Nodes stand in every other column, so that each has those behind it to its right; loops are broken
 where the search comes back. Connections have boxes of their own in the columns between, and where

@@ -1,27 +1,184 @@
-"""From files to a project: read, override, judge, build. All problems at once."""
+"""Loading of a project: read, override, check, build; all problems are reported at once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from neuros.errors import Problem, ProjectError
-from neuros.project.budgets import budgets_of
-from neuros.project.build import Builder, connection
 from neuros.project.checks import mistakes, remarks
-from neuros.project.draft import Draft, read_draft
-from neuros.project.message_types import NO_PACKAGES, MessagePackages
-from neuros.project.model import Project
-from neuros.project.overrides import apply_override
-from neuros.project.paths import Roots
+from neuros.project.gazebo import container_in_place_of, is_for_gazebo
+from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
+from neuros.project.model import Budgets, Connection, Node, Port, Project, Value
+from neuros.project.overrides import apply_namespace, apply_override, apply_remaps
+from neuros.project.parameters import parameters_of
+from neuros.project.parsed import ParsedProject, names_of, parse_project
+from neuros.project.paths import PathError, Roots
 from neuros.project.plugin_checks import plugin_problems, unread_variables
-from neuros.project.renaming import apply_namespace, apply_remaps
-from neuros.project.ros_graph_checks import names_of
+from neuros.project.qos import Qos, qos_of
+from neuros.project.resources import Access, Resources, access_of, resources_of
 from neuros.project.scanner import SourceError, display_name
+from neuros.project.source import Element
 from neuros.project.suggest import did_you_mean
 
+STANDARD_CONTAINERS = frozenset(
+    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
+)
+"""NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
+
+
+class Builder:
+    """Builds nodes and connections, as far as they have the right form.
+
+    Attributes:
+        problems: what was found on the way: missing files, unknown types. What they concern is
+            left out of the nodes, which are of no use then.
+    """
+
+    def __init__(self, parsed: ParsedProject) -> None:
+        self._roots = parsed.roots
+        self.problems: list[Problem] = []
+
+    def node(self, element: Element) -> Node:
+        """The node that an object describes."""
+        environment: dict[str, str] = {}
+        paths: list[str] = []
+        variables = element.member("environment")
+        if variables is not None and isinstance(variables.value, dict):
+            for name, member in variables.value.items():
+                if is_for_gazebo(name) and not self._roots.finds(
+                    member.value, member.source.folder
+                ):
+                    continue
+                value, is_path = self._variable(member)
+                environment[name] = value
+                if is_path:
+                    paths.append(name)
+        resources, access = _resources_and_access(element)
+        return Node(
+            name=element.string("name") or "",
+            container=container_in_place_of(element.string("container") or ""),
+            plugin=self._file(element, "plugin") or Path(),
+            script=self._file(element, "script"),
+            inputs=self._ports(element, "inputs"),
+            outputs=self._ports(element, "outputs"),
+            environment=environment,
+            file=element.source.file,
+            pointer=element.pointer,
+            environment_paths=tuple(sorted(paths)),
+            affinity=_affinity(element),
+            resources=resources,
+            access=access,
+            parameters=_parameters(element),
+        )
+
+    def _file(self, element: Element, key: str) -> Path | None:
+        member = element.member(key)
+        if member is None or not isinstance(member.value, str) or not member.value:
+            return None
+        return self._find(member, folder_allowed=False)
+
+    def _find(self, member: Element, *, folder_allowed: bool, advice: str = "") -> Path | None:
+        try:
+            return self._roots.find(
+                member.value, member.source.folder, folder_allowed=folder_allowed
+            )
+        except PathError as error:
+            self.problems.append(member.problem(error.text, error.hint or advice))
+            return None
+
+    def _variable(self, member: Element) -> tuple[str, bool]:
+        """The value of an environment variable, and whether it is a path."""
+        value = member.value
+        if isinstance(value, bool | int | float):
+            return member.text, False
+        if not isinstance(value, str) or value[:1] not in ("#", "@") or "\0" in value:
+            return str(value), False
+        if value[:2] in ("##", "@@"):
+            return value[1:], False
+        advice = f"write '{value[0]}{value}' if it is no path"
+        return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
+
+    def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
+        container = container_in_place_of(node.string("container") or "").partition(":")[0]
+        must_be_here = container in STANDARD_CONTAINERS
+        return tuple(
+            self._port(port, side, must_be_here=must_be_here)
+            for port in node.items(side)
+            if isinstance(port.value, dict)
+        )
+
+    def _port(self, element: Element, side: str, *, must_be_here: bool) -> Port:
+        written = element.string("type") or ""
+        type_name = normalised(written)
+        unknown = type_name and unknown_type(
+            type_name, must_be_here=must_be_here, packages=self._roots.packages
+        )
+        if unknown:
+            self.problems.append(element.value["type"].problem(*unknown))
+        mujoco = element.member("mujoco")
+        keys: dict[str, Any] = {} if mujoco is None else {"mujoco": mujoco.plain}
+        return Port(
+            name=element.string("name") or "",
+            type=type_name or written,
+            external_topic=element.string("external_topic"),
+            gazebo_type=element.string("gazebo_type"),
+            qos=_qos(element, is_input=side == "inputs"),
+            **keys,
+        )
+
+
+def _qos(port: Element, *, is_input: bool) -> Qos | None:
+    """The QoS of a port; the schema has reported what is wrong with it."""
+    member = port.member("qos")
+    if member is None:
+        return None
+    try:
+        return qos_of(member.plain, is_input=is_input)
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _parameters(node: Element) -> dict[str, Value]:
+    """The ROS parameters of a node; what is wrong with them has been reported."""
+    member = node.member("parameters")
+    try:
+        return {} if member is None else parameters_of(member.plain)
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        return {}
+
+
+def _affinity(node: Element) -> tuple[int, ...]:
+    """The cores that a node asks for; the schema has reported what is no number of a core."""
+    cores = (core.value for core in node.items("affinity"))
+    return tuple(int(core) for core in cores if isinstance(core, int | float) and core % 1 == 0)
+
+
+def _resources_and_access(node: Element) -> tuple[Resources, Access]:
+    """What a node may use; the schema has reported what is wrong with it."""
+    try:
+        return resources_of(node.plain), access_of(node.plain)
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
+        return Resources(), Access()
+
+
+def connection(element: Element, index: int, namespace: str) -> Connection:
+    """The connection that a valid object describes."""
+    values = element.plain
+    limit = values.get("discard_limit")
+    return Connection(
+        source_node=values["source_node"],
+        source_output=values["source_output"],
+        destination_node=values["destination_node"],
+        destination_input=values["destination_input"],
+        discard_limit=None if limit is None else int(limit),
+        queue_size=int(values.get("queue_size", 1)),
+        index=index,
+        namespace=namespace,
+    )
 
 
 @dataclass(frozen=True)
@@ -62,50 +219,50 @@ def load_project(
     file = _project_file(path)
     roots = Roots((folder or file.parent).resolve(), workspace.resolve(), packages)
     try:
-        draft = read_draft(file, roots)
+        parsed = parse_project(file, roots)
     except SourceError as error:
         raise ProjectError([error.problem]) from None
     for text in overrides:
-        draft.problems += apply_override(draft, text)
+        parsed.problems += apply_override(parsed, text)
     if namespace is not None:
-        apply_namespace(draft, namespace)
-    draft.problems += apply_remaps(draft, remap)
-    builder = Builder(draft)
-    names = names_of(draft)
-    nodes = tuple(builder.node(element) for element in draft.nodes)
-    problems = [*draft.problems, *_judgements(draft), *builder.problems]
+        apply_namespace(parsed, namespace)
+    parsed.problems += apply_remaps(parsed, remap)
+    builder = Builder(parsed)
+    names = names_of(parsed)
+    nodes = tuple(builder.node(element) for element in parsed.nodes)
+    problems = [*parsed.problems, *_judgements(parsed), *builder.problems]
     connections = (
         ()
         if problems
         else tuple(
-            connection(c, index, names.namespace) for index, c in enumerate(draft.connections)
+            connection(c, index, names.namespace) for index, c in enumerate(parsed.connections)
         )
     )
     doubts: list[Problem] = []
     if reads_plugins:
-        mistakes, doubts = plugin_problems(draft, nodes, None if problems else connections)
+        mistakes, doubts = plugin_problems(parsed, nodes, None if problems else connections)
         problems += mistakes
     if problems:
         raise ProjectError(problems)
     if reads_plugins:
-        doubts += unread_variables(draft, nodes, overrides)
+        doubts += unread_variables(parsed, nodes, overrides)
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
         connections=connections,
         file=roots.project / file.name,
-        description=draft.root.string("description") or "",
-        budgets=budgets_of(draft),
+        description=parsed.root.string("description") or "",
+        budgets=_budgets_of(parsed),
         names=names,
     )
-    return Loaded(project, (*remarks(draft), *doubts))
+    return Loaded(project, (*remarks(parsed), *doubts))
 
 
-def _judgements(draft: Draft) -> list[Problem]:
-    # Imported here, so that whoever imports this module does not pay for jsonschema.
+def _judgements(parsed: ParsedProject) -> list[Problem]:
+    # Imported late: importing this module must not load jsonschema.
     from neuros.project.validate import violations
 
-    return [*violations(draft), *mistakes(draft)]
+    return [*violations(parsed), *mistakes(parsed)]
 
 
 def _project_file(path: Path) -> Path:
@@ -134,3 +291,14 @@ def _name(folder: Path, file: Path) -> str:
     """What a run of the project is called: the folder, and the file where it is a variant."""
     name = folder.name or "project"
     return name if file.name == PROJECT_FILE else f"{name}-{file.stem}"
+
+
+def _budgets_of(parsed: ParsedProject) -> Budgets:
+    """The budgets of a valid project."""
+    element = parsed.root.member("budgets")
+    values: dict[str, Any] = {} if element is None else element.plain
+    return Budgets(
+        lost_packets={name: int(most) for name, most in values.get("lost_packets", {}).items()},
+        real_time_factor=values.get("real_time_factor"),
+        tick_error_ms=values.get("tick_error_ms"),
+    )

@@ -53,7 +53,7 @@ def normalised(text: str) -> str | None:
 def unknown_type(
     type_name: str, *, must_be_here: bool, packages: MessagePackages = NO_PACKAGES
 ) -> tuple[str, str] | None:
-    """What is wrong with a normalised type, and a hint; ``None`` if nothing is, or nobody knows.
+    """What is wrong with a normalised type, and a hint; ``None`` if nothing is, or it is not known.
 
     Args:
         must_be_here: whether it is wrong too if its package is not installed on this machine.
@@ -100,7 +100,7 @@ def _message_folder(package: str) -> Path | None:
 def _really_has(package: str, name: str) -> bool:
     try:
         return hasattr(importlib.import_module(f"{package}.msg"), name)
-    except Exception:  # whatever a broken package raises: the message cannot be used
+    except Exception:  # a broken package raises anything: the message cannot be used
         return False
 
 

@@ -7,7 +7,9 @@ A rule replaces a name if both are the same in full; the first rule that fits co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 MOST_CHARACTERS = 247
 """Of a topic's full name: DDS has 255, and ROS puts up to 8 in front (``rmw/validate_full...``)."""
@@ -56,3 +58,14 @@ def normalised_namespace(written: str) -> str:
     """``/left`` for ``left`` and ``/left``; empty for ``/``, where everybody is."""
     stripped = written.strip("/")
     return f"/{stripped}" if stripped else ""
+
+
+def names_from(namespace: str, remap: Mapping[str, str]) -> Names:
+    """The names of a project, from valid values of its keys."""
+    return Names(normalised_namespace(namespace), tuple(remap.items()))
+
+
+def names_to_json(names: Names) -> dict[str, Any]:
+    """As a project file has them; only what there is."""
+    content: dict[str, Any] = {"namespace": names.namespace, "remap": dict(names.remap)}
+    return {key: value for key, value in content.items() if value}

@@ -1,6 +1,6 @@
-"""``--set``: values from the command line in the place of those in the files.
+"""``--set``, ``--namespace`` and ``--remap``: values that replace those of the files.
 
-::
+The form of ``--set``::
 
     nodes.NAME.KEY...=VALUE
     connections.SRC.OUT.DST.IN.KEY=VALUE
@@ -13,51 +13,57 @@ other lists an index.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from neuros.errors import Problem
-from neuros.project.draft import Draft
+from neuros.project.parsed import ENDS, ParsedProject
 from neuros.project.scanner import SourceError, parse
 from neuros.project.source import Element, Source, escape
 from neuros.project.suggest import did_you_mean
 
-_ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 _NODE_FORM = "nodes.NAME.KEY=VALUE"
 _CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
 _BUDGET_FORM = "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE"
+_REMAP_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
+_SPECIAL_NAMES = {
+    "__ns": "use --namespace",
+    "__node": "a node keeps the name that the project gives it",
+    "__name": "a node keeps the name that the project gives it",
+}
 
 
-def apply_override(draft: Draft, text: str) -> list[Problem]:
-    """Apply one ``--set`` to a draft; what is wrong with the text itself is returned."""
-    override = _Override(Source(f"--set {text}", draft.roots.project, text))
+def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
+    """Apply one ``--set`` to a parsed project; what is wrong with the text itself is returned."""
+    override = _Override(Source(f"--set {text}", parsed.roots.project, text))
     target, equals, _ = text.partition("=")
     kind, *steps = target.split(".")
     if kind == "budgets":
-        return override.apply_to_budgets(draft.root, steps)
+        return override.apply_to_budgets(parsed.root, steps)
     form = {"nodes": _NODE_FORM, "connections": _CONNECTION_FORM}.get(kind)
     if form is None:
         hint = did_you_mean(kind, ("nodes", "connections", "budgets"))
         return [override.problem("must begin with 'nodes.', 'connections.' or 'budgets.'", hint)]
-    names = len(_ENDS) if kind == "connections" else 1
+    names = len(ENDS) if kind == "connections" else 1
     if not equals or len(steps) <= names or not all(steps[: names + 1]):
         return [override.problem("is not of the form", form)]
-    parent = _node(draft, steps[0]) if names == 1 else _connection(draft, steps[:names])
+    parent = _node(parsed, steps[0]) if names == 1 else _connection(parsed, steps[:names])
     if isinstance(parent, str):
         what = f"there is no {kind.removesuffix('s')} '{'.'.join(steps[:names])}'"
-        return [] if not draft.is_complete else [override.problem(what, parent)]
+        return [] if not parsed.is_complete else [override.problem(what, parent)]
     return override.apply(parent, steps[names:])
 
 
-def _node(draft: Draft, name: str) -> Element | str:
-    names = [node.string("name") or "" for node in draft.nodes]
-    return draft.nodes[names.index(name)] if name in names else did_you_mean(name, names)
+def _node(parsed: ParsedProject, name: str) -> Element | str:
+    names = [node.string("name") or "" for node in parsed.nodes]
+    return parsed.nodes[names.index(name)] if name in names else did_you_mean(name, names)
 
 
-def _connection(draft: Draft, ends: list[str]) -> Element | str:
-    known = [".".join(c.string(end) or "" for end in _ENDS) for c in draft.connections]
+def _connection(parsed: ParsedProject, ends: list[str]) -> Element | str:
+    known = [".".join(c.string(end) or "" for end in ENDS) for c in parsed.connections]
     wanted = ".".join(ends)
     if wanted in known:
-        return draft.connections[known.index(wanted)]
+        return parsed.connections[known.index(wanted)]
     return did_you_mean(wanted, known)
 
 
@@ -130,3 +136,37 @@ class _Override:
 
     def _element(self, value: object, pointer: str) -> Element:
         return Element(value, self.source, self._value_start, len(self.source.text), pointer)
+
+
+def apply_namespace(parsed: ParsedProject, text: str) -> None:
+    """Apply ``--namespace`` to a parsed project, in the place of the project's own."""
+    if isinstance(parsed.root.value, dict):
+        source = Source(f"--namespace {text}", parsed.roots.project, text)
+        parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
+
+
+def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
+    """Apply each ``--remap`` to a parsed project; they go before the rules of the project."""
+    problems: list[Problem] = []
+    rules: dict[str, Element] = {}
+    for text in texts:
+        source = Source(f"--remap {text}", parsed.roots.project, text)
+        old, sign, new = text.partition(":=")
+        if not (sign and old and new):
+            problems.append(source.problem(0, "/remap", "is no rule", _REMAP_FORM))
+        elif old.rpartition(":")[2] in _SPECIAL_NAMES:
+            hint = _SPECIAL_NAMES[old.rpartition(":")[2]]
+            problems.append(source.problem(0, "/remap", f"'{old}' is not remapped", hint))
+        else:
+            start = len(old) + len(sign)
+            pointer = f"/remap/{escape(old)}"
+            rule = Element(new, source, start, len(text), pointer, key_start=0)
+            rules.setdefault(old, rule)  # the first one counts
+    if rules and isinstance(parsed.root.value, dict):
+        remap = parsed.root.member("remap")
+        if remap is None:
+            source = next(iter(rules.values())).source
+            parsed.root.value["remap"] = Element(rules, source, 0, len(source.text), "/remap")
+        elif isinstance(remap.value, dict):
+            remap.value = {**rules, **{k: v for k, v in remap.value.items() if k not in rules}}
+    return problems

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from neuros.errors import Problem
-from neuros.project.draft import Draft
 from neuros.project.model import Value
+from neuros.project.parsed import ParsedProject
 from neuros.project.source import Element
 
 _INT64 = 1 << 63
@@ -41,9 +41,9 @@ def parameters_to_json(parameters: Mapping[str, Value]) -> dict[str, Any]:
     }
 
 
-def parameter_mistakes(draft: Draft) -> Iterator[Problem]:
+def parameter_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
     """What ROS has no type for, and names that occur twice."""
-    for node in draft.nodes:
+    for node in parsed.nodes:
         parameters = node.member("parameters")
         if parameters is not None and isinstance(parameters.value, dict):
             yield from _mistakes(parameters, "", {})

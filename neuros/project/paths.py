@@ -1,4 +1,4 @@
-"""Where the paths in project files point to, and that they stay where they belong."""
+"""Paths in project files: resolved, and kept inside project and workspace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the plugins of a project fit its nodes, without running them; what they do not read."""
+"""Checks that plugins fit their nodes, without running them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from neuros.errors import Problem
-from neuros.project.draft import Draft
 from neuros.project.model import Connection, Node
+from neuros.project.parsed import ParsedProject
 from neuros.project.plugin_files import DeclaredHook, DeclaredPort, PluginFile, Remark, read_plugin
 from neuros.project.scanner import display_name
 from neuros.project.suggest import did_you_mean
@@ -22,7 +22,7 @@ _COMPUTED = re.compile(
     r"\benviron\b(?!\s*\[\s*[\"']|\.(?:get|setdefault|pop)\(\s*[\"']|\s*$)|\bgetenv\((?!\s*[\"'])",
     re.MULTILINE,
 )
-# Read by Python, libraries, drivers, and ROS, whatever a plugin says.
+# Read by Python, libraries, drivers, and ROS.
 _KNOWN_PREFIXES = (
     *("PYTHON", "LD_", "LC_", "LANG", "TZ", "HOME", "PATH", "TMP", "XDG_", "DISPLAY", "QT_"),
     *("OMP_", "OPENBLAS_", "MKL_", "KMP_", "GOMP_", "BLIS_", "NUMEXPR_", "VECLIB_", "MALLOC_"),
@@ -34,16 +34,16 @@ _KNOWN_PREFIXES = (
 
 
 def plugin_problems(
-    draft: Draft, nodes: Sequence[Node], connections: Sequence[Connection] | None
+    parsed: ParsedProject, nodes: Sequence[Node], connections: Sequence[Connection] | None
 ) -> tuple[list[Problem], list[Problem]]:
     """What keeps plugins from running, and what may be a mistake in them.
 
     Args:
-        nodes: made of the elements of the draft, in the same order.
+        nodes: made of the elements of the parsed project, in the same order.
         connections: ``None`` where they are not all known.
     """
     problems, doubts = list[Problem](), list[Problem]()
-    for node, element in zip(nodes, draft.nodes, strict=True):
+    for node, element in zip(nodes, parsed.nodes, strict=True):
         plugin = read_plugin(node.plugin) if node.plugin != Path() else None
         if plugin is None:
             continue
@@ -105,7 +105,7 @@ def _located(plugin: PluginFile, remarks: Iterable[Remark]) -> list[Problem]:
 
 
 def unread_variables(
-    draft: Draft, nodes: Sequence[Node], overrides: Sequence[str]
+    parsed: ParsedProject, nodes: Sequence[Node], overrides: Sequence[str]
 ) -> Iterator[Problem]:
     """Variables that ``--set`` gives to nodes, and that nothing of the project reads."""
     for text in overrides:
@@ -117,7 +117,7 @@ def unread_variables(
         node = next((node for node in nodes if node.name == steps[0]), None)
         if node is None or key.startswith(_KNOWN_PREFIXES) or _is_read_by_neuros(key):
             continue
-        plugin, sources = read_plugin(node.plugin), _sources(node, draft.roots.project)
+        plugin, sources = read_plugin(node.plugin), _sources(node, parsed.roots.project)
         if plugin is None or sources is None:
             continue
         word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)", re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""What a plugin declares, found out without running it.
+"""Hooks and ports that a plugin declares, read without running it.
 
 Only what is written as a literal is looked at. A name that is computed, a hook inside of an ``if``,
 a decorator of another library: of those nothing is said, here or in
@@ -82,7 +82,7 @@ class PluginFile:
 
     Attributes:
         hooks: those that are known.
-        mistakes: what would keep a node from starting, whatever its ports are.
+        mistakes: what would keep a node with any ports from starting.
         doubts: what may be a mistake.
         imports: the modules that it imports.
         texts: all text constants.
@@ -121,7 +121,7 @@ def _read(path: Path, *_: int) -> PluginFile:
     plugin, source = PluginFile(path), path.read_bytes()
     try:
         with _PARSING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of syntax: whoever runs it will hear them
+            warnings.simplefilter("ignore")  # of syntax: Python shows them when the plugin runs
             tree = ast.parse(source, str(path))
             compile(tree, str(path), "exec", dont_inherit=True)
     except SyntaxError as error:

@@ -1,4 +1,4 @@
-"""What a node may use of its machine: limits, and the things it is let in to."""
+"""Resource limits of a node, and the devices that its container may use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON that remembers where everything stands; :mod:`neuros.project.scanner` makes it."""
+"""JSON values with their positions in the file; :mod:`neuros.project.scanner` makes them."""
 
 from __future__ import annotations
 

@@ -11,13 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neuros.project.budgets import budgets_to_json
 from neuros.project.model import Budgets, Connection, Folders, Node, NodeFile, Port, Project
-from neuros.project.names import Names
+from neuros.project.names import Names, names_from, names_to_json
 from neuros.project.parameters import parameters_of, parameters_to_json
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
-from neuros.project.ros_graph_checks import names_from, names_to_json
 
 _NO_BUDGETS = Budgets()
 _ENDS = ("source_node", "source_output", "destination_node", "destination_input")
@@ -136,7 +134,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
 def node_files_from_json(contents: Iterable[Mapping[str, Any]]) -> list[NodeFile]:
     """Those of nodes that share a process.
 
-    A connection between two of them is one object for both, so that whoever looks it up finds it
+    A connection between two of them is one object for both, so that a look-up finds it
     without a comparison of all its fields.
     """
     files = [node_file_from_json(content) for content in contents]
@@ -158,7 +156,7 @@ def project_to_json(project: Project) -> dict[str, Any]:
     ]
     content["connections"] = [_connection_keys(c) for c in project.connections]
     content |= names_to_json(project.names)
-    if budgets := budgets_to_json(project.budgets):
+    if budgets := _budgets_to_json(project.budgets):
         content["budgets"] = budgets
     return content
 
@@ -230,3 +228,13 @@ def _written(node: Node, key: str, value: str) -> str:
     if key in node.environment_paths:
         return f"#{value}"
     return value[0] + value if value[:1] in ("#", "@") else value
+
+
+def _budgets_to_json(budgets: Budgets) -> dict[str, Any]:
+    """As a project file has them; only those that there are."""
+    content = {
+        "lost_packets": dict(budgets.lost_packets),
+        "real_time_factor": budgets.real_time_factor,
+        "tick_error_ms": budgets.tick_error_ms,
+    }
+    return {key: value for key, value in content.items() if value not in (None, {})}

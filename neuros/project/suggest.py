@@ -1,4 +1,4 @@
-"""Hints: what somebody may have meant who wrote something else."""
+"""Hints for misspelt names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the schema says of a project, in sentences; and whether its nodes fit into one process.
+"""Schema violations of a project, in sentences; and NEST nodes that cannot share a process.
 
 The schema is the only grammar of the configuration. What it cannot express (names that occur
 twice, connections that end nowhere) is in :mod:`neuros.project.checks`.
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import Problem
-from neuros.project.draft import Draft
 from neuros.project.model import Project
+from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import display_name, place_of
 from neuros.project.source import Element
 from neuros.project.suggest import did_you_mean, listed
@@ -33,11 +33,11 @@ _KINDS = {
 }
 
 
-def violations(draft: Draft) -> list[Problem]:
+def violations(parsed: ParsedProject) -> list[Problem]:
     """Everything in the files of a project that violates the schema."""
-    found = _violations_of(draft.root, "project")
-    for node in draft.nodes:
-        if node.source is not draft.root.source:
+    found = _violations_of(parsed.root, "project")
+    for node in parsed.nodes:
+        if node.source is not parsed.root.source:
             found += _violations_of(node, "node")
     return found
 

@@ -1,4 +1,4 @@
-"""For tests of plugins, and of the transports and back ends that NeuROS can be extended with.
+"""Test tools: a harness for plugins, and the suite of checks for transports.
 
 :class:`PluginHarness` runs one plugin on the real engine, without ROS processes and without a
 launcher; :class:`~neuros.testing.transports.TransportChecks` is the suite that every transport

@@ -1,10 +1,11 @@
-"""``PluginHarness``: one plugin on the real engine, where the test is everybody else."""
+"""``PluginHarness``: one plugin on the real engine; the test plays all other nodes."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import sys
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
@@ -13,17 +14,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import neuros
-from neuros.errors import WrongValue
+from neuros.distribution import WORKSPACE
+from neuros.errors import ProjectError, WrongValue
+from neuros.installation.progress import Progress
+from neuros.launch.node_command import without_mark
+from neuros.messages.needed import Messages
+from neuros.messages.workspace import Workspaces
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.testing.bench import NodeBench
-from neuros.testing.packages import provide_messages, workspaces_of
 from neuros.testing.wiring import ports, with_neighbours, with_observer
 from neuros.transport.messages import decode, encode, message_class
 from neuros.transport.values import checker
-
-_WORKSPACE = Path(neuros.__file__).resolve().parents[1] / "workspace"
 
 
 class PluginHarness(NodeBench):
@@ -116,7 +118,7 @@ class PluginHarness(NodeBench):
             file=path,
         )
         wires = with_neighbours(node, connections)
-        self._open(node, wires, path.parent, _WORKSPACE, run_folder)
+        self._open(node, wires, path.parent, WORKSPACE, run_folder)
 
     @classmethod
     def from_project(
@@ -126,7 +128,7 @@ class PluginHarness(NodeBench):
         *,
         environment: Mapping[str, str] | None = None,
         overrides: Sequence[str] = (),
-        workspace: Path = _WORKSPACE,
+        workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
     ) -> PluginHarness:
         """One node of a project, with the connections that it has there.
@@ -159,7 +161,7 @@ class PluginHarness(NodeBench):
         *,
         connections: Sequence[Connection] = (),
         environment: Mapping[str, str] | None = None,
-        workspace: Path = _WORKSPACE,
+        workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
@@ -313,3 +315,24 @@ def _temporary_folder_of(owner: object) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="neuros-"))
     weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+def workspaces_of(project: Path, workspace: Path) -> Workspaces:
+    """What a project in this folder sees besides the packages of ROS."""
+    return Workspaces(project.resolve() / "workspace", workspace, os.environ)
+
+
+def provide_messages(node: Node, workspaces: Workspaces) -> tuple[Path, ...]:
+    """Build what a node needs; returns where Python finds it from now on.
+
+    Raises:
+        ProjectError: with all mistakes in message files.
+        EnvironmentFault: if they cannot be built.
+    """
+    messages = Messages.of_nodes([node], workspaces)
+    if problems := messages.problems():
+        raise ProjectError(problems)
+    if not messages.is_made:
+        messages.make(Progress(sys.stderr), without_mark(os.environ))
+    sys.path[:0] = [path for path in map(str, messages.paths) if path not in sys.path]
+    return messages.paths

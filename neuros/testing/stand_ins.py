@@ -1,8 +1,9 @@
-"""What a plugin under test finds in place of ROS: real messages, a logger that remembers."""
+"""Stand-ins for ROS in tests of plugins: node, logger, transport, event loop and clock."""
 
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -10,13 +11,13 @@ from typing import Any, NamedTuple
 from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
-from neuros.testing.step_loop import StepLoop
 from neuros.transport.copying import copy_packet, make_packet
 from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode, message_class
 from neuros.transport.values import checker
 
+Event = Callable[[], None]
 _LEVELS = {
     "DEBUG": logging.DEBUG,
     "INFO": logging.INFO,
@@ -24,6 +25,87 @@ _LEVELS = {
     "ERROR": logging.ERROR,
     "FATAL": logging.CRITICAL,
 }
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
+
+
+class ManualClock:
+    """A monotonic clock in nanoseconds; it starts at 0."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+class StepLoop:
+    """Handles events in the order in which they were posted (:class:`neuros.ports.EventLoop`).
+
+    All packets travel through this one queue, so a loop-back needs no queue of its own to come
+    after everything that waits.
+    """
+
+    has_taken_in = True
+
+    def __init__(self, clock: ManualClock) -> None:
+        self._clock = clock
+        self._events: deque[Event] = deque()
+        self._timers: list[tuple[Callable[[], int | None], Event]] = []
+        self._is_stopping = False
+
+    @property
+    def has_waiting_events(self) -> bool:
+        """Whether events wait."""
+        return bool(self._events)
+
+    def post(self, event: Event) -> None:
+        """Handle ``event`` after all that already wait."""
+        self._events.append(event)
+
+    def post_loop_back(self, event: Event) -> None:
+        """Handle ``event`` after all that already wait."""
+        self._events.append(event)
+
+    def note_execution(self) -> None:
+        """Nothing has arrived meanwhile."""
+
+    def post_from_thread(self, event: Event) -> None:
+        """Handle ``event`` after all that wait; callable from any thread."""
+        self._events.append(event)
+
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
+        """Call ``on_due`` when :meth:`advance_to` reaches ``next_due_ns()``."""
+        self._timers.append((next_due_ns, on_due))
+
+    @property
+    def next_due_ns(self) -> int | None:
+        """When the next timer is due, ``None`` if none is."""
+        dues = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
+        return min(dues, default=None)
+
+    def advance_to(self, time_ns: int) -> None:
+        """Set the clock, and run the timers that are due then."""
+        self._clock.now_ns = time_ns
+        for next_due_ns, on_due in self._timers:
+            due_ns = next_due_ns()
+            if due_ns is not None and due_ns <= time_ns:
+                on_due()
+
+    def step(self) -> bool:
+        """Handle the oldest event; returns False if there was none."""
+        if self._is_stopping or not self._events:
+            return False
+        self._events.popleft()()
+        return True
+
+    def run(self) -> None:
+        """Handle events until none is left, or until :meth:`stop`."""
+        while self.step():
+            pass
+
+    def stop(self) -> None:
+        """Handle no further event."""
+        self._is_stopping = True
 
 
 class Record(NamedTuple):
@@ -69,9 +151,6 @@ class RecordingLogger:
         self._records.append(Record(severity, str(message)))
         self._python.log(_LEVELS[severity], "%s", message)
         return True
-
-
-_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class RosNodeStandIn:
@@ -162,7 +241,7 @@ class Topics:
         self.published.setdefault(port.name, []).append(decode(encode(packet)))
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Nobody else listens."""
+        """There are no other listeners."""
 
     def make_packet(self, type_name: str) -> Any:
         """A new message with default values."""

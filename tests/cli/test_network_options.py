@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.api.network import chosen_network
+from neuros.api.plan import chosen_network
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES_VARIABLE
 

@@ -9,7 +9,7 @@ import pytest
 
 from neuros.cli.main import main
 from neuros.doctor.delivery import PROJECT, prove_delivery
-from neuros.doctor.findings import State
+from neuros.doctor.machine_checks import State
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])

@@ -16,7 +16,7 @@ from test_transports import RosNetwork
 
 from neuros.launch.domain import choose_domain
 from neuros.project.model import NodeFile
-from neuros.testing.transport_bench import SERIES, TransportBench
+from neuros.testing.transports import SERIES, TransportBench
 from neuros.testing.wiring import wire
 from neuros.transport import large_packets
 
@@ -108,15 +108,15 @@ def segments() -> list[Path]:
 def exchange(bench: TransportBench, first: int, count: int) -> None:
     """Send large packets from a to b, one after another, and see them arrive."""
     (connection,) = bench.connections
-    transport, ear = bench.network.transport("a"), bench.ears["b"]
+    transport, inbox = bench.network.transport("a"), bench.inboxes["b"]
     for number in range(first, first + count):
         packet = transport.make_packet(SERIES)
         packet.data = array("d", [float(number)] * (1 << 15))
-        before = len(ear.packets.get(connection, ()))
+        before = len(inbox.packets.get(connection, ()))
         transport.send([connection], packet)
-        bench.wait(lambda before=before: len(ear.packets.get(connection, ())) > before)  # type: ignore[misc]
+        bench.wait(lambda before=before: len(inbox.packets.get(connection, ())) > before)  # type: ignore[misc]
         bench.acknowledge(connection, before + 1)
-        assert ear.packets[connection][-1] == packet
+        assert inbox.packets[connection][-1] == packet
 
 
 @pytest.mark.usefixtures("domain")

@@ -23,7 +23,7 @@ from containers import require_containers
 from neuros.cli.main import main
 from neuros.errors import WrongValue
 from neuros.project.model import Node, Port
-from neuros.testing.packages import provide_messages, workspaces_of
+from neuros.testing.harness import provide_messages, workspaces_of
 from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.messages import message_class

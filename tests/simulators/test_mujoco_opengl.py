@@ -16,8 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.doctor.findings import State
-from neuros.doctor.machine import prove_rendering
+from neuros.doctor.machine_checks import State, prove_rendering
 from neuros.installation import machine
 from neuros.simulators.mujoco import cameras
 
@@ -196,7 +195,7 @@ class TestDoctor:
     def test_opengl_that_is_not_there_need_not_be(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("neuros.doctor.machine.offscreen_opengl", lambda: "")
+        monkeypatch.setattr("neuros.doctor.machine_checks.offscreen_opengl", lambda: "")
         finding = prove_rendering(without(EGL + OSMESA, tmp_path))
         assert finding.state is State.ABSENT
         assert "neither EGL" in finding.text

@@ -7,8 +7,7 @@ from typing import Any
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.testing.stand_ins import Topics, Workbench
-from neuros.testing.step_loop import ManualClock, StepLoop
+from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench
 from neuros.testing.transports import TransportChecks
 
 

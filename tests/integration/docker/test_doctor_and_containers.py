@@ -8,9 +8,8 @@ import pytest
 
 from containers import require_containers
 from neuros.cli.main import main
-from neuros.doctor.containers import look_at_containers
 from neuros.doctor.delivery import prove_delivery
-from neuros.doctor.findings import State
+from neuros.doctor.machine_checks import State, look_at_containers
 
 
 @pytest.fixture(autouse=True)

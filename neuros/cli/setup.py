@@ -1,24 +1,24 @@
-"""``neuros containers``: builds the images that nodes run in, shows and removes them."""
+"""``neuros build``, ``containers`` and ``doctor``: prepare this machine for runs, and check it."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
+    from neuros.doctor.machine_checks import Finding
     from neuros.launch.docker.recipes import Recipe
 
 STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
 """What the examples need."""
-
-_EPILOG = """\
+_CONTAINERS_EPILOG = """\
 exit codes:
   0    done
   2    wrong usage
@@ -26,6 +26,68 @@ exit codes:
   4    no engine, or an image cannot be built: nothing half-built gets a name
   130  ended by Ctrl+C
 """
+_DOCTOR_EPILOG = """\
+exit codes:
+  0    nothing is wrong
+  4    something is: the lines that begin with PROBLEM say what, and what to do
+"""
+
+
+def add_build(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    build = commands.add_parser(
+        "build",
+        help="build message packages",
+        description="Build the ROS packages with messages, services and actions of a workspace"
+        " that are not built yet, and those of NeuROS's own. Launching a project does it, too.",
+        epilog="exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
+        " with its line, 4 no compiler, or it fails",
+    )
+    build.add_argument("packages", nargs="*", metavar="PACKAGE", help="these only (default: all)")
+    build.add_argument(
+        "-p",
+        "--project",
+        metavar="PROJECT",
+        help="whose workspace, a folder beside the project file (default: that of this folder)",
+    )
+    # For install.py: a machine without a compiler can do all the rest.
+    build.add_argument("--if-compiler", action="store_true", help=argparse.SUPPRESS)
+    build.set_defaults(command=_build)
+
+
+def _build(options: argparse.Namespace) -> int:
+    from neuros.api.loading import workspaces_of
+    from neuros.cli.environments import build_messages
+    from neuros.distribution import WORKSPACE
+    from neuros.messages.compilation import Compilers
+    from neuros.messages.needed import Messages
+    from neuros.project.suggest import did_you_mean
+
+    project = Path(options.project or os.curdir)
+    if not project.exists():
+        raise UsageError(f"build: there is no project {project}")
+    workspaces = workspaces_of(project)
+    for name in options.packages:
+        if name not in workspaces.packages and not workspaces.problems:
+            hint = did_you_mean(name, workspaces.packages) or "it needs a package.xml and msg/*.msg"
+            raise UsageError(f"build: no workspace has a message package '{name}' ({hint})")
+    messages = Messages(workspaces, options.packages or workspaces.packages)
+    if problems := [*messages.problems(), *workspaces.problems]:
+        raise ProjectError(problems)
+    if options.if_compiler and not messages.is_made:
+        try:
+            Compilers.here()
+        except EnvironmentFault as fault:
+            print(f"message packages are not built: {fault}")
+            return 0
+    if ended := build_messages(messages):
+        return ended
+    for built in messages.built:
+        print(f"messages of {built.package} are built: {built.folder}")
+    if not messages.built:
+        folder = project if project.is_dir() else project.parent
+        print(f"no message packages in {folder / 'workspace'} and {WORKSPACE}")
+    return 0
 
 
 def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -34,7 +96,7 @@ def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]
         "containers",
         help="build, list and remove the images that nodes run in",
         description="Build, list and remove the images that nodes run in.",
-        epilog=_EPILOG,
+        epilog=_CONTAINERS_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = containers.add_subparsers(title="actions", metavar="ACTION", required=True)
@@ -57,11 +119,11 @@ def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     build.add_argument(
         "--if-engine", action="store_true", help="where there is no engine, say so, and that is all"
     )
-    build.set_defaults(command=_build)
-    actions.add_parser("list", help="show NeuROS's images").set_defaults(command=_list)
+    build.set_defaults(command=_build_images)
+    actions.add_parser("list", help="show NeuROS's images").set_defaults(command=_list_images)
     remove = actions.add_parser("remove", help="remove images that NeuROS has built")
     remove.add_argument("names", nargs="*", metavar="NAME", help="of containers (default: all)")
-    remove.set_defaults(command=_remove)
+    remove.set_defaults(command=_remove_images)
 
 
 def add_build_options(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +141,7 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
     add("--pull", action="store_true", help="ask for the newest version of base images")
 
 
-def _build(options: argparse.Namespace) -> int:
+def _build_images(options: argparse.Namespace) -> int:
     from neuros.installation.progress import Progress
     from neuros.launch.docker.building import ImageBuilder, Wishes
     from neuros.launch.docker.context import served, surroundings
@@ -112,7 +174,7 @@ def _build(options: argparse.Namespace) -> int:
     return 0
 
 
-def _list(options: argparse.Namespace) -> int:
+def _list_images(options: argparse.Namespace) -> int:
     from neuros.launch.containers import OWN_FOLDER
     from neuros.launch.docker.engine import connect
     from neuros.launch.docker.inventory import inventory
@@ -130,7 +192,7 @@ def _list(options: argparse.Namespace) -> int:
     return 0
 
 
-def _remove(options: argparse.Namespace) -> int:
+def _remove_images(options: argparse.Namespace) -> int:
     from neuros.launch.docker.engine import connect
     from neuros.launch.docker.inventory import remove_images
 
@@ -163,7 +225,7 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
-    from neuros.api.workspace import WORKSPACE
+    from neuros.distribution import WORKSPACE
     from neuros.launch.containers import OWN_FOLDER
     from neuros.launch.docker.recipes import names_in
     from neuros.project.load import load_project
@@ -200,3 +262,50 @@ def _file_or_folder(text: str | None, option: str, *, is_folder: bool) -> Path |
 def _cache() -> Path:
     """Where NeuROS keeps what it can make again."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"
+
+
+def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    doctor = commands.add_parser(
+        "doctor",
+        help="check this machine, and prove that packets arrive",
+        description="Check what runs need of this machine, and prove with packets between two"
+        " nodes that they can talk, on each back end that there is.",
+        epilog=_DOCTOR_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    doctor.add_argument(
+        "--no-delivery", action="store_true", help="only look: start no nodes and no containers"
+    )
+    doctor.set_defaults(command=_doctor)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from neuros.doctor.machine_checks import State
+
+    is_well = True
+    for finding in _findings(proves=not options.no_delivery):
+        print(finding, flush=True)  # the proofs take seconds
+        is_well &= finding.state is not State.BAD
+    return 0 if is_well else 4
+
+
+def _findings(*, proves: bool) -> Iterator[Finding]:
+    from neuros.doctor.delivery import prove_delivery
+    from neuros.doctor.machine_checks import (
+        State,
+        look_at_containers,
+        look_at_machine,
+        prove_rendering,
+    )
+
+    yield from look_at_machine(os.environ)
+    yield prove_rendering(os.environ)
+    has_base = False
+    for finding in look_at_containers(STANDARD, os.environ):
+        has_base |= finding.state is State.GOOD and finding.text.startswith("neuros_python:")
+        yield finding
+    if not proves:
+        return
+    for backend in ("in-process", "process", *(["docker"] if has_base else [])):
+        yield prove_delivery(backend)

@@ -1,4 +1,4 @@
-"""What runs need of the machine itself: Python, packages, memory, a domain, screens, OpenGL."""
+"""Checks of Python, packages, memory, ROS domain, display, OpenGL and Docker on this machine."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from enum import Enum
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.doctor.findings import Finding, absent, bad, good
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
 from neuros.launch.domain import choose_domain
@@ -28,6 +30,50 @@ _EXTRAS = (
 )
 _GPU_TIMEOUT_S = 10.0
 _RENDERING_TIMEOUT_S = 60.0
+
+
+class State(Enum):
+    """How good a finding is."""
+
+    GOOD = "ok"
+    ABSENT = "-"
+    """Something that is not there and need not be."""
+    BAD = "PROBLEM"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        subject: what was looked at, "Python".
+        text: what was found.
+        remedy: what to do about it, where there is something to do.
+    """
+
+    state: State
+    subject: str
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        remedy = f": {self.remedy}" if self.remedy else ""
+        return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
+
+
+def good(subject: str, text: str) -> Finding:
+    """It is as it should be."""
+    return Finding(State.GOOD, subject, text)
+
+
+def absent(subject: str, text: str, remedy: str = "") -> Finding:
+    """It is not there, and projects run without it."""
+    return Finding(State.ABSENT, subject, text, remedy)
+
+
+def bad(subject: str, text: str, remedy: str = "") -> Finding:
+    """Projects do not run, or not well, because of it."""
+    return Finding(State.BAD, subject, text, remedy)
 
 
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
@@ -127,3 +173,37 @@ def _gpu() -> Finding:
     except (OSError, subprocess.SubprocessError) as error:
         return bad("GPU", f"nvidia-smi fails ({error})", "mend the driver")
     return good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))
+
+
+def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
+    """The engine and, if it answers, the images of containers of NeuROS's own."""
+    if find_spec("docker") is None:
+        yield absent("Docker", "its Python package is not installed", "run ./install.py")
+        return
+    from neuros.launch.docker.engine import connect, engine_faults
+    from neuros.launch.docker.images import image_for
+
+    try:
+        engine = connect(environ)
+    except EnvironmentFault as fault:
+        yield absent("Docker", str(fault))
+        return
+    with closing(engine):
+        try:
+            with engine_faults("the engine"):
+                version = engine.version()
+            yield good("Docker", f"engine {version['Version']}, API {version['ApiVersion']}")
+        except EnvironmentFault as fault:
+            yield bad("Docker", str(fault))
+            return
+        for name in names:
+            try:
+                image = image_for(name, None, engine)
+            except EnvironmentFault as fault:
+                yield absent("image", str(fault))
+                continue
+            python = "{}.{}".format(*image.python_version)
+            if image.notice:
+                yield absent("image", image.notice)
+            else:
+                yield good("image", f"{image.name}, Python {python}")

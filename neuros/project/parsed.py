@@ -1,4 +1,4 @@
-"""A project as its files say it: read, put together, and not judged yet."""
+"""Parsed project: the JSON of its files, node files merged in, before validation."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from neuros.errors import Problem
+from neuros.project.names import Names, names_from
 from neuros.project.paths import PathError, Roots
 from neuros.project.scanner import SourceError, display_name, read_file
 from neuros.project.source import Element
 
+ENDS = ("source_node", "source_output", "destination_node", "destination_input")
+"""The keys of a connection that name its ends."""
+
 
 @dataclass
-class Draft:
+class ParsedProject:
     """The elements of a project's files, with node files in the place of their paths.
 
     Attributes:
         root: the document of the project file.
         nodes: the objects that describe nodes, in order.
         entries: for each of them, the entry of the project file that it comes from.
-        is_complete: whether every entry of ``nodes`` could be read; where it could not, nobody
-            knows which nodes are missing.
+        is_complete: whether every entry of ``nodes`` could be read; if not, the missing nodes
+            are unknown.
         problems: what was wrong while reading.
     """
 
@@ -37,50 +41,63 @@ class Draft:
         return [item for item in self.root.items("connections") if isinstance(item.value, dict)]
 
 
-def read_draft(file: Path, roots: Roots) -> Draft:
+def parse_project(file: Path, roots: Roots) -> ParsedProject:
     """Read a project file and its node files. Raises :class:`SourceError` for the first only."""
     root, duplicates = read_file(file)
     nodes = root.member("nodes")
     is_list = nodes is not None and isinstance(nodes.value, list)
-    draft = Draft(root, roots, is_complete=is_list, problems=duplicates)
+    parsed = ParsedProject(root, roots, is_complete=is_list, problems=duplicates)
     for entry in root.items("nodes"):
-        _expand(draft, entry, (file,))
-        draft.entries += [entry] * (len(draft.nodes) - len(draft.entries))
-    return draft
+        _expand(parsed, entry, (file,))
+        parsed.entries += [entry] * (len(parsed.nodes) - len(parsed.entries))
+    return parsed
 
 
-def _expand(draft: Draft, entry: Element, chain: tuple[Path, ...]) -> None:
+def _expand(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> None:
     """Add the node, or nodes, of an entry; ``chain`` is the files that lead to it."""
     if isinstance(entry.value, dict):
-        draft.nodes.append(entry)
+        parsed.nodes.append(entry)
     elif isinstance(entry.value, list) and len(chain) > 1:
         for item in entry.value:
-            _expand(draft, item, chain)
+            _expand(parsed, item, chain)
     elif isinstance(entry.value, str) and entry.value:
-        _import(draft, entry, chain)
+        _import(parsed, entry, chain)
     else:
-        draft.is_complete = False
+        parsed.is_complete = False
         if len(chain) > 1:
-            draft.problems.append(
+            parsed.problems.append(
                 entry.problem(
                     "a node file holds a node, the path of another node file, or a list of both"
                 )
             )
 
 
-def _import(draft: Draft, entry: Element, chain: tuple[Path, ...]) -> None:
+def _import(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> None:
     try:
-        file = draft.roots.find(entry.value, entry.source.folder)
+        file = parsed.roots.find(entry.value, entry.source.folder)
         if file in chain:
             loop = " -> ".join(display_name(link) for link in (*chain[chain.index(file) :], file))
             raise PathError(f"node files import each other in a circle: {loop}")
         element, duplicates = read_file(file)
     except PathError as error:
-        draft.problems.append(entry.problem(error.text, error.hint))
-        draft.is_complete = False
+        parsed.problems.append(entry.problem(error.text, error.hint))
+        parsed.is_complete = False
     except SourceError as error:
-        draft.problems.append(error.problem)
-        draft.is_complete = False
+        parsed.problems.append(error.problem)
+        parsed.is_complete = False
     else:
-        draft.problems.extend(duplicates)
-        _expand(draft, element, (*chain, file))
+        parsed.problems.extend(duplicates)
+        _expand(parsed, element, (*chain, file))
+
+
+def names_of(parsed: ParsedProject) -> Names:
+    """The namespace and rules of a project; what has the wrong form is passed over."""
+    namespace = parsed.root.string("namespace") or ""
+    return names_from(namespace, rules_of(parsed.root.member("remap")))
+
+
+def rules_of(remap: Element | None) -> dict[str, str]:
+    """The rules of a project's ``"remap"`` that have the right form."""
+    if remap is None or not isinstance(remap.value, dict):
+        return {}
+    return {old: new.value for old, new in remap.value.items() if isinstance(new.value, str)}

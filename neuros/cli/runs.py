@@ -1,0 +1,342 @@
+"""Commands about runs: ``ps``, ``stop``, ``report``, ``compare``, ``verify`` and ``bag``."""
+
+from __future__ import annotations
+
+import argparse
+import pwd
+import sys
+import time
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.launch.sessions import Session, sessions
+from neuros.launch.shared_memory import remove_dead_runs
+
+if TYPE_CHECKING:
+    from neuros.observe.review.run import Run
+
+EXIT_DIFFERENT = 1
+EXIT_UNKNOWN = EXIT_LEFT_OUT = 2
+EXIT_DAMAGED = 4
+_PAGE = "report.html"
+_SHOWN = 8  # digits of a run's id
+_AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
+_GIVE_UP_S = 30.0
+_POLL_S = 0.05
+
+
+def add_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add both commands to the parser."""
+    ps = commands.add_parser(
+        "ps",
+        help="show the runs of this user",
+        description="Show the nodes of all runs of this user on this machine; for root, of all"
+        " users.",
+    )
+    ps.set_defaults(command=_ps)
+    stop = commands.add_parser(
+        "stop",
+        help="stop a run, as Ctrl+C does",
+        description="Stop runs of this user, as Ctrl+C in their terminal does, and wait for it."
+        " Root stops a run of another user by its id alone.",
+    )
+    stop.add_argument(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help="as `neuros ps` shows it (its first digits are enough), or a project; can be left out"
+        " where there is one run only",
+    )
+    stop.add_argument("--all", action="store_true", help="stop all runs of this user")
+    stop.set_defaults(command=_stop)
+
+
+def _ps(_: argparse.Namespace) -> int:
+    found = sessions()
+    if not found:
+        print("nothing is running")
+        return 0
+    from tabulate import tabulate
+
+    shows_users = not all(session.is_own for session in found)
+    users = ["user"] if shows_users else []
+    rows = [row for session in found for row in _rows(session, shows_users=shows_users)]
+    print(tabulate(rows, headers=["run", *users, "project", "node", "back end", "since", "state"]))
+    return 0
+
+
+def _rows(session: Session, *, shows_users: bool) -> list[list[str]]:
+    since = datetime.fromtimestamp(session.since).strftime("%Y-%m-%d %H:%M:%S")
+    users = [_user_name(session.user)] if shows_users else []
+    head = [session.run[:_SHOWN], *users, session.project]
+    prefix = f"{session.namespace}/" if session.namespace else ""
+    return [
+        [*head, prefix + node, session.backend, since, state]
+        for node, state in session.states().items()
+    ]
+
+
+def _user_name(user: int) -> str:
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return str(user)
+
+
+def _stop(options: argparse.Namespace) -> int:
+    found = sessions()
+    chosen = _chosen(options.runs, found, is_all=options.all)
+    if not chosen:
+        print("no run of yours goes on" if found else "nothing is running")
+    for session in chosen:
+        session.interrupt()
+    _await_end(chosen)
+    for session in chosen:
+        print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
+    for name in remove_dead_runs():
+        print(f"removed {name} from shared memory: its run was killed, and its reaper, too")
+    return 0
+
+
+def _chosen(names: Sequence[str], found: Sequence[Session], *, is_all: bool) -> Sequence[Session]:
+    own = [session for session in found if session.is_own]
+    if is_all or (not names and len(own) <= 1):
+        return own
+    shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in own)
+    if not names:
+        raise UsageError(f"several runs: name one of {shown}, or give --all")
+    for name in names:
+        if not any(_is_named(session, name) for session in found):
+            raise UsageError(f"no run of yours is called '{name}'; there are {shown or 'none'}")
+    return [session for session in found if any(_is_named(session, name) for name in names)]
+
+
+def _is_named(session: Session, name: str) -> bool:
+    is_project = session.project == name and session.is_own
+    return is_project or (bool(name) and session.run.startswith(name))
+
+
+def _await_end(chosen: Sequence[Session]) -> None:
+    """Until the reapers have gone, and with them all that they guard."""
+    begin_s = time.monotonic()
+    waiting, has_insisted = {session.run for session in chosen}, False
+    while waiting := waiting & {session.run for session in sessions()}:
+        waited_s = time.monotonic() - begin_s
+        if waited_s > _AGAIN_S and not has_insisted:
+            has_insisted = True
+            for session in chosen:
+                if session.run in waiting:
+                    session.interrupt()  # the second one kills at once
+        if waited_s > _GIVE_UP_S:
+            left = ", ".join(sorted(run[:_SHOWN] for run in waiting))
+            raise EnvironmentFault(f"not ended after {_GIVE_UP_S:g} s: {left}: see `neuros ps`")
+        time.sleep(_POLL_S)
+
+
+def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the commands."""
+    report = commands.add_parser(
+        "report",
+        help="what limited a run, and figures of it",
+        description="Say what limited the speed of a run, and write a page (HTML, one file) with"
+        " figures, and the figures themselves (PNG).",
+    )
+    report.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    report.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="where to write (default: RUN/report)"
+    )
+    report.set_defaults(command=_report)
+    compare = commands.add_parser(
+        "compare",
+        help="runs side by side",
+        description="Print the figures of several runs side by side. What is no run is named and"
+        " left out (exit code 2).",
+    )
+    compare.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
+    compare.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="write a page (HTML) as well"
+    )
+    compare.set_defaults(command=_compare)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from neuros.observe.review.findings import findings_of
+    from neuros.observe.review.page import report_page
+    from neuros.observe.review.run import open_for_review
+
+    run = open_for_review(options.run)
+    findings = findings_of(run)
+    print(findings.headline)
+    for line in (*findings.reasons, *findings.gains):
+        print(f"  {line}")
+    if findings.trial:
+        print(f"  To test it: {findings.trial}")
+    for line in run.missing:
+        print(f"missing: {line}")
+    figures = _figures(run)
+    folder = options.output or options.run / "report"
+    text = report_page(run, findings, {t: (text, data) for t, text, data in figures.values()})
+    files = {f"{name}.png": data for name, (_, _, data) in figures.items()}
+    _write(folder, {**files, _PAGE: text.encode()})
+    print(f"{folder / _PAGE}: {len(figures)} figures")
+    return 0
+
+
+def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
+    from neuros.observe.review.page import figures_of
+
+    try:
+        return figures_of(run)
+    except ModuleNotFoundError as error:
+        raise _no_matplotlib(error) from error
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from neuros.observe.review.comparison import comparison_rows, comparison_table, labels_of
+
+    runs, refused = _readable(options.runs)
+    header, rows = comparison_rows(runs)
+    print(comparison_table(header, rows))
+    for run, label in zip(runs, labels_of(runs), strict=True):
+        for line in run.missing:
+            print(f"missing in {label}: {line}")
+    if options.output is not None:
+        _write(options.output.parent, {options.output.name: _comparison(runs, header, rows)})
+        print(options.output)
+    for error in refused:
+        print(f"neuros: left out: {error}", file=sys.stderr)
+    return EXIT_LEFT_OUT if refused else 0
+
+
+def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
+    """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
+    from neuros.observe.review.run import open_for_review
+
+    runs, refused = [], []
+    for folder in folders:
+        try:
+            runs.append(open_for_review(folder))
+        except UsageError as error:
+            refused.append(error)
+    if not runs:
+        raise UsageError("\n".join(map(str, refused)))
+    return runs, refused
+
+
+def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> bytes:
+    from neuros.observe.review.comparison import comparison_figure, labels_of
+    from neuros.observe.review.findings import findings_of
+    from neuros.observe.review.page import bottleneck_part, figure_part, page, png, table_part
+
+    parts = [
+        bottleneck_part(findings_of(run), f"The bottleneck of {label}")
+        for run, label in zip(runs, labels_of(runs), strict=True)
+    ]
+    try:
+        figure = comparison_figure(runs)
+    except ModuleNotFoundError as error:
+        raise _no_matplotlib(error) from error
+    if figure is not None:
+        parts.append(figure_part("Side by side", "", png(figure)))
+    parts.append(table_part("All figures", header, rows))
+    return page("Comparison of runs", parts).encode()
+
+
+def _no_matplotlib(error: ModuleNotFoundError) -> EnvironmentFault:
+    return EnvironmentFault(
+        f"figures need {error.name}, which this Python has not: pip install 'neuros[plot]'"
+    )
+
+
+def _write(folder: Path, files: dict[str, bytes]) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            (folder / name).write_bytes(data)
+    except OSError as error:
+        raise EnvironmentFault(
+            f"{folder} could not be written to ({error.strerror}): name another place with -o"
+        ) from error
+
+
+def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    verify = commands.add_parser(
+        "verify",
+        help="compare the packets of two runs",
+        description="Say whether two runs carried the same packets, or where they parted first:"
+        " connection, packet, and, where both were recorded, field.",
+        epilog="exit codes: 0 identical, 1 different, 2 nothing to compare",
+    )
+    verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
+    verify.add_argument("run_b", metavar="RUN_B", type=Path, help="another one")
+    verify.set_defaults(command=_verify)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from neuros.observe.difference import compare
+    from neuros.observe.recorded_packets import RecordedPackets
+    from neuros.observe.run_record import open_run
+
+    a, b = open_run(options.run_a), open_run(options.run_b)
+    recorded = RecordedPackets()
+    verdict = compare(a, b, recorded)
+    for remark in (*recorded.remarks, *verdict.remarks):
+        print(f"note: {remark}")
+    if verdict.difference is not None:
+        print(f"different: {verdict.difference}")
+        return EXIT_DIFFERENT
+    if not verdict.compared and verdict.remarks:
+        print("unknown: there is nothing to compare")
+        return EXIT_UNKNOWN
+    print(f"identical: {verdict.compared} packet{'' if verdict.compared == 1 else 's'}")
+    return 0
+
+
+def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the grammar."""
+    bag = commands.add_parser(
+        "bag",
+        help="show or complete what a run has recorded",
+        description="Show what a run has recorded, or complete the bag of a run that was cut off.",
+    )
+    actions = bag.add_subparsers(title="actions", metavar="ACTION", required=True)
+    info = actions.add_parser("info", help="show the topics of a bag")
+    info.add_argument("run", metavar="RUN", help="the run folder, or a bag")
+    info.set_defaults(command=_info)
+    repair = actions.add_parser(
+        "repair",
+        help="complete the bag of a run that was killed",
+        description="Put the packets that had not reached the bag into it, and complete its files.",
+    )
+    repair.add_argument("run", metavar="RUN", help="the run folder")
+    repair.set_defaults(command=_repair)
+
+
+def _info(options: argparse.Namespace) -> int:
+    from tabulate import tabulate
+
+    from neuros.observe.bag.bag_reader import open_bag
+
+    with open_bag(options.run) as opened:
+        rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
+        print(tabulate(rows, headers=["topic", "type", "packets"], disable_numparse=True))
+        print(f"\n{opened.folder}: {opened.duration_s:.2f} s, project {opened.project or '?'}")
+    if opened.damage is None:
+        return 0
+    print(f"neuros: {opened.damage}", file=sys.stderr)
+    return EXIT_DAMAGED
+
+
+def _repair(options: argparse.Namespace) -> int:
+    from neuros.observe.recording.repair import repair
+
+    counts = repair(Path(options.run), lambda text: print(f"neuros: {text}", file=sys.stderr))
+    if counts is None:
+        print(f"{options.run}: the bag is complete")
+    else:
+        print(f"{options.run}: completed, {sum(counts.values())} packets on {len(counts)} topics")
+    return 0
