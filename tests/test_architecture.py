@@ -1,6 +1,6 @@
-"""The house has floors: a room imports only from the floors below its own.
+"""A package imports only from layers below its own.
 
-The table is that of the architecture; ``neuros.launch.supervisor`` is a room of its own, above the
+The table is that of the architecture; ``neuros.launch.supervisor`` is a package of its own, above the
 back ends that it starts through their port.
 """
 
@@ -20,10 +20,10 @@ FILES = sorted((ROOT / "neuros").rglob("*.py"))
 
 
 @dataclass(frozen=True)
-class Room:
-    """A part of ``neuros``: the modules it consists of, and its floor."""
+class Package:
+    """A part of ``neuros``: the modules it consists of, and its layer."""
 
-    floor: int
+    layer: int
     modules: tuple[str, ...]
 
     def holds(self, module: str) -> bool:
@@ -51,35 +51,35 @@ SUPERVISOR = (
     "stall_detector",
 )
 
-# The first room that holds a module is its room.
-ROOMS = (
-    Room(0, ("errors", "distribution")),
-    Room(1, ("hooks",)),
-    Room(1, ("project",)),
-    Room(2, ("core",)),
-    Room(3, ("ports", "control", "stacks")),
-    Room(3, ("convert",)),
-    Room(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
-    Room(4, ("launch",)),
-    Room(4, ("transport",)),
-    Room(4, ("simulators",)),
-    Room(4, ("observe",)),
-    Room(4, ("visualise",)),
-    Room(4, ("dashboard", "views")),
-    Room(4, ("snn",)),
-    Room(4, ("tf",)),
-    Room(5, ("runtime",)),
-    Room(4, ("messages",)),
-    Room(6, ("api",)),
-    Room(7, ("cli", "doctor", "replay")),
-    Room(6, ("bag",)),
-    Room(6, ("testing",)),
-    Room(1, ("installation",)),
-    Room(1, ("caching",)),
+# The first one that holds a module counts.
+PACKAGES = (
+    Package(0, ("errors", "distribution")),
+    Package(1, ("hooks",)),
+    Package(1, ("project",)),
+    Package(2, ("core",)),
+    Package(3, ("ports", "control", "stacks")),
+    Package(3, ("convert",)),
+    Package(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
+    Package(4, ("launch",)),
+    Package(4, ("transport",)),
+    Package(4, ("simulators",)),
+    Package(4, ("observe",)),
+    Package(4, ("visualise",)),
+    Package(4, ("dashboard", "views")),
+    Package(4, ("snn",)),
+    Package(4, ("tf",)),
+    Package(5, ("runtime",)),
+    Package(4, ("messages",)),
+    Package(6, ("api",)),
+    Package(7, ("cli", "doctor", "replay")),
+    Package(6, ("bag",)),
+    Package(6, ("testing",)),
+    Package(1, ("installation",)),
+    Package(1, ("caching",)),
 )
-# The package itself holds public names; every room may ask it for the version. Those of the room
+# neuros itself holds public names; every package may ask it for the version. Those of the package
 # ``api`` it imports when they are asked for.
-PUBLIC_NAMES = Room(2, ("",))
+PUBLIC_NAMES = Package(2, ("",))
 PUBLIC_NAMES_OF_API = ("Project", "Run", "sweep")
 PORTS = 3
 
@@ -88,7 +88,7 @@ MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
 GENERATORS = {f"rosidl_generator_{name}" for name in ("c", "py", "type_description")}
 GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "introspection_c")}
 GENERATORS |= {"rosidl_adapter"}
-# What is not named here has none; a part of a room may have less than the room.
+# What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
     "transport": {"numpy", "rclpy", "rosidl_parser", "rpyutils", "xxhash"} | MESSAGES,
@@ -123,13 +123,13 @@ THIRD_PARTY: dict[str, set[str]] = {
 NOT_IN_THE_CORE = {"threading", "multiprocessing", "asyncio", "time", "socket", "os", "subprocess"}
 
 
-def room_of(module: str) -> Room | None:
-    """The room of ``neuros.<module>``; the package itself is ``""``."""
+def package_of(module: str) -> Package | None:
+    """The package of ``neuros.<module>``; the package itself is ``""``."""
     if not module:
         return PUBLIC_NAMES
     if module in PUBLIC_NAMES_OF_API:
         module = "api"
-    return next((room for room in ROOMS if room.holds(module)), None)
+    return next((package for package in PACKAGES if package.holds(module)), None)
 
 
 def third_party_of(module: str) -> set[str]:
@@ -158,24 +158,24 @@ def imports_of(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
 
 def complaint(importer: str, imported: str) -> str | None:
     """Why ``neuros.<importer>`` must not import the absolute name ``imported``."""
-    room, (top, _, inner) = room_of(importer), imported.partition(".")
-    assert room is not None, f"neuros.{importer} belongs to no room: add it to ROOMS"
+    package, (top, _, inner) = package_of(importer), imported.partition(".")
+    assert package is not None, f"neuros.{importer} belongs to no package: add it to PACKAGES"
     if top != "neuros":
-        if room.holds("core") and top in NOT_IN_THE_CORE:
+        if package.holds("core") and top in NOT_IN_THE_CORE:
             return f"core knows no {top}"
         is_allowed = top in sys.stdlib_module_names or top in third_party_of(importer)
         return None if is_allowed else f"the third-party package {top} is not for it"
-    other = room_of(inner)
-    if other is None or other in (room, PUBLIC_NAMES):
+    other = package_of(inner)
+    if other is None or other in (package, PUBLIC_NAMES):
         return None
-    if room is PUBLIC_NAMES and other.holds("api"):
+    if package is PUBLIC_NAMES and other.holds("api"):
         return None
-    if room.holds("installation"):
+    if package.holds("installation"):
         return None if other.holds("errors") else "the installation knows nothing but errors"
-    if other.floor >= room.floor:
-        return f"{other} is on floor {other.floor}, not below {room.floor}"
-    if room.floor == 5 and other.floor > PORTS:
-        return f"{room} sees ports only, and {other} is an adapter"
+    if other.layer >= package.layer:
+        return f"{other} is on layer {other.layer}, not below {package.layer}"
+    if package.layer == 5 and other.layer > PORTS:
+        return f"{package} sees ports only, and {other} is an adapter"
     return None
 
 
@@ -207,20 +207,20 @@ def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
     [
         ("neuros.core.engine", "import rclpy", "third-party package rclpy"),
         ("neuros.core.engine", "import time", "knows no time"),
-        ("neuros.core.engine", "from neuros import transport", "transport is on floor 4"),
-        ("neuros.core.engine", "from ..ports import Clock", "ports is on floor 3"),
-        ("neuros.runtime.node", "from neuros import Project", "api is on floor 6"),
-        ("neuros.hooks", "def f():\n    import neuros.project.model", "project is on floor 1"),
+        ("neuros.core.engine", "from neuros import transport", "transport is on layer 4"),
+        ("neuros.core.engine", "from ..ports import Clock", "ports is on layer 3"),
+        ("neuros.runtime.node", "from neuros import Project", "api is on layer 6"),
+        ("neuros.hooks", "def f():\n    import neuros.project.model", "project is on layer 1"),
         ("neuros.project.load", "import jsonschema", "third-party package jsonschema"),
-        ("neuros.transport.ros", "from neuros.launch import console", "launch is on floor 4"),
+        ("neuros.transport.ros", "from neuros.launch import console", "launch is on layer 4"),
         ("neuros.transport.memory", "import rclpy", "third-party package rclpy"),
         ("neuros.runtime.node", "from neuros.transport.ros import x", "sees ports only"),
         ("neuros.launch.supervisor", "from neuros.launch.console import x", "sees ports only"),
-        ("neuros.launch.console", "from neuros.launch.supervisor import x", "on floor 5"),
+        ("neuros.launch.console", "from neuros.launch.supervisor import x", "on layer 5"),
         ("neuros.simulators.mujoco.sensors", "import nest", "third-party package nest"),
         ("neuros.snn.decoding", "import nest", "third-party package nest"),
         ("neuros.installation.machine", "from neuros.hooks import All", "nothing but errors"),
-        ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on floor 7"),
+        ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on layer 7"),
     ],
 )
 def test_an_import_that_breaks_the_table_is_named_with_its_line(
