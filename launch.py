@@ -24,7 +24,7 @@ def clean_environment():
 
     There are two sorts: a sourced distribution (AMENT_PREFIX_PATH), and the parent's own .venv.
     The mark keeps the ROS wheels from starting Python once more for their libraries: launching
-    needs none of them. Nodes get both anew (neuros/launch/node_command.py).
+    needs none of them. Nodes get both anew (neuros/backends/node_command.py).
     """
     environment = dict(os.environ)
     if environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None):

@@ -13,8 +13,8 @@ from typing import IO
 
 from benchmarks.machine import ROOT
 from benchmarks.measure import Unavailable
-from neuros.launch.domain import choose_domain
-from neuros.launch.placement import children_on, usable_cores
+from neuros.backends.domain import choose_domain
+from neuros.backends.placement import children_on, usable_cores
 
 END_S = 5.0
 

@@ -15,9 +15,9 @@ import tempfile
 from pathlib import Path
 
 import neuros
-from neuros.observe.review.page import png
-from neuros.observe.review.run import open_for_review
-from neuros.observe.review.timeline import timeline_figure
+from neuros.analysis.review.page import png
+from neuros.analysis.review.run import open_for_review
+from neuros.analysis.review.timeline import timeline_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"

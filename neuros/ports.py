@@ -1,6 +1,6 @@
 """All seams of NeuROS on one page.
 
-The engine (:mod:`neuros.core`) knows nothing of ROS, processes or physics. The rest of
+The engine (:mod:`neuros.engine`) knows nothing of ROS, processes or physics. The rest of
 the world stands behind these protocols: an adapter implements one (layer 4), the runtime and the
 supervisor use it (layer 5), the command line picks it (layer 6).
 """

@@ -14,9 +14,9 @@ from pathlib import Path
 from docker import DockerClient
 from needs import cannot_run
 
+from neuros.backends.docker.engine import connect
+from neuros.backends.docker.images import images_for
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.engine import connect
-from neuros.launch.docker.images import images_for
 
 IMAGES = ("neuros_python", "neuros_mujoco", "neuros_nest")
 

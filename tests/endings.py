@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neuros.launch.shared_memory import _dead_groups
+from neuros.backends.shared_memory import _dead_groups
 
 GONE_WITHIN_S = 6.0
 RUNS = """

@@ -14,8 +14,8 @@ from machines import Machine, require_machines
 from needs import cannot_run
 
 from containers import connected, require_containers, wait_until
+from neuros.backends.docker.engine import connect
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.engine import connect
 
 _SOON_S = 30.0
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from neuros.launch.node_command import with_libraries
+from neuros.backends.node_command import with_libraries
 
 ENDS_WITHIN_S = 10.0
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neuros.launch.child_processes import RunningProcess
-from neuros.launch.outcome import Outcome
-from neuros.launch.peers import Peers
-from neuros.launch.process_launchers import InProcessLauncher, ProcessLauncher
-from neuros.launch.supervisor import Supervisor
+from neuros.backends.child_processes import RunningProcess
+from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
+from neuros.launcher.outcome import Outcome
+from neuros.launcher.peers import Peers
+from neuros.launcher.supervisor import Supervisor
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
 HOST = [sys.executable, "-S", str(Path(__file__).parent / "launch" / "stand_in_host.py")]

@@ -1,7 +1,6 @@
 """A package imports only from layers below its own.
 
-The table is that of the architecture; ``neuros.launch.supervisor`` is a package of its own, above the
-back ends that it starts through their port.
+The table is that of the architecture.
 """
 
 from __future__ import annotations
@@ -38,44 +37,31 @@ def is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(package + ".")
 
 
-SUPERVISOR = (
-    "supervisor",
-    "channels",
-    "declarations",
-    "shutdown",
-    "observers",
-    "outcome",
-    "processes",
-    "quiescence",
-    "peers",
-    "stall_detector",
-)
-
 # The first one that holds a module counts.
 PACKAGES = (
     Package(0, ("errors", "distribution")),
     Package(1, ("hooks",)),
     Package(1, ("project",)),
-    Package(2, ("core",)),
-    Package(3, ("ports", "control", "stacks")),
-    Package(3, ("convert",)),
-    Package(5, tuple(f"launch.{part}" for part in SUPERVISOR)),
-    Package(4, ("launch",)),
-    Package(4, ("transport",)),
-    Package(4, ("simulators",)),
-    Package(4, ("observe",)),
-    Package(4, ("visualise",)),
-    Package(4, ("dashboard", "views")),
-    Package(4, ("snn",)),
-    Package(4, ("tf",)),
-    Package(5, ("runtime",)),
-    Package(4, ("messages",)),
-    Package(6, ("api",)),
-    Package(7, ("cli", "doctor", "replay")),
-    Package(6, ("bag",)),
-    Package(6, ("testing",)),
     Package(1, ("installation",)),
     Package(1, ("caching",)),
+    Package(2, ("engine",)),
+    Package(3, ("ports", "control", "stacks")),
+    Package(4, ("transport",)),
+    Package(4, ("backends",)),
+    Package(4, ("simulators",)),
+    Package(4, ("snn",)),
+    Package(4, ("tf",)),
+    Package(4, ("messages",)),
+    Package(4, ("recording",)),
+    Package(4, ("visualise",)),
+    Package(4, ("viewers",)),
+    Package(5, ("node",)),
+    Package(5, ("launcher",)),
+    Package(6, ("analysis",)),
+    Package(7, ("api",)),
+    Package(7, ("bag",)),
+    Package(7, ("testing",)),
+    Package(8, ("cli", "doctor", "replay")),
 )
 # neuros itself holds public names; every package may ask it for the version. Those of the package
 # ``api`` it imports when they are asked for.
@@ -97,11 +83,11 @@ THIRD_PARTY: dict[str, set[str]] = {
     "snn": {"numpy"},
     "tf": {"geometry_msgs"},
     "snn.kernel": {"numpy", "nest"},
-    "convert": {"mujoco", "numpy"},
-    "convert.meshes": {"mujoco", "numpy", "trimesh"},
-    "launch.docker": {"docker", "requests"},
-    "launch.progress": {"tqdm"},
-    "launch.environments.requirements": {"packaging"},
+    "simulators.convert": {"mujoco", "numpy"},
+    "simulators.convert.meshes": {"mujoco", "numpy", "trimesh"},
+    "backends.docker": {"docker", "requests"},
+    "backends.progress": {"tqdm"},
+    "backends.environments.requirements": {"packaging"},
     "api.run": {"pandas"},
     "api.sweep": {"tabulate"},
     "messages.package": {"catkin_pkg"},
@@ -110,17 +96,26 @@ THIRD_PARTY: dict[str, set[str]] = {
     "messages.compilation": {"numpy"},
     "cli.runs": {"tabulate"},
     "replay.debugging": {"debugpy"},
-    "observe": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
+    "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
+    "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
     "visualise": {"matplotlib", "numpy"},
     "visualise.feed": set(),
-    "observe.bag": {"rosbags", "numpy", "pandas"},
-    "dashboard": {"starlette", "uvicorn"},
-    "views.rerun_feed": {"rerun", "numpy"},
+    "recording.bag": {"rosbags", "numpy", "pandas"},
+    "viewers.dashboard": {"starlette", "uvicorn"},
+    "viewers.rerun_feed": {"rerun", "numpy"},
     "cli.convert": {"tabulate"},
     "testing": {"pytest", "hypothesis"},
 }
-# The core is pure: no threads, no wall clock, no files.
-NOT_IN_THE_CORE = {"threading", "multiprocessing", "asyncio", "time", "socket", "os", "subprocess"}
+# The engine is pure: no threads, no wall clock, no files.
+IMPURE = {
+    "threading",
+    "multiprocessing",
+    "asyncio",
+    "time",
+    "socket",
+    "os",
+    "subprocess",
+}
 
 
 def package_of(module: str) -> Package | None:
@@ -161,7 +156,7 @@ def complaint(importer: str, imported: str) -> str | None:
     package, (top, _, inner) = package_of(importer), imported.partition(".")
     assert package is not None, f"neuros.{importer} belongs to no package: add it to PACKAGES"
     if top != "neuros":
-        if package.holds("core") and top in NOT_IN_THE_CORE:
+        if package.holds("engine") and top in IMPURE:
             return f"core knows no {top}"
         is_allowed = top in sys.stdlib_module_names or top in third_party_of(importer)
         return None if is_allowed else f"the third-party package {top} is not for it"
@@ -197,7 +192,7 @@ def module_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
+def test_a_package_imports_only_from_the_layers_below(path: Path) -> None:
     name = str(path.relative_to(ROOT))
     assert broken_rules(name, module_of(path), path.read_text("utf-8")) == []
 
@@ -205,22 +200,22 @@ def test_a_room_imports_only_from_the_floors_below(path: Path) -> None:
 @pytest.mark.parametrize(
     ("module", "source", "complaint_about"),
     [
-        ("neuros.core.engine", "import rclpy", "third-party package rclpy"),
-        ("neuros.core.engine", "import time", "knows no time"),
-        ("neuros.core.engine", "from neuros import transport", "transport is on layer 4"),
-        ("neuros.core.engine", "from ..ports import Clock", "ports is on layer 3"),
-        ("neuros.runtime.node", "from neuros import Project", "api is on layer 6"),
+        ("neuros.engine.engine", "import rclpy", "third-party package rclpy"),
+        ("neuros.engine.engine", "import time", "knows no time"),
+        ("neuros.engine.engine", "from neuros import transport", "transport is on layer 4"),
+        ("neuros.engine.engine", "from ..ports import Clock", "ports is on layer 3"),
+        ("neuros.node.node", "from neuros import Project", "api is on layer 7"),
         ("neuros.hooks", "def f():\n    import neuros.project.model", "project is on layer 1"),
         ("neuros.project.load", "import jsonschema", "third-party package jsonschema"),
-        ("neuros.transport.ros", "from neuros.launch import console", "launch is on layer 4"),
+        ("neuros.transport.ros", "from neuros.backends import console", "backends is on layer 4"),
         ("neuros.transport.memory", "import rclpy", "third-party package rclpy"),
-        ("neuros.runtime.node", "from neuros.transport.ros import x", "sees ports only"),
-        ("neuros.launch.supervisor", "from neuros.launch.console import x", "sees ports only"),
-        ("neuros.launch.console", "from neuros.launch.supervisor import x", "on layer 5"),
+        ("neuros.node.node", "from neuros.transport.ros import x", "sees ports only"),
+        ("neuros.launcher.supervisor", "from neuros.backends.console import x", "sees ports only"),
+        ("neuros.backends.console", "from neuros.launcher.supervisor import x", "on layer 5"),
         ("neuros.simulators.mujoco.sensors", "import nest", "third-party package nest"),
         ("neuros.snn.decoding", "import nest", "third-party package nest"),
         ("neuros.installation.machine", "from neuros.hooks import All", "nothing but errors"),
-        ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on layer 7"),
+        ("neuros.ports", "import importlib\nimportlib.import_module('neuros.cli')", "on layer 8"),
     ],
 )
 def test_an_import_that_breaks_the_table_is_named_with_its_line(
@@ -235,8 +230,8 @@ def test_an_import_that_breaks_the_table_is_named_with_its_line(
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("neuros.core.engine", "from neuros.core import hook\nfrom .metrics import Rest"),
-        ("neuros.core.engine", "from neuros import errors, hooks\nimport heapq"),
+        ("neuros.engine.engine", "from neuros.engine import hook\nfrom .metrics import Rest"),
+        ("neuros.engine.engine", "from neuros import errors, hooks\nimport heapq"),
         ("neuros.project.validate", "import jsonschema\nfrom neuros.project.model import Node"),
         ("neuros.cli.launch", "from neuros.transport.ros import x\nfrom neuros import __version__"),
         ("neuros.installation.machine", "from neuros.errors import EnvironmentFault"),
@@ -262,7 +257,7 @@ def test_the_core_imports_where_the_outside_world_does_not_exist() -> None:
         "for name in ('rclpy', 'docker', 'mujoco', 'psutil', 'numpy', 'nest', 'jsonschema'):\n"
         "    sys.modules[name] = None\n"
         "sys.path.insert(0, '.')\n"
-        f"import {', '.join(['neuros.core', *core])}",
+        f"import {', '.join(['neuros.engine', *core])}",
     )
 
 

@@ -34,8 +34,8 @@ from pathlib import Path
 from typing import Any
 
 from neuros.hooks import HookKind, HookSpec
-from neuros.runtime import node
-from neuros.runtime.context import Context, ContextSwitch
+from neuros.node import node
+from neuros.node.context import Context, ContextSwitch
 
 CYCLES = 12
 SETTLING_CYCLES = 100

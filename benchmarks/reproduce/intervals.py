@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.reproduce.tables import Ours
-from neuros.core.metrics import WITHIN_MS, TickIntervals
+from neuros.engine.metrics import WITHIN_MS, TickIntervals
 
 BIN_MS = 0.1
 INTERVAL_COLUMNS = (

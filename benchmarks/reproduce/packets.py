@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.reproduce.load import load_between
-from neuros.observe.run_record import PastRun
+from neuros.analysis.run_record import PastRun
 
 
 def packet_figures(past: PastRun, connections: Mapping[str, str]) -> dict[str, float | None]:

@@ -24,8 +24,8 @@ from benchmarks.reproduce.packets import (
     speed_percent,
 )
 from benchmarks.subjects.whiskeye import IMU, WHISKEYE
-from neuros.observe.packets import read_packets
-from neuros.observe.run_record import open_run
+from neuros.analysis.packets import read_packets
+from neuros.analysis.run_record import open_run
 
 FILES = {
     "tick_20ms": "tick_20ms.json",

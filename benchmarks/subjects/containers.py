@@ -57,7 +57,7 @@ def subject(is_quick: bool) -> Subject:
 
 def _in_containers(measure: Callable[..., dict[str, float]]) -> dict[str, float]:
     try:
-        from neuros.launch.docker.launcher import find_containers
+        from neuros.backends.docker.launcher import find_containers
 
         find_containers(IMAGES, None).engine.close()
     except (EnvironmentFault, ModuleNotFoundError) as error:

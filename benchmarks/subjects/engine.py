@@ -14,9 +14,9 @@ from typing import Any
 
 from benchmarks.launching import PLUGINS, launch, project_of_plugins
 from benchmarks.measure import Case, Figure, Group, Subject
-from neuros.core.engine import Engine
-from neuros.core.event_log import LoggedEngine
-from neuros.core.hook import Hook
+from neuros.engine.engine import Engine
+from neuros.engine.event_log import LoggedEngine
+from neuros.engine.hook import Hook
 from neuros.hooks import hook_specs_of, neuros_function
 from neuros.project.model import Connection, Node, Port
 

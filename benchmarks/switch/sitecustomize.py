@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from neuros.runtime.effects import NodeEffects
+from neuros.node.effects import NodeEffects
 
 Place = tuple[Any, str]
 
@@ -47,10 +47,10 @@ def nothing(*_: Any) -> None:
 
 def without_ledger() -> dict[Place, Any]:
     """Times of packets, digests, the accounts of wall time, the timeline."""
-    from neuros.core.engine import Engine
-    from neuros.core.input_queue import Subscription
-    from neuros.core.send_window import SendWindow
-    from neuros.runtime.simulated_time import SimulatedTime
+    from neuros.engine.engine import Engine
+    from neuros.engine.input_queue import Subscription
+    from neuros.engine.send_window import SendWindow
+    from neuros.node.simulated_time import SimulatedTime
     from neuros.transport import digests
     from neuros.transport.memory import MemoryTransport
 
@@ -73,9 +73,9 @@ def without_ledger() -> dict[Place, Any]:
 
 def without_recording() -> dict[Place, Any]:
     """The event log of the engine, and the packets that are kept."""
-    from neuros.core.engine import Engine
-    from neuros.core.event_log import LoggedEngine
-    from neuros.runtime.effects import NodeRecorder
+    from neuros.engine.engine import Engine
+    from neuros.engine.event_log import LoggedEngine
+    from neuros.node.effects import NodeRecorder
 
     events = [name for name in vars(LoggedEngine) if name in vars(Engine)]
     kept = {"__init__", "__doc__", "__module__", "stop_hooks"}

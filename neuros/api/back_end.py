@@ -10,17 +10,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.backends.docker.layout import as_here, inside
+from neuros.backends.placement import Cores
+from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
+from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.launch.docker.layout import as_here, inside
-from neuros.launch.placement import Cores
-from neuros.launch.process_launchers import InProcessLauncher, ProcessLauncher
-from neuros.launch.reaper import Reaper
 from neuros.ports import Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.transport.dds_profile import as_asked
 
 if TYPE_CHECKING:
-    from neuros.launch.docker.launcher import Containers
+    from neuros.backends.docker.launcher import Containers
 
 BACK_ENDS = ("auto", "docker", "process", "in-process")
 _VARIABLE = "NEUROS_BACKEND"
@@ -64,7 +64,7 @@ class BackEnd:
         ``pythons``: of nodes that run as a process on another one than this.
         """
         if self.containers:
-            from neuros.launch.docker.launcher import DockerLauncher
+            from neuros.backends.docker.launcher import DockerLauncher
 
             watch = reaper.watch_containers if reaper else None
             return DockerLauncher(self.containers, options, watch, placement, as_asked(os.environ))
@@ -107,7 +107,7 @@ def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> Ba
 def _containers(project: Project, nodes: Sequence[Node]) -> Containers:
     if find_spec("docker") is None:
         raise EnvironmentFault("the Python package docker is not installed: run install.py")
-    from neuros.launch.docker.launcher import find_containers
+    from neuros.backends.docker.launcher import find_containers
 
     return find_containers(dict.fromkeys(node.container for node in nodes), project.folder)
 

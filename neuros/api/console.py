@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TextIO
 
-from neuros.launch.console import LAYOUT, LogTail, NonBlockingWriter, format_record, wants_colours
-from neuros.launch.progress import Progress
+from neuros.backends.console import LAYOUT, LogTail, NonBlockingWriter, format_record, wants_colours
+from neuros.backends.progress import Progress
 
 _REDRAW_S = 0.5
 _PLAIN_S = 10.0

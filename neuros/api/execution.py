@@ -12,26 +12,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
+from neuros.analysis.budgets import broken_budgets, losses
+from neuros.analysis.run_record import run_record, run_table
 from neuros.api.console import Console
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
 from neuros.api.request import Request
 from neuros.api.run_folder import make_run_folder, write_node_files, write_record
+from neuros.backends.domain import DomainLock, choose_domain
+from neuros.backends.node_command import with_messages
+from neuros.backends.progress import Progress
+from neuros.backends.reaper import Reaper
+from neuros.backends.sessions import Session, reaper_environment, this_process
 from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
-from neuros.launch.domain import DomainLock, choose_domain
-from neuros.launch.node_command import with_messages
-from neuros.launch.outcome import Outcome
-from neuros.launch.peers import Peers
-from neuros.launch.progress import Progress
-from neuros.launch.reaper import Reaper
-from neuros.launch.sessions import Session, reaper_environment, this_process
-from neuros.launch.supervisor import Supervisor
-from neuros.observe.budgets import broken_budgets, losses
-from neuros.observe.recording.plan import RecordingPlan
-from neuros.observe.run_record import run_record, run_table
-from neuros.runtime.peer_link import ELSEWHERE_VARIABLE
+from neuros.launcher.outcome import Outcome
+from neuros.launcher.peers import Peers
+from neuros.launcher.supervisor import Supervisor
+from neuros.node.peer_link import ELSEWHERE_VARIABLE
+from neuros.recording.plan import RecordingPlan
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from neuros.backends.containers import find_container, misspelt
 from neuros.distribution import WORKSPACE
 from neuros.errors import Problem, ProjectError
-from neuros.launch.containers import find_container, misspelt
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project

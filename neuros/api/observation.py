@@ -9,12 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault
-from neuros.launch.run_processes import RUN_ID
 from neuros.project.model import Project
 
 if TYPE_CHECKING:
-    from neuros.observe.load import LoadMonitor
+    from neuros.recording.load import LoadMonitor
 
 HOST = "host"
 """The columns of all nodes together, where they share a process."""
@@ -51,7 +51,7 @@ class Observation:
         self._run_id = run_id
         self._run_folder = run_folder
         self._project = project
-        from neuros.observe.provenance import GitState
+        from neuros.recording.provenance import GitState
 
         self._git = GitState(project.folder)
         self._monitor: LoadMonitor | None = None
@@ -61,7 +61,7 @@ class Observation:
 
     def finish(self) -> tuple[dict[str, Any], list[str]]:
         """End it; returns what belongs into the run's record, and what has gone wrong."""
-        from neuros.observe.provenance import provenance
+        from neuros.recording.provenance import provenance
 
         record = {
             "run_id": self._run_id,
@@ -78,8 +78,8 @@ class Observation:
 def _monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
-    from neuros.observe.load import LAUNCHER, LoadMeter, LoadMonitor
-    from neuros.observe.load_table import LoadTable
+    from neuros.recording.load import LAUNCHER, LoadMeter, LoadMonitor
+    from neuros.recording.load_table import LoadTable
 
     groups = [HOST] if is_one_process else list(names)
     table = LoadTable([*groups, LAUNCHER], os.cpu_count() or 1)

@@ -13,20 +13,20 @@ from importlib.util import find_spec
 
 from neuros.api.back_end import BackEnd, choose_back_end
 from neuros.api.request import Duration, Request
+from neuros.backends.environments.pythons import Pythons, require_one_python
+from neuros.backends.node_command import without_mark
+from neuros.backends.placement import place, usable_cores
+from neuros.backends.reaper import Reaper
+from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.installation.progress import Progress, Stream
-from neuros.launch.environments.pythons import Pythons, require_one_python
-from neuros.launch.node_command import without_mark
-from neuros.launch.placement import place, usable_cores
-from neuros.launch.reaper import Reaper
-from neuros.launch.run_processes import RUN_ID
 from neuros.messages.needed import Messages
-from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.ports import Launcher
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
+from neuros.recording.selection import Request as RecordingRequest
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,

@@ -19,11 +19,11 @@ from neuros.api.run import Run
 from neuros.api.validation import model_problems
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
-from neuros.observe.recording.selection import Request as RecordingRequest
 from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
+from neuros.recording.selection import Request as RecordingRequest
 
 _ENVIRONMENT = "environment"
 

@@ -16,14 +16,14 @@ from typing import Any
 from neuros.api.plan import Plan
 from neuros.api.request import Request
 from neuros.api.run_folder import run_folder_path
+from neuros.backends.reaper import Reaper
+from neuros.backends.recording import Recorded, RecorderProcess
 from neuros.distribution import __version__
 from neuros.errors import UsageError
-from neuros.launch.reaper import Reaper
-from neuros.launch.recording import Recorded, RecorderProcess
-from neuros.observe.recording.plan import BAG_NAME, RecordingPlan
-from neuros.observe.recording.selection import plan_recording
 from neuros.project.model import Project
 from neuros.project.split import project_to_json
+from neuros.recording.plan import BAG_NAME, RecordingPlan
+from neuros.recording.selection import plan_recording
 
 _PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")
 

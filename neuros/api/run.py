@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.analysis.run_record import open_run, run_table
 from neuros.errors import EnvironmentFault, RunError
-from neuros.observe.run_record import open_run, run_table
 
 if TYPE_CHECKING:
-    from neuros.observe.bag.bag_reader import Bag
+    from neuros.recording.bag.bag_reader import Bag
 
 
 _LATENCIES = ("p50", "p90", "p99", "max")
@@ -113,7 +113,7 @@ class Run:
             UsageError: if nothing was recorded.
             EnvironmentFault: if the bag is damaged.
         """
-        from neuros.observe.bag.bag_reader import open_bag
+        from neuros.recording.bag.bag_reader import open_bag
 
         return open_bag(self.folder)
 

@@ -14,13 +14,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from neuros.analysis.run_record import consumed_percent
 from neuros.api.grid import Point, points_of, short_names
 from neuros.api.live import LiveRun
 from neuros.api.project import Project
 from neuros.api.run import Run, frame_of
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
-from neuros.observe.run_record import consumed_percent
 
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)

@@ -15,10 +15,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.plan import make_environments
+from neuros.backends.child_processes import signal_in_words
+from neuros.backends.environments.pythons import Pythons
+from neuros.backends.node_command import without_mark
 from neuros.errors import Problem
-from neuros.launch.child_processes import signal_in_words
-from neuros.launch.environments.pythons import Pythons
-from neuros.launch.node_command import without_mark
 from neuros.messages.needed import Messages
 from neuros.project.model import Node, Project
 from neuros.project.plugin_files import PluginFile, read_plugin

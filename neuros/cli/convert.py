@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
 
 if TYPE_CHECKING:
-    from neuros.convert.output import Converted
-    from neuros.convert.report import NotTaken
+    from neuros.simulators.convert.output import Converted
+    from neuros.simulators.convert.report import NotTaken
 
 _EPILOG = """\
 exit codes:
@@ -58,7 +58,7 @@ def add_convert(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 def _convert(options: argparse.Namespace) -> int:
     converted, source, output = _converted(options)
     try:
-        from neuros.convert.output import write_mjcf
+        from neuros.simulators.convert.output import write_mjcf
 
         files = write_mjcf(converted, source, output)
     except OSError as error:
@@ -83,11 +83,11 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     try:
-        from neuros.convert.find import NotFound, finder
-        from neuros.convert.includes import model_file
-        from neuros.convert.output import is_ours
-        from neuros.convert.sdf import convert_sdf
-        from neuros.convert.urdf import read_urdf
+        from neuros.simulators.convert.find import NotFound, finder
+        from neuros.simulators.convert.includes import model_file
+        from neuros.simulators.convert.output import is_ours
+        from neuros.simulators.convert.sdf import convert_sdf
+        from neuros.simulators.convert.urdf import read_urdf
     except ImportError as error:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
         raise EnvironmentFault(text) from error

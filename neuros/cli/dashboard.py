@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
-    from neuros.dashboard.server import Sources
-    from neuros.launch.dashboard import DashboardProcess
+    from neuros.backends.dashboard import DashboardProcess
+    from neuros.viewers.dashboard.server import Sources
 
 _LAST_LOG_BYTES = 1 << 16
 
@@ -50,7 +50,7 @@ def dashboard_of(options: argparse.Namespace, *, is_wanted: bool) -> DashboardPr
     """
     if not (options.dashboard or is_wanted) and options.dashboard_port is None:
         return None
-    from neuros.launch.dashboard import DashboardProcess
+    from neuros.backends.dashboard import DashboardProcess
 
     return DashboardProcess(options.dashboard_port or 0)
 
@@ -64,7 +64,7 @@ def start_dashboard(
     environment: Mapping[str, str],
 ) -> int:
     """Start the process for a run that has a control socket; returns its id."""
-    from neuros.dashboard.plan import plan as shown_plan
+    from neuros.viewers.dashboard.plan import plan as shown_plan
 
     return dashboard.start(
         [sys.executable, "-m", "neuros.cli", "dashboard", str(run_folder)],
@@ -89,7 +89,7 @@ def _run_dashboard(options: argparse.Namespace) -> int:
     # Loading all this takes a fifth of a second of a core that the nodes can use.
     import asyncio
 
-    from neuros.dashboard.server import Dashboard
+    from neuros.viewers.dashboard.server import Dashboard
 
     names = tuple(told["names"])
     dashboard = Dashboard(told["plan"], names, _sources(told, names), told["start_s"])
@@ -105,8 +105,8 @@ def _is_looked_at(listening: socket.socket) -> bool:
 
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
     from neuros.api.observation import owner_of_processes
-    from neuros.dashboard.server import Sources
-    from neuros.observe.load import LAUNCHER, LoadMeter, LoadNow
+    from neuros.recording.load import LAUNCHER, LoadMeter, LoadNow
+    from neuros.viewers.dashboard.server import Sources
 
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
     load_now = LoadNow(LoadMeter(owner))
@@ -125,7 +125,7 @@ class _Log:
     """The new lines of the logs of a run, as the console shows them."""
 
     def __init__(self, files: Mapping[str, Path]) -> None:
-        from neuros.launch.console import LogTail
+        from neuros.backends.console import LogTail
 
         self._lines: list[str] = []
         self._tail = LogTail(files, self._take, colours=False, last_bytes=_LAST_LOG_BYTES)

@@ -13,8 +13,8 @@ from types import FrameType
 
 from neuros.api.loading import workspaces_of
 from neuros.api.plan import are_made, make_environments
+from neuros.backends.environments.pythons import Pythons
 from neuros.errors import UsageError
-from neuros.launch.environments.pythons import Pythons
 from neuros.messages.cache import message_cache
 from neuros.messages.needed import Messages
 from neuros.project.model import NodeFile

@@ -19,7 +19,7 @@ from neuros.cli.environments import make_shown_environments
 from neuros.cli.projects import load_with_messages
 from neuros.cli.views import Views
 from neuros.errors import UsageError
-from neuros.observe.recording.selection import Request as RecordingRequest
+from neuros.recording.selection import Request as RecordingRequest
 
 
 def launch(options: argparse.Namespace) -> int:

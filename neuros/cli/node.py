@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros.observe.provenance import note_versions
+from neuros.node.process import NodeProcess
 from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
-from neuros.runtime.process import NodeProcess
+from neuros.recording.provenance import note_versions
 
 _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
 _STANDARD = (0, 1, 2)
@@ -64,8 +64,8 @@ def run_node(options: argparse.Namespace) -> int:
 
 def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:
     """Makes the packet recorders of nodes by the recording plan of the run."""
-    from neuros.observe.recording.plan import load_plan
-    from neuros.observe.recording.spool import open_recorder
+    from neuros.recording.plan import load_plan
+    from neuros.recording.spool import open_recorder
 
     plan = load_plan(run)
     return lambda file: open_recorder(plan, run, file.node.name)
@@ -75,7 +75,7 @@ class _Leave:
     """Python's last act: open files are closed, and it ends here where ROS has not been given up.
 
     Python would close files by itself, but not on :func:`os._exit`, and not those that it finds
-    only through objects which the garbage collector leaves alone (:mod:`neuros.runtime.process`).
+    only through objects which the garbage collector leaves alone (:mod:`neuros.node.process`).
     """
 
     def __init__(self) -> None:

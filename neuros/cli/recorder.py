@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuros.backends.recording import END
 from neuros.errors import NeurosError
-from neuros.launch.recording import END
-from neuros.observe.recording.plan import BAG_NAME, RecordingPlan, Topic, load_plan
-from neuros.observe.recording.recorder import Recorder
-from neuros.observe.recording.repair import counts_of, repair, the_only_recorder
-from neuros.observe.recording.spool import ListenedSpool
+from neuros.recording.plan import BAG_NAME, RecordingPlan, Topic, load_plan
+from neuros.recording.recorder import Recorder
+from neuros.recording.repair import counts_of, repair, the_only_recorder
+from neuros.recording.spool import ListenedSpool
 
 if TYPE_CHECKING:
     from neuros.transport.listening import FoundTopic

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 from neuros.errors import EnvironmentFault, UsageError
 
 if TYPE_CHECKING:
+    from neuros.analysis.run_record import PastRun
     from neuros.hooks import HookSpec
-    from neuros.observe.bag.bag_reader import RecordedTopic
-    from neuros.observe.run_record import PastRun
     from neuros.project.model import NodeFile
+    from neuros.recording.bag.bag_reader import RecordedTopic
     from neuros.replay.node import ReplayedNode
 
 
@@ -115,7 +115,7 @@ def _replay(options: argparse.Namespace) -> int:
     if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
         raise UsageError("replay: --rate must be above 0, --delay and -w not below")
     from neuros.cli.environments import find_messages_of
-    from neuros.observe.bag.bag_reader import open_bag
+    from neuros.recording.bag.bag_reader import open_bag
     from neuros.transport.playing import PlayedTopic, play
 
     find_messages_of(Path(options.run))
@@ -142,7 +142,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _chosen(topics: Sequence[RecordedTopic], patterns: Sequence[str]) -> list[RecordedTopic]:
     """The topics that are asked for. Raises ``UsageError`` if a pattern fits none."""
-    from neuros.observe.recording.selection import is_named
+    from neuros.recording.selection import is_named
 
     for pattern in patterns:
         if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
@@ -163,10 +163,10 @@ def _replay_node(options: argparse.Namespace) -> int:
     """
     if options.replay_topics:
         raise UsageError("replay: --node runs a node, --topic publishes: choose one of them")
+    from neuros.analysis.recorded_node import RecordedNode, recorded_node
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.cache import message_cache
-    from neuros.observe.recorded_node import RecordedNode, recorded_node
     from neuros.replay.containers import as_on_this_machine, ran_in_container
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
@@ -196,8 +196,8 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
     Raises:
         EnvironmentFault: if it cannot be made.
     """
+    from neuros.backends.environments.pythons import Pythons
     from neuros.cli.environments import make_shown_environments
-    from neuros.launch.environments.pythons import Pythons
     from neuros.replay.containers import not_here, ran_in_container
 
     own = [] if run.record.get("backend") == "in-process" else [file.node]
@@ -211,10 +211,10 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
 
 def _replayed(options: argparse.Namespace) -> int:
     """The process that :func:`_replay_node` becomes."""
-    from neuros.observe.provenance import python_versions
-    from neuros.observe.recorded_node import RecordedNode
-    from neuros.observe.run_record import open_run
+    from neuros.analysis.recorded_node import RecordedNode
+    from neuros.analysis.run_record import open_run
     from neuros.project.split import node_file_from_json
+    from neuros.recording.provenance import python_versions
     from neuros.replay.containers import note_on_versions, ran_in_container
     from neuros.replay.debugging import debugpy_on
     from neuros.replay.node import ReplayedNode, files_changed_since
@@ -308,7 +308,7 @@ def _folder(output: str | None) -> Path:
 
 
 def _become(command: Sequence[str], file: NodeFile) -> None:
-    from neuros.launch.node_command import (
+    from neuros.backends.node_command import (
         node_environment,
         process_environment,
         start_arguments,

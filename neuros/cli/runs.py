@@ -11,12 +11,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuros.backends.sessions import Session, sessions
+from neuros.backends.shared_memory import remove_dead_runs
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.launch.sessions import Session, sessions
-from neuros.launch.shared_memory import remove_dead_runs
 
 if TYPE_CHECKING:
-    from neuros.observe.review.run import Run
+    from neuros.analysis.review.run import Run
 
 EXIT_DIFFERENT = 1
 EXIT_UNKNOWN = EXIT_LEFT_OUT = 2
@@ -163,9 +163,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _report(options: argparse.Namespace) -> int:
-    from neuros.observe.review.findings import findings_of
-    from neuros.observe.review.page import report_page
-    from neuros.observe.review.run import open_for_review
+    from neuros.analysis.review.findings import findings_of
+    from neuros.analysis.review.page import report_page
+    from neuros.analysis.review.run import open_for_review
 
     run = open_for_review(options.run)
     findings = findings_of(run)
@@ -186,7 +186,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.observe.review.page import figures_of
+    from neuros.analysis.review.page import figures_of
 
     try:
         return figures_of(run)
@@ -195,7 +195,7 @@ def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from neuros.observe.review.comparison import comparison_rows, comparison_table, labels_of
+    from neuros.analysis.review.comparison import comparison_rows, comparison_table, labels_of
 
     runs, refused = _readable(options.runs)
     header, rows = comparison_rows(runs)
@@ -213,7 +213,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
     """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
-    from neuros.observe.review.run import open_for_review
+    from neuros.analysis.review.run import open_for_review
 
     runs, refused = [], []
     for folder in folders:
@@ -227,9 +227,9 @@ def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
 
 
 def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> bytes:
-    from neuros.observe.review.comparison import comparison_figure, labels_of
-    from neuros.observe.review.findings import findings_of
-    from neuros.observe.review.page import bottleneck_part, figure_part, page, png, table_part
+    from neuros.analysis.review.comparison import comparison_figure, labels_of
+    from neuros.analysis.review.findings import findings_of
+    from neuros.analysis.review.page import bottleneck_part, figure_part, page, png, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")
@@ -277,9 +277,9 @@ def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from neuros.observe.difference import compare
-    from neuros.observe.recorded_packets import RecordedPackets
-    from neuros.observe.run_record import open_run
+    from neuros.analysis.difference import compare
+    from neuros.analysis.recorded_packets import RecordedPackets
+    from neuros.analysis.run_record import open_run
 
     a, b = open_run(options.run_a), open_run(options.run_b)
     recorded = RecordedPackets()
@@ -319,7 +319,7 @@ def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def _info(options: argparse.Namespace) -> int:
     from tabulate import tabulate
 
-    from neuros.observe.bag.bag_reader import open_bag
+    from neuros.recording.bag.bag_reader import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
@@ -332,7 +332,7 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _repair(options: argparse.Namespace) -> int:
-    from neuros.observe.recording.repair import repair
+    from neuros.recording.repair import repair
 
     counts = repair(Path(options.run), lambda text: print(f"neuros: {text}", file=sys.stderr))
     if counts is None:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
+    from neuros.backends.docker.recipes import Recipe
     from neuros.doctor.machine_checks import Finding
-    from neuros.launch.docker.recipes import Recipe
 
 STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
 """What the examples need."""
@@ -142,10 +142,10 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _build_images(options: argparse.Namespace) -> int:
+    from neuros.backends.docker.building import ImageBuilder, Wishes
+    from neuros.backends.docker.context import served, surroundings
+    from neuros.backends.docker.engine import connect
     from neuros.installation.progress import Progress
-    from neuros.launch.docker.building import ImageBuilder, Wishes
-    from neuros.launch.docker.context import served, surroundings
-    from neuros.launch.docker.engine import connect
 
     wishes = Wishes(
         logs=_cache() / "builds",
@@ -175,10 +175,10 @@ def _build_images(options: argparse.Namespace) -> int:
 
 
 def _list_images(options: argparse.Namespace) -> int:
-    from neuros.launch.containers import OWN_FOLDER
-    from neuros.launch.docker.engine import connect
-    from neuros.launch.docker.inventory import inventory
-    from neuros.launch.docker.recipes import names_in
+    from neuros.backends.containers import OWN_FOLDER
+    from neuros.backends.docker.engine import connect
+    from neuros.backends.docker.inventory import inventory
+    from neuros.backends.docker.recipes import names_in
 
     with closing(connect()) as engine:
         images = inventory(engine)
@@ -193,8 +193,8 @@ def _list_images(options: argparse.Namespace) -> int:
 
 
 def _remove_images(options: argparse.Namespace) -> int:
-    from neuros.launch.docker.engine import connect
-    from neuros.launch.docker.inventory import remove_images
+    from neuros.backends.docker.engine import connect
+    from neuros.backends.docker.inventory import remove_images
 
     with closing(connect()) as engine:
         has_removed = False
@@ -208,7 +208,7 @@ def _remove_images(options: argparse.Namespace) -> int:
 
 def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
     """The recipes, and the images without one, that are behind names, folders and projects."""
-    from neuros.launch.docker.recipes import find_recipe
+    from neuros.backends.docker.recipes import find_recipe
 
     recipes: list[Recipe] = []
     images: list[str] = []
@@ -225,9 +225,9 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
+    from neuros.backends.containers import OWN_FOLDER
+    from neuros.backends.docker.recipes import names_in
     from neuros.distribution import WORKSPACE
-    from neuros.launch.containers import OWN_FOLDER
-    from neuros.launch.docker.recipes import names_in
     from neuros.project.load import load_project
 
     path = Path(name).absolute()

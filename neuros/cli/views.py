@@ -16,9 +16,9 @@ from neuros.errors import EnvironmentFault
 if TYPE_CHECKING:
     from neuros.api.execution import Shown
     from neuros.api.plan import Plan
-    from neuros.launch.reaper import Reaper
-    from neuros.launch.rerun import RerunProcesses
-    from neuros.launch.tools import Tool
+    from neuros.backends.reaper import Reaper
+    from neuros.backends.rerun import RerunProcesses
+    from neuros.backends.tools import Tool
 
 RVIZ_FILE = "project.rviz"
 
@@ -115,7 +115,7 @@ class Views:
 
     def _take_tool(self, program: str) -> str | None:
         """Have a tool started later, or say in a few words why it cannot be."""
-        from neuros.launch.tools import find_tool
+        from neuros.backends.tools import find_tool
 
         if self._plan.backend == "in-process":
             return "nodes of one process talk past ROS, where its tools see nothing"
@@ -126,7 +126,7 @@ class Views:
         return None
 
     def _take_rerun(self, reason: str) -> None:
-        from neuros.launch.rerun import RerunProcesses
+        from neuros.backends.rerun import RerunProcesses
 
         if find_spec("rerun") is None:
             raise EnvironmentFault(
@@ -137,7 +137,7 @@ class Views:
         self._notices.append(f"--visualisations: in Rerun, since {reason}")
 
     def _start_rerun(self, rerun: RerunProcesses, run: Shown, reaper: Reaper) -> None:
-        from neuros.dashboard.plan import plan as shown_plan
+        from neuros.viewers.dashboard.plan import plan as shown_plan
 
         sources = shown_plan(self._plan.project, self._plan.names)["sources"]
         command = [sys.executable, "-m", "neuros.cli", "view", str(run.folder)]
@@ -147,7 +147,7 @@ class Views:
             reaper.watch(pid)
 
     def _write_rviz(self, folder: Path) -> str:
-        from neuros.views.rviz import rviz_configuration
+        from neuros.viewers.rviz import rviz_configuration
 
         path = folder / RVIZ_FILE
         path.write_text(rviz_configuration(self._plan.project), "utf-8")
@@ -158,17 +158,17 @@ def _open(url: str) -> None:
     """Open a page where there is a display; its address is printed in any case."""
     import webbrowser
 
-    from neuros.launch.tools import has_display
+    from neuros.backends.tools import has_display
 
     if has_display():
         webbrowser.open(url)
 
 
 def _run_view(options: argparse.Namespace) -> int:
-    from neuros.launch.rerun import await_server
-    from neuros.views.observer import look_on
-    from neuros.views.rerun_feed import RerunFeed
-    from neuros.views.visual_types import VisualTypes
+    from neuros.backends.rerun import await_server
+    from neuros.viewers.observer import look_on
+    from neuros.viewers.rerun_feed import RerunFeed
+    from neuros.viewers.visual_types import VisualTypes
 
     told = json.loads(sys.stdin.readline())
     sources = {

@@ -15,10 +15,10 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+from neuros.backends.domain import choose_domain
+from neuros.backends.placement import usable_cores
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
-from neuros.launch.domain import choose_domain
-from neuros.launch.placement import usable_cores
 
 SHARED_MEMORY = Path("/dev/shm")
 _LEAST_SHARED_BYTES = 64 * 2**20
@@ -180,8 +180,8 @@ def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iter
     if find_spec("docker") is None:
         yield absent("Docker", "its Python package is not installed", "run ./install.py")
         return
-    from neuros.launch.docker.engine import connect, engine_faults
-    from neuros.launch.docker.images import image_for
+    from neuros.backends.docker.engine import connect, engine_faults
+    from neuros.backends.docker.images import image_for
 
     try:
         engine = connect(environ)

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from neuros.analysis.run_record import PastRun
+from neuros.backends.docker.layout import outside
 from neuros.errors import EnvironmentFault, NeurosError
-from neuros.launch.docker.layout import outside
-from neuros.observe.run_record import PastRun
 from neuros.project.model import Folders, NodeFile
 
 _FEW = 5
@@ -54,7 +54,7 @@ def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
     """The packages of which the image of a node had another version; empty if there are none.
 
     Args:
-        here: as from :func:`neuros.observe.provenance.python_versions`.
+        here: as from :func:`neuros.recording.provenance.python_versions`.
     """
     versions = run.record["versions"]
     there = versions["nodes"].get(name, versions)  # not noted where it is the launcher's own

@@ -11,18 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from neuros.core.engine import Engine
-from neuros.core.event_log import is_whole
-from neuros.core.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
+from neuros.analysis.difference import differing_fields
+from neuros.analysis.recorded_node import RecordedNode
+from neuros.engine.engine import Engine
+from neuros.engine.event_log import is_whole
+from neuros.engine.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec
-from neuros.observe.difference import differing_fields
-from neuros.observe.recorded_node import RecordedNode
+from neuros.node.context import ContextSwitch
+from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.debugging import is_quit
-from neuros.runtime.context import ContextSwitch
-from neuros.runtime.node import NodeRuntime
 from neuros.transport.messages import decode, message_class
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 

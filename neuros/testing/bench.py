@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neuros.core.engine import Engine
-from neuros.core.send_window import SendWindow
-from neuros.core.snapshot import snapshot
+from neuros.engine.engine import Engine
+from neuros.engine.send_window import SendWindow
+from neuros.engine.snapshot import snapshot
 from neuros.errors import NeurosError, NodeError
+from neuros.node.context import ContextSwitch
+from neuros.node.handle import NodeHandle
+from neuros.node.node import NodeRuntime
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.runtime.context import ContextSwitch
-from neuros.runtime.handle import NodeHandle
-from neuros.runtime.node import NodeRuntime
 from neuros.testing.stand_ins import ManualClock, Record, StepLoop, Topics, Workbench
 from neuros.transport.lean_node import without_spinning
 from neuros.transport.memory import MemoryHub

@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from neuros.backends.node_command import without_mark
 from neuros.distribution import WORKSPACE
 from neuros.errors import ProjectError, WrongValue
 from neuros.installation.progress import Progress
-from neuros.launch.node_command import without_mark
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import load_project

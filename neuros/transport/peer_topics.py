@@ -1,6 +1,6 @@
 """Topics on which the launchers of one project hear each other's state.
 
-The nodes of a launcher publish its state (:class:`neuros.launch.peers.PeerState`), each on a
+The nodes of a launcher publish its state (:class:`neuros.launcher.peers.PeerState`), each on a
 topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
 ``std_msgs/msg/String``, so that the last state also reaches who comes later. That a node goes
 on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no

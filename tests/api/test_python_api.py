@@ -24,8 +24,8 @@ from api_projects import COUNTER, ENDLESS, dice
 
 import neuros
 from containers import require_containers
+from neuros.backends.sessions import sessions
 from neuros.errors import EnvironmentFault, ProjectError, RunError, UsageError
-from neuros.launch.sessions import sessions
 
 DEADLINE_S = 30.0
 # Whoever runs these tests in the background has them, and all that they start, ignore Ctrl+C.
@@ -207,7 +207,7 @@ def test_a_run_that_cannot_be_observed_leaves_no_reaper(
     def fail(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr("neuros.observe.provenance.GitState.__init__", fail)
+    monkeypatch.setattr("neuros.recording.provenance.GitState.__init__", fail)
     with pytest.raises(RuntimeError, match="can't start new thread"):
         made.run(backend="in-process", output="run")
     assert str(tmp_path / "run") not in {each.folder for each in sessions()}
@@ -258,7 +258,7 @@ def test_a_run_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.Mon
         raise OSError("too many of them")
 
     monkeypatch.setattr(
-        "neuros.launch.child_processes.subprocess.Popen", _popen_but_not_for_hosts(fail)
+        "neuros.backends.child_processes.subprocess.Popen", _popen_but_not_for_hosts(fail)
     )
     with pytest.raises(EnvironmentFault, match="cannot start the process of thrower"):
         made.run(backend="in-process", output="run")

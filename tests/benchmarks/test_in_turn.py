@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from benchmarks import in_turn
-from neuros.core.engine import Engine
-from neuros.core.event_log import LoggedEngine
-from neuros.core.send_window import SendWindow
+from neuros.engine.engine import Engine
+from neuros.engine.event_log import LoggedEngine
+from neuros.engine.send_window import SendWindow
+from neuros.node.effects import NodeRecorder
 from neuros.project.model import Connection
-from neuros.runtime.effects import NodeRecorder
 
 
 @pytest.fixture(scope="module")

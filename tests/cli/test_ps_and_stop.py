@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
+from neuros.backends.sessions import Session
 from neuros.cli import runs
 from neuros.cli.main import main
-from neuros.launch.sessions import Session
 
 NOBODY = 65534
 

@@ -16,8 +16,8 @@ from typing import Any
 
 from neuros.api.live import LiveRun
 from neuros.api.project import Project as Loaded
+from neuros.backends.domain import choose_domain
 from neuros.errors import NeurosError
-from neuros.launch.domain import choose_domain
 
 from .description import Project
 

@@ -92,7 +92,7 @@ class TestReference:
 
     def test_every_package_says_in_the_list_what_it_is(self) -> None:
         listed = dict(code.pages(ROOT))["code"]
-        assert "| [neuros.core](code/neuros.core.md) | The engine of a node" in listed
+        assert "| [neuros.engine](code/neuros.engine.md) | The engine of a node" in listed
         assert ") |  |" not in listed
 
     def test_the_navigation_has_the_pages_of_each_table_of_the_index(self) -> None:

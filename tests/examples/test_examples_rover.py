@@ -11,7 +11,7 @@ from launching import EXAMPLES, start
 from plain_programs import plain_program
 
 from containers import require_containers
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 ROVER = EXAMPLES / "6_outside/rover"
 SOON = ("--set", "nodes.rover.parameters.low_battery=0.95")

@@ -11,7 +11,7 @@ from launching import REPOSITORY, Finished, start
 from plain_programs import plain_program
 from shown_output import Entry
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 QUICK = ("clock", "tennis", "voting", "elevator")
 BESIDE = {"rover": ("driver.py", "battery.py")}

@@ -19,7 +19,7 @@ from std_msgs.msg import Int32
 from std_srvs.srv import SetBool, Trigger
 
 from containers import require_containers
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 PROJECTS = Path(__file__).parent / "back_ends"
 COUNT = 200

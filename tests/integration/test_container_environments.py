@@ -18,9 +18,9 @@ import pytest
 from launching import EXAMPLES, Finished, Running, launch, start
 from packages import make_slow_package, make_wheel
 
+from neuros.backends.environments.choice import HERE, find_python
+from neuros.backends.run_processes import RUN_ID
 from neuros.installation.machine import NEWEST, OLDEST, dotted
-from neuros.launch.environments.choice import HERE, find_python
-from neuros.launch.run_processes import RUN_ID
 
 CONFLICT = EXAMPLES / "5_containers/conflict"
 COUNT = 20

@@ -18,10 +18,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import neuros.bag
 from containers import connected, require_containers
+from neuros.backends.docker.images import images_for
+from neuros.backends.domain import choose_domain
+from neuros.backends.environments.choice import HERE
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.images import images_for
-from neuros.launch.domain import choose_domain
-from neuros.launch.environments.choice import HERE
 from neuros.messages.package import Ros
 
 PROJECT = Path(__file__).parent / "custom_messages"

@@ -13,7 +13,7 @@ from dashboard.browser import browser_page
 from dashboard.visitor import IMU, WATCHED, Visitor, address, is_full
 from launching import Running, start
 
-from neuros.dashboard.server import STATIC
+from neuros.viewers.dashboard.server import STATIC
 
 
 def start_watched(tmp_path: Path, *arguments: str) -> Running:

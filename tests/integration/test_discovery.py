@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from launching import EXAMPLES, start
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 
 # Ends as soon as it has heard a packet, and knows both nodes by name.

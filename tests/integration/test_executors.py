@@ -18,8 +18,8 @@ from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
+from neuros.backends.domain import choose_domain
 from neuros.errors import EnvironmentFault
-from neuros.launch.domain import choose_domain
 from neuros.transport import ros_loop
 from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
 from neuros.transport.lean_node import LeanNode, PluginCallbacks

@@ -8,7 +8,7 @@ import pytest
 from launching import BACKENDS, start
 from ros_program import RosProgram
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 from neuros.transport.messages import message_class
 
 PROJECT = Path(__file__).parent / "external_topics"

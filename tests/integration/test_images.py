@@ -14,7 +14,7 @@ import pytest
 from launching import Finished, launch, start
 from test_transports import RosNetwork
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 from neuros.project.model import NodeFile
 from neuros.testing.transports import SERIES, TransportBench
 from neuros.testing.wiring import wire

@@ -21,8 +21,8 @@ import pytest
 from launching import Running, start
 from outside_asker import PROGRAM
 
+from neuros.backends.domain import choose_domain
 from neuros.doctor.delivery import PROJECT as IMAGES
-from neuros.launch.domain import choose_domain
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 
 pytestmark = pytest.mark.needs("root")

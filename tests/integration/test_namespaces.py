@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from containers import require_containers
 from neuros import bag
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 PROJECT = Path(__file__).parent / "namespaces"
 LIMIT_S = 60.0

@@ -12,7 +12,7 @@ from launching import Running, start
 from plain_programs import plain_program
 
 from containers import require_containers
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 PROJECT = Path(__file__).parent / "outside_ros"
 PROGRAM = PROJECT / "program.py"

@@ -10,7 +10,7 @@ import psutil
 import pytest
 from launching import Running, start
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 STREAM = Path(__file__).parent / "network" / "stream"
 CONNECTION = "source.image -> sink.image"

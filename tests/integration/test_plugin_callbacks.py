@@ -16,9 +16,9 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
+from neuros.backends.domain import choose_domain
 from neuros.errors import NodeError
-from neuros.launch.domain import choose_domain
-from neuros.runtime.failures import callback_error
+from neuros.node.failures import callback_error
 from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.lean_node import LeanNode, PluginCallbacks, give_up
 from neuros.transport.messages import message_class

@@ -24,8 +24,8 @@ from std_msgs.msg import Float64, String
 from test_back_ends import talk_to_the_gate
 
 import neuros.bag
+from neuros.backends.domain import choose_domain
 from neuros.cli.main import main
-from neuros.launch.domain import choose_domain
 
 HERE = Path(__file__).parent
 PROJECTS = HERE / "back_ends"

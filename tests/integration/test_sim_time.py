@@ -13,8 +13,8 @@ import pytest
 from launching import start
 
 from containers import require_containers
-from neuros.launch.domain import choose_domain
-from neuros.launch.node_command import with_libraries
+from neuros.backends.domain import choose_domain
+from neuros.backends.node_command import with_libraries
 
 PROJECT = Path(__file__).parent / "sim_time"
 LIMIT_S = 60.0

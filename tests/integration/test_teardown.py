@@ -18,7 +18,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 from neuros.transport import lean_node
 from neuros.transport.lean_node import give_up
 from neuros.transport.messages import message_class

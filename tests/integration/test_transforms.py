@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from launching import BACKENDS, launch
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 
 PROJECT = Path(__file__).parent / "transforms"
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from ros_program import RosProgram
 
-from neuros.launch.domain import choose_domain
+from neuros.backends.domain import choose_domain
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.testing.transports import TransportChecks

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from neuros.observe.run_record import PastRun
+from neuros.analysis.run_record import PastRun
 from neuros.replay.containers import note_on_versions
 
 

@@ -24,7 +24,7 @@ An input drives actuators: ``{"actuator": NAME}`` or ``{"actuators": [NAME, ...]
 declares for joints without any.
 """
 
-import neuros.convert  # noqa: F401 (imports MuJoCo without OpenGL where that does not work)
+import neuros.simulators.convert  # noqa: F401 (imports MuJoCo without OpenGL where that does not work)
 from neuros.simulators.mujoco.simulator import MuJoCo
 
 __all__ = ["MuJoCo"]

@@ -10,11 +10,11 @@ from typing import Any
 
 import mujoco
 
-from neuros.convert.find import Finder, NotFound, finder
-from neuros.convert.sdf import convert_sdf
-from neuros.convert.urdf import read_urdf
 from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext, Packet
+from neuros.simulators.convert.find import Finder, NotFound, finder
+from neuros.simulators.convert.sdf import convert_sdf
+from neuros.simulators.convert.urdf import read_urdf
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.declarations import Problems, has_any, names_of

@@ -15,9 +15,9 @@ from endings import GONE_WITHIN_S, dead_shared_memory
 from launching import Finished, Running, start
 
 from containers import nothing_left, wait_until
-from neuros.launch.docker.settings import shared_memory
-from neuros.launch.run_processes import RUN_ID, RunProcesses
-from neuros.launch.sessions import Session, sessions
+from neuros.backends.docker.settings import shared_memory
+from neuros.backends.run_processes import RUN_ID, RunProcesses
+from neuros.backends.sessions import Session, sessions
 
 HEAD = """
 import ctypes, errno, json, os, pathlib, signal, socket, subprocess, sys, time

@@ -10,8 +10,8 @@ from launching import EXAMPLES, launch
 from needs import cannot_run
 
 from containers import connected
+from neuros.backends.docker.images import Image, images_for
 from neuros.errors import EnvironmentFault
-from neuros.launch.docker.images import Image, images_for
 
 CONFLICT = EXAMPLES / "5_containers/conflict"
 CONTAINERS = ("statemachine_0", "statemachine_2")

@@ -15,8 +15,8 @@ from engines import OwnEngine, own_engine, require_engines
 from machines import Machine
 
 from containers import wait_until
+from neuros.backends.run_processes import RunProcesses
 from neuros.cli.main import main
-from neuros.launch.run_processes import RunProcesses
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from docker import DockerClient
 from launching import start
 
 from containers import connected, require_containers, wait_until
-from neuros.launch.docker.tool import IMAGE
-from neuros.launch.domain import choose_domain
+from neuros.backends.docker.tool import IMAGE
+from neuros.backends.domain import choose_domain
 
 # A stand-in for the tools of a ROS distribution, which no test machine has the gigabytes for.
 TOOL = '#!/bin/sh\necho "$ROS_DOMAIN_ID $DISPLAY"; head -n 1 "$2"; exec sleep 60\n'

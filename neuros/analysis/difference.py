@@ -1,0 +1,228 @@
+"""Comparison of the packets of two runs, up to the first difference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from neuros.analysis.packets import Numbers, Packets, read_packets
+from neuros.analysis.run_record import PastRun
+from neuros.project.model import Connection
+
+
+class Recordings(Protocol):
+    """Bags of runs (:class:`neuros.analysis.recorded_packets.RecordedPackets`)."""
+
+    def message(self, run: Path, connection: str, number: int) -> Any: ...
+    def digests(self, run: Path, connection: str) -> Numbers | None: ...
+    def are_as_of_nodes(self, run: Path, connection: str) -> bool: ...
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a comparison.
+
+    Attributes:
+        difference: where the runs parted first, in a sentence; ``None`` if they are identical.
+        remarks: what differs and may, and what could not be compared.
+        compared: packets that were found equal.
+    """
+
+    difference: str | None
+    remarks: tuple[str, ...]
+    compared: int
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """One connection on which they part; ``at_ns`` (in run A) tells which was the first.
+
+    ``packet``: the connection and the number of the first packet that differs, from 1.
+    """
+
+    at_ns: float
+    text: str
+    packet: tuple[str, int] | None = None
+
+
+def compare(a: PastRun, b: PastRun, recorded: Recordings) -> Verdict:
+    """Compare what was sent on every connection, and what hooks took on those that lose nothing.
+
+    Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
+    that may lose packets it depends on the moment which ones hooks get: that is told as a remark.
+    """
+    found: list[_Difference] = []
+    remarks: list[str] = []
+    compared = 0
+    names = [*a.connections, *(name for name in b.connections if name not in a.connections)]
+    for name in names:
+        if name not in a.connections or name not in b.connections:
+            only = "A" if name in a.connections else "B"
+            found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
+            continue
+        compared += _compare_connection(name, (a, b), recorded, found, remarks)
+    first = min(found, key=lambda difference: difference.at_ns, default=None)
+    others = len(found) - 1
+    if others > 0:
+        differ = "connections differ" if others > 1 else "connection differs"
+        remarks.append(f"{others} more {differ}, later on")
+    text = None if first is None else first.text
+    if first is not None and first.packet is not None:  # a bag is read for the first one only
+        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
+    return Verdict(text, tuple(remarks), compared)
+
+
+def _compare_connection(
+    name: str,
+    runs: tuple[PastRun, PastRun],
+    recorded: Recordings,
+    found: list[_Difference],
+    remarks: list[str],
+) -> int:
+    """Returns how many packets were found equal."""
+    a, b = runs
+    in_a, in_b = _packets(name, runs, recorded)
+    sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
+    lacking = [_lacks_digests(*each) for each in sent]
+    if any(lacking):
+        folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
+        remarks.append(
+            f"{name}: not compared, there are neither digests nor a recording of it in"
+            f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process digests are kept with"
+            " --digests, or unasked where no packet may be lost and they are cheap; never of what a"
+            " node sends to itself)"
+        )
+        return 0
+    compared = _first_difference(in_a.sent, in_b.sent)
+    cut_off = [len(packets.sent) for count, packets in sent if (count or 0) > len(packets.sent)]
+    if cut_off:
+        listed = min(cut_off)
+        in_a, in_b = (replace(packets, sent=packets.sent[:listed]) for packets in (in_a, in_b))
+        remarks.append(
+            f"{name}: compared up to packet {listed}, of later ones no digests are there"
+        )
+        taken = None
+    else:
+        taken = _taken(name, in_a, in_b)
+    difference = _sent(name, in_a, in_b)
+    if difference is not None:
+        found.append(difference)
+    elif taken is not None and a.connections[name]["discard_limit"] == 0:
+        found.append(taken)
+    elif taken is not None:
+        remarks.append(f"{taken.text}: as a connection may that loses packets")
+    return compared
+
+
+def _packets(
+    name: str, runs: tuple[PastRun, PastRun], recorded: Recordings
+) -> tuple[Packets, Packets]:
+    """The lists of both runs, with digests from their bags where nodes have kept none.
+
+    If one run has digests of its nodes and the other only a bag, both are taken from bags, where
+    both have one; a bag stands beside digests of nodes only where both digest packets alike.
+    """
+    packets = [read_packets(run.folder, run.connection(name)) for run in runs]
+    lacks = [
+        _lacks_digests(run.connections[name]["sent"], listed)
+        for run, listed in zip(runs, packets, strict=True)
+    ]
+    if not any(lacks):
+        return packets[0], packets[1]
+    connection = runs[0].connection(name)
+    bags = [recorded.digests(run.folder, name) for run in runs]
+    if bags[0] is not None and bags[1] is not None:
+        return _recorded(packets[0], bags[0], connection), _recorded(
+            packets[1], bags[1], connection
+        )
+    for place, run in enumerate(runs):
+        bag = bags[place]
+        if lacks[place] and bag is not None and recorded.are_as_of_nodes(run.folder, name):
+            packets[place] = _recorded(packets[place], bag, connection)
+    return packets[0], packets[1]
+
+
+def _recorded(packets: Packets, digests: Numbers, connection: Connection) -> Packets:
+    """With the digests of what was recorded; on a reliable connection all of that arrives."""
+    received = digests if connection.is_reliable else packets.received
+    return replace(packets, sent=digests, received=received)
+
+
+def _lacks_digests(sent: int | None, packets: Packets) -> bool:
+    """Whether packets have passed, or may have, of which nothing is known here."""
+    if sent is None:  # by a node of another launcher, or one that never reported
+        return not len(packets.sent) and not len(packets.received)
+    return sent > 0 and not len(packets.sent)
+
+
+def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+    place = _first_difference(in_a.sent, in_b.sent)
+    if place == len(in_a.sent) == len(in_b.sent):
+        return None
+    at_ns = float(in_a.sent_ns[place]) if place < len(in_a.sent_ns) else np.inf
+    if place == len(in_a.sent) or place == len(in_b.sent):
+        shorter, longer = ("A", "B") if len(in_a.sent) < len(in_b.sent) else ("B", "A")
+        text = f"{name}: run {shorter} ends after packet {place}, run {longer} has more"
+        return _Difference(at_ns, f"{text} ({abs(len(in_a.sent) - len(in_b.sent))})")
+    return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
+
+
+def _field(folders: tuple[Path, Path], name: str, number: int, recorded: Recordings) -> str:
+    """In which field a packet differs, as far as it was recorded."""
+    messages = [recorded.message(folder, name, number) for folder in folders]
+    if None in messages:
+        return "(which field, only --record can tell)"
+    field = next(differing_fields(*messages), None)
+    return f"in {field or 'nothing that was recorded'}"
+
+
+def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+    a, b = in_a.consumed, in_b.consumed
+    place = _first_difference(a, b)
+    if place == len(a) == len(b):
+        return None
+    at_ns = float(in_a.consumed_ns[place]) if place < len(a) else np.inf
+    if place in (len(a), len(b)):
+        what = f"hooks took {len(a)} packets in run A, and {len(b)} in run B"
+    else:
+        what = f"the packet that hooks took as number {place + 1} is another one"
+    return _Difference(at_ns, f"{name}: {what}")
+
+
+def _first_difference(a: Numbers, b: Numbers) -> int:
+    """The first place at which they differ, from 0; where one ends, at the latest."""
+    common = min(len(a), len(b))
+    unequal = np.flatnonzero(a[:common] != b[:common])
+    return int(unequal[0]) if len(unequal) else common
+
+
+def differing_fields(
+    a: Any, b: Any, name: str = "", sides: tuple[str, str] = ("A", "B")
+) -> Iterator[str]:
+    """Differences between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
+    fields = getattr(a, "__dataclass_fields__", None)
+    if fields:
+        for field in fields:
+            if not field.startswith("__"):
+                inner = f"{name}.{field}" if name else field
+                yield from differing_fields(getattr(a, field), getattr(b, field), inner, sides)
+        return
+    if isinstance(a, np.ndarray | list | tuple) and not isinstance(b, str):
+        if len(a) != len(b):
+            yield f"{name}: {len(a)} elements in {sides[0]}, {len(b)} in {sides[1]}"
+            return
+        for place, (left, right) in enumerate(zip(a, b, strict=True)):
+            yield from differing_fields(left, right, f"{name}[{place}]", sides)
+        return
+    if not (a == b or (a != a and b != b)):  # NaN is what it was
+        left, right = _plain(a), _plain(b)
+        yield f"{name}: {left!r} in {sides[0]}, {right!r} in {sides[1]}"
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy as Python's own, which is shown without its type."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,145 @@
+"""Packet lists of a run: times, digests and latencies, as its nodes have written them.
+
+Reads what :mod:`neuros.node.packet_log` writes. Both ends' times are of the monotonic clock
+of one machine, which all its processes share; the two ends of a connection on different machines
+leave their lists in different run folders, and no latency is worked out for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from xxhash import xxh3_128_hexdigest
+
+from neuros.project.model import Connection
+
+FOLDER = "packets"
+PERCENTILES = (50, 90, 99)
+
+Numbers = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Packets:
+    """The lists of one connection; empty where there are none.
+
+    Attributes:
+        sent_ns: when each packet was sent, (sent,).
+        sent: its digest, (sent,).
+        received: the digest of each that arrived, (received,).
+        taken: of each that a hook started on, its place among those that arrived, from 1, (taken,).
+        taken_ns: when that was, (taken,).
+    """
+
+    sent_ns: Numbers
+    sent: Numbers
+    received: Numbers
+    taken: Numbers
+    taken_ns: Numbers
+
+    @property
+    def consumed(self) -> Numbers:
+        """The digests of the packets that hooks have started on, each once, in order."""
+        places = np.unique(self.taken)
+        found: Numbers = self.received[places[places <= len(self.received)] - 1]
+        return found
+
+    @property
+    def consumed_ns(self) -> Numbers:
+        """When the first hook has started on each packet of :attr:`consumed`."""
+        places, firsts = np.unique(self.taken, return_index=True)
+        found: Numbers = self.taken_ns[firsts[places <= len(self.received)]]
+        return found
+
+    def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
+        """Nanoseconds from when a packet was sent to each start of a hook on it.
+
+        Where packets may be lost on their way, those that arrived are found by their digests among
+        those that were sent; ``None`` if that is not possible.
+        """
+        places = self.taken - 1
+        if may_lose:
+            which = self._which_arrived()
+            if which is None:
+                return None
+            is_known = places < len(which)
+            places, taken_ns = which[places[is_known]], self.taken_ns[is_known]
+        else:
+            is_known = places < len(self.sent_ns)
+            places, taken_ns = places[is_known], self.taken_ns[is_known]
+        found: Numbers = taken_ns - self.sent_ns[places]
+        return found
+
+    def _which_arrived(self) -> Numbers | None:
+        """For each packet that arrived, its place among those that were sent, from 0."""
+        order = np.argsort(self.sent)
+        ordered = self.sent[order]
+        if len(ordered) != len(self.sent_ns) or (ordered[1:] == ordered[:-1]).any():
+            return None
+        found = np.searchsorted(ordered, self.received)
+        is_known = found < len(ordered)
+        found[~is_known] = 0
+        if not len(ordered) or not (is_known & (ordered[found] == self.received)).all():
+            return None
+        return order[found]
+
+
+def read_packets(run_folder: Path, connection: Connection) -> Packets:
+    """The lists of a connection; what a killed node could not write any more is missing."""
+    index = connection.index
+    sender = run_folder / connection.source_node / FOLDER
+    receiver = run_folder / connection.destination_node / FOLDER
+    taken = _numbers(receiver / f"{index}.taken", np.int64)
+    taken_ns = _numbers(receiver / f"{index}.taken_ns", np.int64)
+    both = min(len(taken), len(taken_ns))
+    return Packets(
+        sent_ns=_numbers(sender / f"{index}.sent_ns", np.int64),
+        sent=_numbers(sender / f"{index}.digests", np.uint64),
+        received=_numbers(receiver / f"{index}.digests", np.uint64),
+        taken=taken[:both],
+        taken_ns=taken_ns[:both],
+    )
+
+
+def packet_figures(packets: Packets, *, may_lose: bool) -> dict[str, Any]:
+    """Latency and digests of a connection, ready for JSON.
+
+    ``latency_ms`` is ``None`` where it cannot be told, ``digests`` where none were kept.
+    """
+    latencies_ns = packets.latencies_ns(may_lose=may_lose)
+    return {"latency_ms": _latency_ms(latencies_ns), "digests": _digests(packets)}
+
+
+def _latency_ms(latencies_ns: Numbers | None) -> dict[str, float] | None:
+    if latencies_ns is None or not len(latencies_ns):
+        return None
+    percentiles = np.percentile(latencies_ns, PERCENTILES) / 1e6
+    return {
+        **{f"p{p}": float(ms) for p, ms in zip(PERCENTILES, percentiles, strict=True)},
+        "max": float(latencies_ns.max()) / 1e6,
+        "count": len(latencies_ns),
+    }
+
+
+def _digests(packets: Packets) -> dict[str, Any] | None:
+    if not len(packets.sent) and not len(packets.received):
+        return None
+    consumed = packets.consumed
+    return {
+        "sent": xxh3_128_hexdigest(packets.sent.tobytes()),
+        "sent_packets": len(packets.sent),
+        "consumed": xxh3_128_hexdigest(consumed.tobytes()),
+        "consumed_packets": len(consumed),
+    }
+
+
+def _numbers(file: Path, kind: Any) -> Numbers:
+    try:
+        data = file.read_bytes()
+    except OSError:  # the node has sent, or received, nothing
+        data = b""
+    return np.frombuffer(data[: len(data) // 8 * 8], dtype=kind)

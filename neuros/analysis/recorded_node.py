@@ -1,0 +1,188 @@
+"""Packets of one node in a recorded run: received and sent."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from neuros.analysis.packets import FOLDER, read_packets
+from neuros.analysis.run_record import PastRun, open_run
+from neuros.errors import UsageError
+from neuros.ports import Way
+from neuros.project.model import Connection, NodeFile
+from neuros.project.split import node_file_from_json
+from neuros.recording.bag.bag_reader import Bag, open_bag
+from neuros.recording.plan import RecordingPlan, load_plan
+
+_RECORD = "run the project again with -r (--record), and replay that run"
+
+
+def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
+    """A run, and what one of its nodes was told: in a container, with the paths of that.
+
+    Raises:
+        UsageError: if the run or the node does not exist, or was not recorded so that the node
+            can be replayed.
+    """
+    run = open_run(run_folder)
+    if name not in run.record["nodes"]:
+        names = ", ".join(run.record["nodes"])
+        raise UsageError(f"replay: {run_folder} has no node '{name}'; it has {names}")
+    load_plan(run_folder)
+    if not _event_log_of(run_folder, name).is_file():
+        raise UsageError(
+            f"replay: {run_folder} does not tell in which order '{name}' received its packets:"
+            f" {_RECORD}"
+        )
+    file = run_folder / name / "node.json"
+    try:
+        return run, node_file_from_json(json.loads(file.read_text("utf-8")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"replay: {file} cannot be read ({error})") from error
+
+
+class RecordedNode:
+    """The packets of one node, from the bag of a run.
+
+    Attributes:
+        event_log: what happened to its engine (:mod:`neuros.engine.event_log`).
+        plan: what was recorded.
+
+    Raises:
+        UsageError: if the run was not recorded, or packets for the node were left out.
+        EnvironmentFault: if the bag is damaged.
+    """
+
+    def __init__(self, run: PastRun, file: NodeFile) -> None:
+        self._run, self._file = run, file
+        self._name = file.node.name
+        self.plan: RecordingPlan = load_plan(run.folder)
+        self._bag: Bag = open_bag(run.folder)
+        self.event_log: array[int] = array("q")
+        data = _event_log_of(run.folder, self._name).read_bytes()
+        self.event_log.frombytes(data[: len(data) // 8 * 8])
+        self._arrivals: dict[Connection | str, _Arrivals] = {}
+        self._check_inputs()
+
+    def arrived(self, key: Connection | str, number: int) -> bytes | None:
+        """The packet that arrived as the ``number``-th (from 1) on a connection or an input's
+        external topic; ``None`` where the bag ends before it.
+
+        Raises:
+            UsageError: if it cannot be told which one that was.
+        """
+        arrivals = self._arrivals.get(key)
+        if arrivals is None:
+            arrivals = self._arrivals[key] = self._find_arrivals(key)
+        return arrivals.packet(number)
+
+    def sent(self) -> dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]]:
+        """Packets sent: by way and port or connection, the topics with name, type and packets.
+
+        A topic is called by its connection, if it belongs to one.
+        """
+        found: dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]] = {}
+        for stream in self.plan.streams.get(self._name, ()):
+            way = Way(stream.way)
+            if way not in (Way.SENT, Way.TO_ITSELF):
+                continue
+            topics = [self.plan.topics[place] for place in stream.topics]
+            found[way, stream.name] = [
+                (topic.connection or topic.name, topic.type, self._packets(topic.name))
+                for topic in topics
+            ]
+        return found
+
+    def lacking(self) -> dict[str, tuple[int, int]]:
+        """Connections of which the bag has lost packets: how many it has, of how many."""
+        found = {}
+        for topics in self.sent().values():
+            for name, _, packets in topics:
+                sent = self._run.connections.get(name, {}).get("sent") or 0
+                if len(packets) < sent:
+                    found[name] = len(packets), sent
+        return found
+
+    def message(self, data: bytes, type_name: str) -> Any:
+        """A message of a type that the bag has."""
+        return self._bag.store.deserialize_cdr(data, type_name)
+
+    # ------------------------------------------------------------------ inside
+
+    def _packets(self, topic: str) -> Sequence[Any]:
+        return self._bag.topics[topic].raw() if topic in self._bag.topics else ()
+
+    def _check_inputs(self) -> None:
+        recorded = {topic.connection for topic in self.plan.topics}
+        recorded |= {topic.name for topic in self.plan.topics}
+        wanted = [
+            str(c)
+            for c in self._file.connections
+            if c.destination_node == self._name != c.source_node
+        ] + [self._topic(port.name) for port in self._file.node.inputs if port.external_topic]
+        missing = [name for name in wanted if name not in recorded]
+        if missing:
+            raise UsageError(
+                f"replay: what '{self._name}' received on {', '.join(missing)} was not recorded:"
+                f" {_RECORD}"
+            )
+
+    def _find_arrivals(self, key: Connection | str) -> _Arrivals:
+        if isinstance(key, str):
+            return self._heard(key)
+        packets = self._packets(f"{key.topic}/data")
+        if key.is_reliable or self._keeps(Way.RECEIVED, str(key)):
+            return _Arrivals(packets)
+        digests = read_packets(self._run.folder, key)
+        places = {digest: place for place, digest in enumerate(digests.sent.tolist())}
+        received = digests.received.tolist()
+        if not received or any(digest not in places for digest in received):
+            raise UsageError(
+                f"replay: {key} may lose packets, and {self._run.folder} does not tell which of"
+                f" them arrived: {_RECORD}"
+            )
+        return _Arrivals(packets, [places[digest] for digest in received])
+
+    def _heard(self, name: str) -> _Arrivals:
+        """Only the first node that listens to an external topic records what arrives."""
+        topic = self._topic(name)
+        if not self._keeps(Way.HEARD, name):
+            raise UsageError(
+                f"replay: another node has recorded {topic}, and it cannot be told which of its"
+                f" packets have reached '{self._name}'"
+            )
+        return _Arrivals(self._packets(topic))
+
+    def _topic(self, name: str) -> str:
+        """The external topic of an input."""
+        topic = self._file.node.input(name).external_topic or ""
+        return self._file.names.resolve(topic, self._name)
+
+    def _keeps(self, way: Way, name: str) -> bool:
+        streams = self.plan.streams.get(self._name, ())
+        return any((stream.way, stream.name) == (way.value, name) for stream in streams)
+
+
+class _Arrivals:
+    """Arrivals of one input; ``places``: which of the packets, if not all."""
+
+    def __init__(self, packets: Sequence[Any], places: Sequence[int] | None = None) -> None:
+        self._packets, self._places = packets, places
+
+    def packet(self, number: int) -> bytes | None:
+        place = number - 1
+        if self._places is not None:
+            if place >= len(self._places):
+                return None
+            place = self._places[place]
+        if place >= len(self._packets):
+            return None
+        data: bytes = self._packets[place].data
+        return data
+
+
+def _event_log_of(run_folder: Path, name: str) -> Path:
+    return run_folder / name / FOLDER / "event_log"

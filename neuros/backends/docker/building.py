@@ -1,0 +1,228 @@
+"""Builds the images of recipes: parents first, what is current not again, a tag for the whole only.
+
+Each image is built without a name, is run once to see that it can run nodes, gets what it lacks for
+that (the recipe ``neuros_python`` on top of it), and its tag last. The classic builder is used, and
+BuildKit where a Dockerfile takes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from docker import DockerClient
+from docker.errors import APIError, ImageNotFound
+
+from neuros.backends.containers import bare_name
+from neuros.backends.docker.build_steps import BuildSteps, pulled
+from neuros.backends.docker.context import Surroundings
+from neuros.backends.docker.dockerfile import arguments_of, images_in, on_images
+from neuros.backends.docker.engine import engine_faults
+from neuros.backends.docker.images import (
+    CONTAINER,
+    DIGEST,
+    FOLDER,
+    added_tag,
+    built_image,
+    labels_of_python,
+)
+from neuros.backends.docker.recipes import BASE_ARGUMENT, Recipe, in_order
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.installation.progress import Progress
+
+_BASE = "neuros.image.base"
+_ARGUMENTS = "neuros.image.arguments"
+_FROM = "neuros.image.from"
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """Options of the user for the builds.
+
+    Attributes:
+        logs: the folder for what the engine says.
+        bases: base images by container name, in place of those in the Dockerfiles.
+        arguments: build arguments for the Dockerfiles that declare them.
+        pull: whether the newest version of base images is asked for.
+    """
+
+    logs: Path
+    bases: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    pull: bool = False
+
+
+class ImageBuilder:
+    """Builds images, with a line about each."""
+
+    def __init__(
+        self, engine: DockerClient, around: Surroundings, wishes: Wishes, progress: Progress
+    ) -> None:
+        self._engine, self._around = engine, around
+        self._wishes, self._progress = wishes, progress
+
+    def build(self, recipes: Iterable[Recipe]) -> None:
+        """Build what is missing or out of date of these and of what they begin from.
+
+        Raises:
+            UsageError: for a base image that would not be used; nothing is built then.
+            EnvironmentFault: at the first that cannot be built; those before it are kept.
+        """
+        recipes = list(recipes)
+        with engine_faults("images cannot be built"):
+            bases = self._remembered_bases(recipes) | dict(self._wishes.bases)
+        wanted = in_order(recipes, bases)
+        _require_use(self._wishes.bases, wanted)
+        for recipe in wanted:
+            with engine_faults(f"image '{recipe.name}' cannot be built"):
+                self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
+
+    def add_to(self, name: str) -> None:
+        """Build, on an image that the user has, one that can run nodes; nothing where it can.
+
+        Raises:
+            EnvironmentFault: if there is no such image, or it can never run nodes.
+        """
+        started_s = time.monotonic()
+        with engine_faults(f"image '{name}' cannot be used"):
+            try:
+                image = self._engine.images.get(name)
+            except ImageNotFound:
+                raise EnvironmentFault(
+                    f"there is neither a folder containers/{name} nor an image '{name}': docker"
+                    f" pull {name}, or correct the name"
+                ) from None
+            steps = self._steps(name)
+            made, python = steps.able(image.id)
+            if made == image.id:
+                self._progress.step(f"{name}: can run nodes as it is")
+                return
+            labels = {CONTAINER: name, **labels_of_python(python)}
+            steps.finish(made, [added_tag(image)], labels)
+            self._report(f"{name}: what nodes need was added, as {added_tag(image)}", started_s)
+
+    def _steps(self, name: str) -> BuildSteps:
+        log = self._wishes.logs / f"{name.replace('/', '_')}.log"
+        return BuildSteps(self._engine, self._around, self._progress, name, log)
+
+    def _remembered_bases(self, recipes: Iterable[Recipe]) -> dict[str, str]:
+        """The base images that the user wanted when these were built last."""
+        built = [(recipe, built_image(recipe, self._engine)) for recipe in in_order(recipes)]
+        return {
+            recipe.name: base
+            for recipe, old in built
+            if old and (base := old.labels.get(_BASE)) and recipe.takes(base)
+        }
+
+    def _bring_up_to_date(self, recipe: Recipe, base: str) -> None:
+        started_s = time.monotonic()
+        old = built_image(recipe, self._engine)
+        labels = self._labels(recipe, base, old)
+        if self._wishes.pull and not base:
+            self._pull_bases(recipe)
+        begin = {
+            parent.name: built_image(parent, self._engine).id  # type: ignore[union-attr]
+            for parent in recipe.parents_on(base or None)
+        }
+        if base and base not in begin:
+            begin[base] = str(pulled(self._engine, base, newest=self._wishes.pull).id)
+        labels[_FROM] = json.dumps(begin, sort_keys=True)
+        if old is not None and not self._wishes.pull and _is_as_wanted(old, labels):
+            self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
+            return
+        steps = self._steps(recipe.name)
+        arguments = json.loads(labels[_ARGUMENTS])
+        if base:
+            arguments[BASE_ARGUMENT] = self._base(recipe, base, begin[base], steps)
+        text = on_images(recipe.dockerfile, begin)
+        made, python = steps.able(steps.build(recipe.folder, text, arguments))
+        steps.finish(made, recipe.tags, {**labels, **labels_of_python(python)})
+        self._forget(recipe, old)
+        self._report(f"{recipe.name}: built", started_s, self._engine.images.get(recipe.tags[0]))
+
+    def _labels(self, recipe: Recipe, base: str, old: Any | None) -> dict[str, str]:
+        """Labels that the image is to have; arguments of last time count again."""
+        wanted = old.labels if old is not None else {}
+        known = arguments_of(recipe.dockerfile)
+        given = {key: value for key, value in self._wishes.arguments.items() if key in known}
+        arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | given
+        return {
+            CONTAINER: recipe.name,
+            FOLDER: str(recipe.folder),
+            DIGEST: recipe.digest,
+            _BASE: base,
+            _ARGUMENTS: json.dumps(arguments, sort_keys=True),
+        }
+
+    def _base(self, recipe: Recipe, base: str, image: str, steps: BuildSteps) -> str:
+        """The image that the user wants to begin with.
+
+        In place of a recipe's image it must be able to do what that can: run nodes.
+        """
+        replaces_recipe = len(recipe.parents_on(base)) < len(recipe.parents)
+        return steps.able(image)[0] if replaces_recipe else image
+
+    def _pull_bases(self, recipe: Recipe) -> None:
+        parents = {parent.name for parent in recipe.parents}
+        for image in images_in(recipe.dockerfile):
+            if bare_name(image) not in parents and image != "scratch":
+                self._progress.detail(f"{recipe.name}: pulling {image}")
+                pulled(self._engine, image, newest=True)
+
+    def _forget(self, recipe: Recipe, old: Any | None) -> None:
+        """Remove what was built from this folder before, unless somebody uses it.
+
+        Labels are inherited, so only names that were given here say what is ours.
+        """
+        stale = [
+            tag
+            for image in self._engine.images.list(
+                name=recipe.name, filters={"label": f"{FOLDER}={recipe.folder}"}
+            )
+            for tag in image.tags
+            if tag not in recipe.tags and tag.startswith(f"{recipe.name}:")
+        ]
+        with contextlib.suppress(ImageNotFound):
+            if old is not None and not self._engine.images.get(old.id).tags:
+                stale.append(old.id)
+        for name in stale:
+            with contextlib.suppress(APIError):
+                self._engine.images.remove(name)
+
+    def _report(self, text: str, started_s: float, image: Any | None = None) -> None:
+        size = f", {_size(image)}" if image is not None else ""
+        self._progress.step(f"{text} in {time.monotonic() - started_s:.1f} s{size}")
+
+
+def _require_use(bases: Mapping[str, str], recipes: Iterable[Recipe]) -> None:
+    """Raise ``UsageError`` where an image that is to be begun from would not be."""
+    by_name = {recipe.name: recipe for recipe in recipes}
+    for name, base in bases.items():
+        recipe = by_name.get(name)
+        if recipe is None:
+            names = ", ".join(sorted(by_name)) or "none"
+            raise UsageError(
+                f"--base-image {name}={base}: no container '{name}' is built here; those that are:"
+                f" {names}"
+            )
+        if not recipe.takes(base):
+            raise UsageError(
+                f"--base-image {name}={base}: {recipe.folder}/Dockerfile does not begin from"
+                f" {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
+                f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
+            )
+
+
+def _is_as_wanted(image: Any, labels: Mapping[str, str]) -> bool:
+    return all(image.labels.get(key) == labels[key] for key in (DIGEST, _BASE, _ARGUMENTS, _FROM))
+
+
+def _size(image: Any) -> str:
+    return f"{image.attrs['Size'] / 1e6:.0f} MB"

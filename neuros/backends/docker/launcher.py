@@ -1,0 +1,402 @@
+"""The Docker back end: one container per node."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import requests
+from docker import DockerClient
+from docker.errors import DockerException
+
+from neuros.backends.child_processes import signal_in_words
+from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_socket
+from neuros.backends.docker.images import Image, images_for
+from neuros.backends.docker.settings import container_settings, shared_memory, user_for
+from neuros.backends.leftover_containers import RUN_LABEL
+from neuros.backends.node_command import last_line, log_file, node_folder, script_failure
+from neuros.backends.placement import Cores, on_cores
+from neuros.backends.run_processes import RUN_ID, RunProcesses
+from neuros.backends.shared_memory import hold
+from neuros.errors import EnvironmentFault
+from neuros.project.load import PROJECT_FILE
+from neuros.project.model import NodeFile
+from neuros.project.resources import memory_text
+
+_MOST_AT_ONCE = 16
+_OUT_OF_MEMORY = 128 + signal.SIGKILL
+_NOT_EXECUTED = (125, 126, 127)
+_STOPPED = "the Docker engine stopped it, as it does for `docker stop` and when it ends itself"
+# The engine removes a container as soon as it has ended. If it cannot, its node has ended anyway.
+_REMOVAL_S = 2.0
+
+
+@dataclass(frozen=True)
+class Containers:
+    """The engine, what it can do, and the image of every container that nodes name."""
+
+    engine: DockerClient
+    images: Mapping[str, Image]
+    abilities: Abilities
+
+    def record(self) -> dict[str, Any]:
+        """The engine's version and the images, ready for JSON. Raises ``EnvironmentFault``."""
+        with engine_faults("Docker"):
+            version = self.engine.version()["Version"]
+        images = {
+            container: {"name": image.name, "id": image.id}
+            for container, image in self.images.items()
+        }
+        return {"engine": version, "images": images}
+
+
+def find_containers(names: Iterable[str], project_folder: Path | None) -> Containers:
+    """The engine and the images for containers of these names.
+
+    Raises:
+        EnvironmentFault: if there is no engine, or an image is not there.
+    """
+    engine = connect()
+    try:
+        with engine_faults("Docker"):
+            abilities = Abilities.of(engine.info())
+        return Containers(engine, images_for(names, project_folder, engine), abilities)
+    except BaseException:
+        engine.close()
+        raise
+
+
+class DockerLauncher:
+    """Starts one container per node (:class:`neuros.ports.Launcher`).
+
+    Args:
+        options: of the command ``node``, as ``--debug``.
+        on_started: is told the socket of the engine, and a folder that is to be removed in the end,
+            before the first container is made.
+        placement: the cores of each node, by name; the kernel places those that are not in it.
+    """
+
+    def __init__(
+        self,
+        containers: Containers,
+        options: Sequence[str] = (),
+        on_started: Callable[[str, Path], None] | None = None,
+        placement: Mapping[str, Cores] = MappingProxyType({}),
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        self._engine = containers.engine
+        self._images = containers.images
+        self._options = tuple(options)
+        self._on_started = on_started
+        self._placement = placement
+        self._environ = environ
+        self._is_rootless = containers.abilities.is_rootless
+
+    def start(
+        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+    ) -> Sequence[RunningContainer]:
+        """Start a container per node, side by side, all or none. Raises ``EnvironmentFault``."""
+        folder = shared_memory(environment.get(RUN_ID, ""))
+        if self._on_started:
+            self._on_started(engine_socket(self._engine), folder)
+        try:
+            folder.mkdir(mode=0o700)
+            hold(folder)
+        except OSError as error:
+            raise EnvironmentFault(f"no shared memory for containers: {error}") from error
+        with engine_faults("the engine's events cannot be listened to"):
+            events = ContainerEvents(self._engine, environment.get(RUN_ID, ""))
+        events.start()
+        in_run_folder = _in_run_folder(nodes)
+        with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
+            work = [
+                threads.submit(self._start_one, node, environment, events, in_run_folder)
+                for node in nodes
+            ]
+        faults = [fault for each in work if (fault := each.exception())]
+        started = [each.result() for each in work if not each.exception()]
+        if not faults:
+            return started
+        events.close()
+        for container in started:
+            container.kill()
+        others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
+        if others:
+            raise others[0]
+        raise EnvironmentFault("\n".join(dict.fromkeys(map(str, faults))))
+
+    def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
+        """One line per container."""
+        return [self._description(node) for node in nodes]
+
+    def _start_one(
+        self,
+        file: NodeFile,
+        environment: Mapping[str, str],
+        events: ContainerEvents,
+        in_run_folder: Sequence[Path],
+    ) -> RunningContainer:
+        name, mem_bytes = file.node.name, file.node.resources.mem_bytes
+        with engine_faults(f"the container of node '{name}' cannot be started"):
+            container = self._engine.containers.create(
+                **self._settings(file, environment, in_run_folder)
+            )
+            container.start()
+        return RunningContainer(
+            name,
+            str(container.id),
+            self._engine,
+            events,
+            log=log_file(file),
+            mem_bytes=mem_bytes,
+        )
+
+    def _settings(
+        self, file: NodeFile, environment: Mapping[str, str], in_run_folder: Sequence[Path]
+    ) -> dict[str, Any]:
+        return container_settings(
+            file,
+            self._images[file.node.container],
+            user_for(file, self._environ, is_rootless=self._is_rootless),
+            self._options,
+            environment,
+            others=[path for path in in_run_folder if path != node_folder(file)],
+            cores=self._placement.get(file.node.name),
+            launcher_pid=os.getpid(),
+        )
+
+    def _description(self, file: NodeFile) -> str:
+        node, image = file.node, self._images[file.node.container]
+        command = shlex.join([*image.start, "-m", "neuros.cli", "node", *self._options])
+        facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
+        where = on_cores(self._placement.get(node.name))
+        return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
+
+
+def _in_run_folder(nodes: Sequence[NodeFile]) -> list[Path]:
+    """Entries of the run folder that not all nodes may write to: folders, the project."""
+    entries = sorted(nodes[0].folders.run.iterdir())
+    return [path for path in entries if path.is_dir() or path.name == PROJECT_FILE]
+
+
+def _limits(file: NodeFile) -> list[str]:
+    resources = file.node.resources
+    facts = []
+    if resources.mem_bytes is not None:
+        facts.append(f"memory {memory_text(resources.mem_bytes)}")
+    if resources.cpus is not None:
+        facts.append(f"cpus {resources.cpus:g}")
+    if resources.pids is not None:
+        facts.append(f"pids {resources.pids}")
+    return facts
+
+
+def _openings(file: NodeFile) -> list[str]:
+    access = file.node.access
+    facts = [f"device {device}" for device in access.devices]
+    if access.gpus:
+        facts.append(f"gpus {' '.join(access.gpus)}")
+    if access.display:
+        facts.append("display")
+    return facts
+
+
+class RunningContainer:
+    """A container with one node (:class:`neuros.ports.RunningNode`).
+
+    Nothing here waits for the engine: it is asked for something in a thread of its own, and the
+    events say what came of it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        container_id: str,
+        engine: DockerClient,
+        events: ContainerEvents,
+        *,
+        log: Path,
+        mem_bytes: int | None,
+    ) -> None:
+        self._name = name
+        self._id = container_id
+        self._engine = engine
+        self._events = events
+        self._log = log
+        self._mem_bytes = mem_bytes
+        self._is_told = False
+        events.add(container_id)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self._name,)
+
+    @property
+    def id(self) -> str:
+        """The id that the engine has given it."""
+        return self._id
+
+    def poll(self) -> str | None:
+        """``None`` while it runs, then how it ended, in words."""
+        end = self._events.end_of(self._id)
+        if end is not None:
+            words = how_it_ended(*end, self._log, self._mem_bytes)
+            is_stopped = self._events.is_signalled(self._id) and not self._is_told
+            return f"{words}: {_STOPPED}" if is_stopped else words
+        if self._events.lost and not self._events.has_processes(self._name):
+            return f"the Docker engine went away ({self._events.lost}): start it again"
+        return None
+
+    @property
+    def is_abandoned(self) -> bool:
+        return bool(self._events.lost) and self._events.end_of(self._id) is None
+
+    def terminate(self) -> None:
+        self._signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
+        self._is_told = True
+        if self._events.lost:
+            self._events.signal_all(number, self._name)
+        else:
+            threading.Thread(target=self._tell_engine, args=(number,), daemon=True).start()
+
+    def _tell_engine(self, number: signal.Signals) -> None:
+        # It may have ended meanwhile; the events say what became of it.
+        with contextlib.suppress(DockerException, requests.RequestException):
+            self._engine.api.kill(self._id, int(number))
+
+
+def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: int | None) -> str:
+    """The end of a container, in words.
+
+    Args:
+        log: of the node; its last line says what could not be executed.
+        mem_bytes: its limit of memory, ``None`` if it has none of its own.
+    """
+    limit = f" (limit {memory_text(mem_bytes)})" if mem_bytes is not None else ""
+    if is_out_of_memory and exit_code == _OUT_OF_MEMORY:
+        return f"out of memory{limit}"
+    if exit_code == 1 and (failure := script_failure(log)):
+        return failure
+    words = f"exit code {exit_code}"
+    if exit_code > 128:
+        words = signal_in_words(exit_code - 128)
+    elif exit_code in _NOT_EXECUTED and (said := last_line(log)):
+        words += f": {said}"
+    return words + (f", after a process of it ran out of memory{limit}" if is_out_of_memory else "")
+
+
+@dataclass
+class _Fate:
+    """Events of a container so far; ``exit_code`` is ``None`` while it runs."""
+
+    exit_code: int | None = None
+    died_s: float = 0.0
+    is_out_of_memory: bool = False
+    is_signalled: bool = False
+    is_gone: bool = False
+
+
+class ContainerEvents(threading.Thread):
+    """Events of the engine, from before the first container of a run to the end of the last.
+
+    A thread listens, so that no caller waits for the engine. A container counts as ended when it
+    is gone: then all that the engine has to say of it has come (that memory ran out may follow on
+    the exit code), and nothing of it is left.
+
+    Where the engine goes away, the nodes are asked to end by themselves (SIGTERM), and judged by
+    their processes from then on.
+
+    Attributes:
+        lost: why the engine is not heard any more, empty while it is.
+    """
+
+    def __init__(self, engine: DockerClient, run_id: str) -> None:
+        super().__init__(name="neuros-containers", daemon=True)
+        self.lost = ""
+        self._run_id = run_id
+        self._fates: dict[str, _Fate] = {}
+        self._awaited: set[str] = set()
+        self._is_closing = False
+        self._stream: Any = engine.events(
+            decode=True,
+            since=int(time.time()) - 1,
+            filters={"type": "container", "label": f"{RUN_LABEL}={run_id}"},
+        )
+
+    def run(self) -> None:
+        """Until the end of the last container, :meth:`close`, or the end of the engine."""
+        reason = "it closed the connection"
+        try:
+            for event in self._stream:
+                self._take(event)
+        except (DockerException, requests.RequestException, OSError, ValueError) as error:
+            reason = str(error)
+        if not self._is_closing:
+            self.lost = reason
+            self.signal_all(signal.SIGTERM)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._is_closing = True
+        with contextlib.suppress(OSError, DockerException):
+            self._stream.close()
+
+    def add(self, container_id: str) -> None:
+        """Keep listening until the end of this container has been asked for."""
+        self._awaited.add(container_id)
+
+    def end_of(self, container_id: str) -> tuple[int, bool] | None:
+        """The exit code of a container and whether it ran out of memory; ``None`` if it runs on."""
+        fate = self._fates.get(container_id)
+        if fate is None or fate.exit_code is None:
+            return None
+        if not fate.is_gone and time.monotonic() - fate.died_s < _REMOVAL_S:
+            return None
+        self._awaited.discard(container_id)
+        if not self._awaited:
+            self.close()
+        return fate.exit_code, fate.is_out_of_memory
+
+    def is_signalled(self, container_id: str) -> bool:
+        """Whether the engine has sent it a signal."""
+        fate = self._fates.get(container_id)
+        return fate is not None and fate.is_signalled
+
+    def has_processes(self, node: str) -> bool:
+        """Whether processes of a node are there, as this machine sees it."""
+        return node in RunProcesses(self._run_id).nodes().values()
+
+    def signal_all(self, number: int, node: str | None = None) -> None:
+        """Send a signal to the processes of the run, or of one node, without the engine."""
+        for pid, name in RunProcesses(self._run_id).nodes().items():
+            if node in (None, name):
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, number)
+
+    def _take(self, event: dict[str, Any]) -> None:
+        actor = event["Actor"]
+        fate = self._fates.setdefault(actor["ID"], _Fate())
+        if event["Action"] == "oom":
+            fate.is_out_of_memory = True
+        elif event["Action"] == "kill":
+            fate.is_signalled = True
+        elif event["Action"] == "die":
+            fate.died_s = time.monotonic()
+            fate.exit_code = int(actor["Attributes"]["exitCode"])
+        elif event["Action"] == "destroy":
+            fate.is_gone = True

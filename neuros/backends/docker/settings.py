@@ -1,0 +1,273 @@
+"""Settings of a container, from its node, its image and the user.
+
+By default a container is locked down: the caller's user id and no capability, nothing gained by
+programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
+goes with it. It sees the project and the workspace, which it can read, and the run folder, where it
+can write new files and into a folder of its own: what the other nodes and the run itself have there
+it can only read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neuros.backends.containers import PACKAGE
+from neuros.backends.docker.images import Image
+from neuros.backends.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
+from neuros.backends.leftover_containers import RUN_LABEL
+from neuros.backends.node_command import (
+    DEFAULTS,
+    log_file,
+    node_environment,
+    node_folder,
+    start_arguments,
+    with_messages,
+)
+from neuros.backends.placement import THREAD_VARIABLES, Cores, thread_limits
+from neuros.backends.run_processes import RUN_ID
+from neuros.errors import EnvironmentFault
+from neuros.project.model import NodeFile
+
+# Discovery stays on this machine, so that nodes have to share its network. Large packets go through
+# shared memory where both ends see the same: the containers of one run do, and see nobody else's.
+NETWORK_MODE = "host"
+IPC_MODE = "private"
+SHARED_MEMORY = Path("/dev/shm")
+
+MOST_PIDS = 4096
+"""Processes and threads of a node that sets no limit: what keeps a fork bomb to its container."""
+
+PASSED_ON = (
+    *("LANG", "LC_ALL", "TZ", *THREAD_VARIABLES),
+    *("MUJOCO_GL", "NEUROS_EXECUTOR", "RCUTILS_CONSOLE_OUTPUT_FORMAT", "ROS_STATIC_PEERS"),
+)
+"""What a container gets of the launcher's environment; the rest of it stays outside."""
+
+# Fast DDS reads settings of the user's own from the file that this names.
+DDS_SETTINGS = "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+_X11 = Path("/tmp/.X11-unix")
+_TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
+# What the engine keeps (`docker logs`) says where the rest is: the node writes its log itself, so
+# that nothing passes through the engine, and nothing is lost when that or the launcher dies.
+_START = 'echo "the output of this node is in $1"; log=$0; shift; exec "$@" >>"$log" 2>&1'
+
+
+@dataclass(frozen=True)
+class User:
+    """Whose rights a container has, and what of the user's session it may be let in to.
+
+    Attributes:
+        groups: further groups, those that own the devices of nodes.
+        environ: the environment of the launcher.
+        xauthority: the file with the key to the display that it names.
+        dds_settings: the file that its ``FASTRTPS_DEFAULT_PROFILES_FILE`` names.
+    """
+
+    uid: int
+    gid: int
+    groups: tuple[int, ...] = ()
+    environ: Mapping[str, str] = field(default_factory=dict)
+    xauthority: Path | None = None
+    dds_settings: Path | None = None
+
+    @property
+    def display(self) -> str:
+        """The X11 display, as in ``DISPLAY``; empty if there is none."""
+        return self.environ.get("DISPLAY", "")
+
+
+def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:
+    """The caller, as far as a node is let in to what belongs to the caller.
+
+    A rootless engine calls its user root in containers, with no more rights.
+
+    Raises:
+        EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
+    """
+    groups = {_group_of(file, device) for device in file.node.access.devices}
+    key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
+    return User(
+        0 if is_rootless else os.getuid(),
+        0 if is_rootless else os.getgid(),
+        () if is_rootless else tuple(sorted(groups.intersection(os.getgroups()))),
+        environ,
+        key if file.node.access.display and key.is_file() else None,
+        _dds_settings(environ.get(DDS_SETTINGS)),
+    )
+
+
+def container_settings(
+    file: NodeFile,
+    image: Image,
+    user: User,
+    options: Sequence[str],
+    environment: Mapping[str, str],
+    *,
+    others: Sequence[Path] = (),
+    cores: Cores | None = None,
+    launcher_pid: int = 0,
+) -> dict[str, Any]:
+    """The arguments of ``docker.containers.create`` for a node.
+
+    Args:
+        file: the node with the paths of this machine.
+        options: of the command ``node``, as ``--debug``.
+        environment: what the run adds to that of each node.
+        others: what is in the run folder and not the node's own; it can only read that.
+        launcher_pid: said in a label.
+    """
+    node, resources = file.node, file.node.resources
+    run_id = environment.get(RUN_ID, "")
+    settings: dict[str, Any] = {
+        "image": image.id,
+        "name": container_name(file, run_id),
+        "entrypoint": start_command(file, image, options),
+        "command": [],
+        "environment": _environment(file, user, environment, cores),
+        "working_dir": str(FOLDERS.run),
+        "labels": _labels(file, run_id, launcher_pid),
+        "mounts": _mounts(file, user, run_id, others),
+        "user": f"{user.uid}:{user.gid}",
+        "group_add": [str(group) for group in user.groups],
+        "cap_drop": ["ALL"],
+        "security_opt": ["no-new-privileges"],
+        "read_only": True,
+        "tmpfs": {"/tmp": _TMP},
+        "init": True,
+        "network_mode": NETWORK_MODE,
+        "ipc_mode": IPC_MODE,
+        "pids_limit": resources.pids or MOST_PIDS,
+        "auto_remove": True,
+    }
+    if resources.mem_bytes is not None:
+        # Without swap: a node that pages is no better than one that has ended, and does not say so.
+        settings |= {"mem_limit": resources.mem_bytes, "memswap_limit": resources.mem_bytes}
+    if resources.cpus is not None:
+        settings["nano_cpus"] = int(resources.cpus * 1e9)
+    if cores:
+        settings["cpuset_cpus"] = ",".join(map(str, cores))
+    if node.access.devices:
+        settings["devices"] = [f"{device}:{device}:rw" for device in node.access.devices]
+    if node.access.gpus:
+        settings["device_requests"] = [_gpu_request(node.access.gpus)]
+    return settings
+
+
+def container_name(file: NodeFile, run_id: str) -> str:
+    """The name of a container: unique, and to be recognised in ``docker ps``."""
+    return f"neuros-{file.node.name}-{run_id[:8]}"
+
+
+def shared_memory(run_id: str) -> Path:
+    """The folder of this machine that the containers of a run have as their ``/dev/shm``."""
+    return SHARED_MEMORY / f"neuros_{run_id}"
+
+
+def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
+    """The command of a container, in place of the image's own."""
+    seen = inside(file)
+    command = [*image.start, "-m", "neuros.cli", "node", *options]
+    return [
+        *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
+        *start_arguments(command, [seen]),
+    ]
+
+
+def _environment(
+    file: NodeFile, user: User, added: Mapping[str, str], cores: Cores | None
+) -> dict[str, str]:
+    environment = {
+        **DEFAULTS,
+        **{key: user.environ[key] for key in PASSED_ON if key in user.environ},
+        "HOME": "/tmp",
+        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that go by the user's entry instead
+        "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
+        **(thread_limits([file.node]) if cores else {}),
+        **node_environment(inside(file)),
+        **added,
+        **with_messages({"PYTHONPATH": str(LIBRARY)}, inside(file).messages),
+        "ROS_LOG_DIR": str(FOLDERS.run),
+    }
+    if user.dds_settings:
+        environment[DDS_SETTINGS] = str(DDS_FILE)
+    if file.node.access.display and user.display:
+        environment["DISPLAY"] = user.display
+        if "NEUROS_GUI" in user.environ:
+            environment.setdefault("NEUROS_GUI", user.environ["NEUROS_GUI"])
+        if user.xauthority:
+            environment["XAUTHORITY"] = str(XAUTHORITY)
+    return environment
+
+
+def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
+    return {
+        RUN_LABEL: run_id,
+        "neuros.node": file.node.name,
+        "neuros.project": str(file.folders.project),
+        "neuros.run_folder": str(file.folders.run),
+        "neuros.launcher": str(launcher_pid),
+    }
+
+
+def _mounts(
+    file: NodeFile, user: User, run_id: str, others: Sequence[Path]
+) -> list[dict[str, Any]]:
+    own = node_folder(file) / "node.json"
+    mounts = [
+        _mount(PACKAGE, LIBRARY / PACKAGE.name),
+        _mount(file.folders.project, FOLDERS.project),
+        _mount(file.folders.run, FOLDERS.run, read_only=False),
+        # In a folder that it may write to; but what it was told stays as it was.
+        _mount(own, node_folder(inside(file)) / own.name),
+        *(_mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
+        _mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
+    ]
+    if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
+        mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))
+    mounts += [
+        _mount(here.parent, there.parent)
+        for here, there in zip(file.messages, inside(file).messages, strict=True)
+    ]
+    if user.dds_settings:
+        mounts.append(_mount(user.dds_settings, DDS_FILE))
+    if file.node.access.display and user.display:
+        if _X11.is_dir():  # with a display over the network (ssh -X) there may be none
+            mounts.append(_mount(_X11, _X11))
+        if user.xauthority:
+            mounts.append(_mount(user.xauthority, XAUTHORITY))
+    return mounts
+
+
+def _mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
+    return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
+
+
+def _gpu_request(gpus: Sequence[str]) -> dict[str, Any]:
+    chosen = {"count": -1} if tuple(gpus) == ("all",) else {"device_ids": list(gpus)}
+    return {**chosen, "capabilities": [["gpu"]]}
+
+
+def _dds_settings(named: str | None) -> Path | None:
+    if not named:
+        return None
+    path = Path(named).absolute()
+    if not path.is_file():
+        raise EnvironmentFault(
+            f"{DDS_SETTINGS}={named}: there is no such file: unset it, or name one"
+        )
+    return path
+
+
+def _group_of(file: NodeFile, device: str) -> int:
+    try:
+        return os.stat(device).st_gid
+    except OSError as error:
+        raise EnvironmentFault(
+            f"node '{file.node.name}' asks for the device {device}: {error.strerror}: is it plugged"
+            f" in? Another one: --set nodes.{file.node.name}.devices='[\"/dev/...\"]'"
+        ) from error

@@ -1,0 +1,174 @@
+"""Command line, environment and scripts of a node process, with the ROS wheel environment.
+
+The ROS wheels from PyPI install a ``.pth`` file: each Python of their environment looks for their
+libraries and restarts itself once, with ``LD_LIBRARY_PATH`` and a mark in the environment. Two
+things follow. A child that runs another environment's Python must not inherit the mark: it would
+find no libraries. And a child that runs this Python can be given both, so that it need not start
+twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from neuros.backends.placement import THREAD_VARIABLES
+from neuros.project.model import NodeFile
+
+# One thread each: more threads than free cores make numerical libraries slower, not faster, and
+# simulators differ in the last bit with their number.
+DEFAULTS = {
+    "PYTHONUNBUFFERED": "1",
+    **dict.fromkeys(THREAD_VARIABLES, "1"),
+}
+# Runs the scripts one after another, each with the log of its node for output, by themselves where
+# they may be executed (seen from where they run, which may be a container); the shell passes
+# SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the node process of it:
+# same process id, nothing in between.
+_SCRIPTS = """\
+run() {
+  name=$1 script=$2 log=$3; shift 3
+  [ -x "$script" ] || set -- "$@" /bin/sh
+  "$@" "$script" >>"$log" 2>&1 & wait "$!"; code=$?
+  if [ "$code" -ne 0 ]; then
+    echo "[FATAL] [$(date +%s.%N)] [$name]: script $script failed: exit code $code"
+    exit 1
+  fi
+}
+trap 'trap - TERM; kill -TERM 0' TERM
+"""
+_SCRIPT_FAILED = re.compile(
+    r"\[FATAL\] \[\d+\.\d+\] \[(?P<node>\w+)\]: "
+    r"script (?P<script>.*) failed: (?P<how>exit code \d+)"
+)
+_TAIL_BYTES = 8192
+_MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+_LIBRARIES = "LD_LIBRARY_PATH"
+_BOOTSTRAPPER = "ros_wheels_bootstrapper"
+
+
+def node_folder(node: NodeFile) -> Path:
+    """The node's own folder in the run folder."""
+    return node.folders.run / node.node.name
+
+
+def log_file(node: NodeFile) -> Path:
+    """The file for the output of a node."""
+    return node_folder(node) / "node.log"
+
+
+def node_environment(node: NodeFile) -> dict[str, str]:
+    """Environment variables of one node only."""
+    return {**node.node.environment, "NEUROS_RUN_DIR": str(node_folder(node))}
+
+
+def process_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a node process: ``base`` (the launcher's own) with ``added`` on top."""
+    return {**DEFAULTS, **without_mark(base), **added}
+
+
+def with_messages(environment: Mapping[str, str], messages: Sequence[Path]) -> dict[str, str]:
+    """An environment in which Python finds built message packages, before all others."""
+    if not messages:
+        return dict(environment)
+    given = environment.get("PYTHONPATH", "")
+    paths = [*map(str, messages), *([given] if given else [])]
+    return {**environment, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def start_environment(
+    command: Sequence[str], nodes: Sequence[NodeFile], environment: Mapping[str, str]
+) -> dict[str, str]:
+    """``environment`` so that a node process of this Python starts in it without a restart.
+
+    Not where scripts run first: they may run any Python.
+    """
+    is_this_python = command[0] == sys.executable
+    if not is_this_python or any(node.node.script for node in nodes):
+        return dict(environment)
+    return with_libraries(environment)
+
+
+def node_command(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """The node program for these nodes, without their scripts."""
+    return [*command, *(str(node_folder(node) / "node.json") for node in nodes)]
+
+
+def start_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[str]:
+    """The command for these nodes: their scripts, one after another, and then the program.
+
+    A script runs in a process of its own in its node's environment; what it changes there does
+    not reach the node. What it prints goes to the log of its node.
+    """
+    program = node_command(command, nodes)
+    scripts = [_script_line(node, node.node.script) for node in nodes if node.node.script]
+    if not scripts:
+        return program
+    lines = [_SCRIPTS.rstrip("\n"), *scripts, "trap - TERM", f"exec {shlex.join(program)}"]
+    return ["/bin/sh", "-c", "\n".join(lines)]
+
+
+def script_failure(log: Path) -> str | None:
+    """The failed script that the last line of a log names, ``None`` if it names none."""
+    match = _SCRIPT_FAILED.fullmatch(last_line(log))
+    return match and f"script {match['script']} of '{match['node']}' failed: {match['how']}"
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log, empty if there is none."""
+    with contextlib.suppress(OSError), open(log, "rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        lines = file.read().decode(errors="replace").splitlines()
+        return lines[-1] if lines else ""
+    return ""
+
+
+def _script_line(node: NodeFile, script: Path) -> str:
+    variables = [f"{key}={value}" for key, value in node_environment(node).items()]
+    return shlex.join(["run", node.node.name, str(script), str(log_file(node)), "env", *variables])
+
+
+def without_mark(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment for any program: as it was before this Python restarted itself."""
+    given = dict(environment)
+    if given.pop(_MARK, None) is not None:
+        kept = [path for path in _paths(given.pop(_LIBRARIES, "")) if not _is_ours(path)]
+        if kept:
+            given[_LIBRARIES] = os.pathsep.join(kept)
+    return given
+
+
+def with_libraries(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment for this Python, which need not restart itself in it.
+
+    It is the one that the restart would make. Where the wheels do not restart Python, or not as we
+    know it, nothing is added.
+    """
+    libraries = _library_paths()
+    if not libraries:
+        return dict(environment)
+    given = [path for path in _paths(environment.get(_LIBRARIES, "")) if path not in libraries]
+    return {**environment, _LIBRARIES: os.pathsep.join([*libraries, *given]), _MARK: "1"}
+
+
+def _library_paths() -> list[str]:
+    """The folders that the wheels put in front, or none."""
+    # Each start of this Python has imported it. If not, importing it here would restart us.
+    find = getattr(sys.modules.get(_BOOTSTRAPPER), "get_ros_paths", None)
+    if find is None or _MARK not in os.environ:
+        return []
+    return sorted(path for path in _paths(str(find())) if _is_ours(path))
+
+
+def _paths(text: str) -> list[str]:
+    return [path for path in text.split(os.pathsep) if path]
+
+
+def _is_ours(path: str) -> bool:
+    prefixes = (str(Path(sys.prefix)), os.path.realpath(sys.prefix))
+    return any(path == inside or path.startswith(f"{inside}{os.sep}") for inside in prefixes)

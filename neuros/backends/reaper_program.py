@@ -1,0 +1,161 @@
+"""Program of the reaper process; :mod:`neuros.backends.reaper` explains it.
+
+It is on duty as soon as it can find and kill the processes of the run: the launcher waits for
+that, and for nothing else. So what takes longer to import, and only removes files, comes after.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from neuros.backends.run_processes import RunProcesses
+
+READY = b"ready\n"
+KILL_DEADLINE_S = 20.0
+"""A process in an uninterruptible system call outlasts even SIGKILL."""
+
+_GRACE_S = 4.5  # nodes have this long when the launcher died; all is gone within 6 s
+_POLL_S = 0.05
+_SETTLE_S = 0.5
+_REMOVE_S = 5.0
+
+
+class Orders:
+    """Orders of the launcher to the reaper so far."""
+
+    def __init__(self, started_s: float) -> None:
+        self.started_s = started_s
+        self.grace_s = _GRACE_S
+        self.sessions: list[int] = []
+        self.paths: list[str] = []
+        self.locks: list[tuple[int, str]] = []
+        self.engines: list[str] = []
+        self.is_finished = False
+
+    def take(self, order: str, value: object) -> None:
+        if order == "session" and isinstance(value, int):
+            self.sessions.append(value)
+        elif order == "remove" and isinstance(value, str):
+            self.paths.append(value)
+        elif order == "lock" and isinstance(value, list):
+            self.locks.append((int(value[0]), str(value[1])))
+        elif order == "grace" and isinstance(value, (int, float)):
+            self.grace_s, self.is_finished = float(value), True
+        elif order == "engine" and isinstance(value, str):
+            self.engines.append(value)
+
+
+def main(run_id: str) -> None:
+    """Wait for the pipe on standard input to close, clean up."""
+    for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
+        signal.signal(name, signal.SIG_IGN)
+    orders = Orders(started_s=time.time())
+    processes = RunProcesses(run_id)
+    os.write(1, READY)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    _import_the_rest()
+    for order, value in _read_orders():
+        orders.take(order, value)
+        if order == "session" and isinstance(value, int):
+            processes.add_session(value)
+    clean_up(run_id, orders, processes)
+
+
+def _read_orders() -> Iterator[tuple[str, object]]:
+    with open(0, "rb", closefd=False) as pipe:
+        for line in pipe:
+            # A launcher that is killed while it writes leaves half a line.
+            with contextlib.suppress(ValueError, TypeError):
+                order, value = json.loads(line)
+                yield order, value
+
+
+def _import_the_rest() -> None:
+    """Now, and not when it is needed: who knows what becomes of the disk until then."""
+    with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
+        import shutil  # noqa: F401
+
+        import neuros.backends.domain
+        import neuros.backends.leftover_containers
+        import neuros.backends.shared_memory  # noqa: F401
+
+
+def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None) -> None:
+    """End what is left of a run, after its grace period, and remove what it leaves."""
+    if processes is None:
+        processes = RunProcesses(run_id)
+        for pid in orders.sessions:
+            processes.add_session(pid)
+    _end_all(processes, orders.grace_s, lambda: _resume_containers(run_id, orders))
+    _remove_containers(run_id, orders)
+
+    from pathlib import Path
+
+    from neuros.backends.domain import remove_lock
+    from neuros.backends.shared_memory import remove_dead_runs, remove_segments, sweep
+
+    remove_segments(run_id)
+    sweep(orders.started_s)
+    _remove(orders.paths)
+    for descriptor, path in orders.locks:
+        remove_lock(descriptor, Path(path))
+    remove_dead_runs()
+
+
+def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]) -> None:
+    """Wait for all processes, and kill those that are left after the grace period.
+
+    What is paused is resumed: at once, so that it can end by itself, and when it was killed.
+    """
+    now = time.monotonic()
+    kill_at, give_up_at = now + grace_s, now + grace_s + KILL_DEADLINE_S
+    pause_s = _POLL_S / 5
+    resume_at = [now, kill_at]
+    while (alive := processes.alive()) and time.monotonic() < give_up_at:
+        if time.monotonic() >= kill_at:
+            _kill(alive)
+            pause_s = _POLL_S / 5
+        if resume_at and time.monotonic() >= resume_at[0]:
+            del resume_at[0]
+            resume()
+        time.sleep(max(0.001, min(pause_s, abs(kill_at - time.monotonic()))))
+        pause_s = min(_POLL_S, pause_s * 2)
+
+
+def _resume_containers(run_id: str, orders: Orders) -> None:
+    for engine in orders.engines:
+        from neuros.backends.leftover_containers import resume_containers
+
+        resume_containers(engine, run_id)
+
+
+def _remove_containers(run_id: str, orders: Orders) -> None:
+    """Containers that a killed launcher had asked for may still be on their way."""
+    for engine in orders.engines:
+        from neuros.backends.leftover_containers import remove_containers
+
+        settle_s = 0.0 if orders.is_finished else _SETTLE_S
+        remove_containers(engine, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
+
+
+def _kill(processes: Mapping[int, int]) -> None:
+    for pid in processes:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _remove(paths: Iterable[str]) -> None:
+    import shutil
+
+    for path in paths:
+        with contextlib.suppress(OSError):
+            if os.path.isdir(path) and not os.path.islink(path):
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                os.unlink(path)

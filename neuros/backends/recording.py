@@ -1,0 +1,89 @@
+"""The recorder process of a run: started before its nodes, ended after them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from neuros.backends.child_processes import start_sidecar
+
+END = b"end\n"
+"""What the recorder is told when nothing more will come."""
+
+_LOOK_S = 0.1
+
+
+@dataclass
+class Recorded:
+    """Last report of a recorder: packets by topic, and problems, a sentence each."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+class RecorderProcess:
+    """Runs the recorder of a run.
+
+    Args:
+        command: the program; started again, it completes what it has left before.
+        environment: what is added to that of this process.
+
+    Raises:
+        EnvironmentFault: if it cannot be started.
+    """
+
+    def __init__(
+        self, command: Sequence[str], run: Path, log: Path, environment: Mapping[str, str]
+    ) -> None:
+        self._command = list(command)
+        self._run = run
+        self._log = log
+        self._environment = environment
+        self._process = self._start()
+
+    @property
+    def pid(self) -> int:
+        """Its process id; it leads a session of its own."""
+        return self._process.pid
+
+    def finish(self, is_given_up: Callable[[], bool]) -> Recorded:
+        """Have it put the last packets into the bag, however long that takes.
+
+        Args:
+            is_given_up: asked again and again whether the user gives up waiting.
+        """
+        recorded = self._finish(is_given_up)
+        if recorded is None and not is_given_up():  # killed, or it has failed
+            self._process = self._start()
+            recorded = self._finish(is_given_up)
+        if recorded is None:
+            why = "it was not waited for" if is_given_up() else f"see {self._log}"
+            recorded = Recorded(
+                problems=[
+                    f"the bag is not complete ({why}): neuros bag repair {self._run} completes it"
+                ]
+            )
+        return recorded
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # The nodes come first: what the recorder has not got to waits for it on the disk.
+        return start_sidecar("recorder", self._command, self._run, self._log, self._environment)
+
+    def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
+        """Its last report, ``None`` if it makes none."""
+        told: bytes | None = END
+        while True:
+            try:
+                answer, _ = self._process.communicate(told, _LOOK_S)
+                break
+            except subprocess.TimeoutExpired:
+                told = None
+                if is_given_up():
+                    self._process.kill()
+        try:
+            return Recorded(**json.loads(answer))
+        except (ValueError, TypeError):
+            return None

@@ -1,0 +1,245 @@
+"""Removes the shared memory that killed nodes and killed launchers leave behind.
+
+A ROS node that ends by itself tidies up after itself; one that is killed leaves files in
+``/dev/shm``. Fast DDS makes them in groups::
+
+    fastrtps_<id>   fastrtps_port<n>     a segment, or a port: the memory itself
+    ..._el   ..._sl                      its lock files: flock held while the owner lives
+    sem.fastrtps_port<n>_mutex           its semaphore
+
+The lock says whether the owner lives, also across containers; Fast DDS's own ``fastdds shm clean``
+goes by it. A group with a free lock is dead, even while a former neighbour still maps it: that
+neighbour keeps its mapping and opens a new port when a new node comes. A group without lock files
+(its owner ended, but a killed neighbour never gave up its reference) is dead when nobody maps it.
+
+``lttng-ust-wait-*`` is one file per machine and one per user, shared by everything that is linked
+with LTTng; it goes when nobody maps it, and the next process makes it anew.
+
+``neuros_<run id>_...`` holds the large packets of a run's nodes. Once the processes of that run are
+gone it goes, and only then: the name says whose it is.
+
+Where launcher and reaper were both killed, the next run removes ``neuros_<run id>_...`` and
+``neuros_<run id>``, the folder that containers share, and so does ``neuros stop``. A living owner,
+the launcher or the sender, has them locked (``flock``); locks are seen from everywhere, also where
+processes are not (from within a container). Nodes may live on for some seconds.
+
+Standard library only: the reaper runs this.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from neuros.backends.run_processes import RunProcesses
+
+_FAST_DDS = re.compile(
+    r"(?:sem\.)?(?P<base>fast(?:rtps|dds|_datasharing)_.+?)(?P<part>_el|_sl|_mutex)?"
+)
+_LTTNG = re.compile(r"lttng-ust-wait-.+")
+_LOCKS = ("_el", "_sl")
+# The kernel stamps files with a clock that is a tick (10 ms at most) behind time.time().
+_CLOCK_SLACK_S = 0.05
+_NAME = re.compile(r"neuros_(?P<run>[0-9a-f]{16})(?:_.*)?")
+_LOOK_AGAIN_S = 0.1
+
+
+def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[str, ...]:
+    """Remove what a run, none of whose processes is left, had in shared memory for large packets.
+
+    Returns the names removed.
+    """
+    mine: list[tuple[str, int]] = []
+    with contextlib.suppress(FileNotFoundError):
+        for name in os.listdir(folder):
+            if name.startswith(f"neuros_{run_id}_"):
+                with contextlib.suppress(FileNotFoundError):
+                    status = os.lstat(folder / name)
+                    if status.st_uid == os.getuid():
+                        mine.append((name, status.st_ino))
+    return tuple(_remove(folder, mine))
+
+
+def sweep(
+    started_s: float, *, folder: Path = Path("/dev/shm"), look_again_s: float = 0.1
+) -> tuple[str, ...]:
+    """Remove what dead nodes of this user left since ``started_s`` (Unix time, seconds).
+
+    Looks twice, ``look_again_s`` apart, and removes only what is dead both times: a node that is
+    just starting makes its files a moment before it locks them. Returns the names removed.
+    """
+    first = set(_dead_groups(folder, started_s))
+    if not first:
+        return ()
+    time.sleep(look_again_s)
+    dead = [group for group in _dead_groups(folder, started_s) if group in first]
+    return tuple(name for group in dead for name in _remove(folder, group.files))
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Files that live and die together; ``files`` are (name, inode)."""
+
+    files: tuple[tuple[str, int], ...]
+
+
+@dataclass
+class _Found:
+    files: dict[str, os.stat_result] = field(default_factory=dict)
+    locks: list[str] = field(default_factory=list)
+
+
+def _dead_groups(folder: Path, started_s: float) -> Iterator[_Group]:
+    found = _groups(folder)
+    fresh = {
+        base: group
+        for base, group in found.items()
+        if _is_ours(group.files.values(), started_s if not _LTTNG.fullmatch(base) else 0.0)
+    }
+    if not fresh:
+        return
+    used = _names_in_use(folder)
+    for group in fresh.values():
+        dead = (
+            not any(_is_locked(folder, name, used) for name in group.locks)
+            if group.locks
+            else used.isdisjoint(group.files)
+        )
+        if dead:
+            yield _Group(tuple(sorted((name, stat.st_ino) for name, stat in group.files.items())))
+
+
+def _groups(folder: Path) -> Mapping[str, _Found]:
+    found: dict[str, _Found] = {}
+    with contextlib.suppress(FileNotFoundError):
+        for name in os.listdir(folder):
+            match = _FAST_DDS.fullmatch(name)
+            if not match and not _LTTNG.fullmatch(name):
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                stat = os.lstat(folder / name)
+                group = found.setdefault(match["base"] if match else name, _Found())
+                group.files[name] = stat
+                if match and match["part"] in _LOCKS:
+                    group.locks.append(name)
+    return found
+
+
+def _is_ours(stats: Iterable[os.stat_result], started_s: float) -> bool:
+    stats = list(stats)
+    return all(stat.st_uid == os.getuid() for stat in stats) and any(
+        stat.st_mtime >= started_s - _CLOCK_SLACK_S for stat in stats
+    )
+
+
+def _names_in_use(folder: Path) -> set[str]:
+    """Names in ``folder`` that some process, as far as it can be seen, has mapped or open."""
+    prefix = f"{folder}/"
+    names: set[str] = set()
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        # Processes end while we look, and those of other users do not let us in.
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
+            for line in maps:
+                at = line.find(prefix.encode())
+                if at >= 0:
+                    names.add(os.fsdecode(line[at + len(prefix) :].rstrip(b"\n")))
+        with contextlib.suppress(OSError):
+            for descriptor in os.listdir(f"/proc/{pid}/fd"):
+                with contextlib.suppress(OSError):
+                    target = os.readlink(f"/proc/{pid}/fd/{descriptor}")
+                    if target.startswith(prefix):
+                        names.add(target[len(prefix) :])
+    return names
+
+
+def _is_locked(folder: Path, name: str, used: set[str]) -> bool:
+    if name in used:  # open: locked, or about to be; do not get in the way
+        return True
+    try:
+        descriptor = os.open(folder / name, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:
+    for name, inode in files:
+        with contextlib.suppress(OSError):
+            if os.lstat(folder / name).st_ino == inode:
+                os.unlink(folder / name)
+                yield name
+
+
+def hold(folder: Path) -> int:
+    """Lock a folder for as long as this process lives; returns the descriptor that does it.
+
+    Raises:
+        OSError: if it cannot be opened.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
+    return descriptor
+
+
+def remove_dead_runs(
+    folder: Path = Path("/dev/shm"), *, look_again_s: float = _LOOK_AGAIN_S
+) -> tuple[str, ...]:
+    """Remove what dead runs of this user have left; returns the names removed.
+
+    Looks twice: what has just been made is locked a moment later.
+    """
+    first = _dead(folder)
+    if not first:
+        return ()
+    time.sleep(look_again_s)
+    second = _dead(folder)
+    names = sorted(name for name, inode in first.items() if second.get(name) == inode)
+    for name in names:
+        path = folder / name
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    return tuple(names)
+
+
+def _dead(folder: Path) -> dict[str, int]:
+    """Names and inodes without a lock, of runs without processes."""
+    found: dict[str, int] = {}
+    is_alive: dict[str, bool] = {}
+    for name in os.listdir(folder) if folder.is_dir() else ():
+        match = _NAME.fullmatch(name)
+        inode = _inode_if_free(folder / name) if match else None
+        if match and inode is not None:
+            run = match["run"]
+            if run not in is_alive:
+                is_alive[run] = bool(RunProcesses(run).alive())
+            if not is_alive[run]:
+                found[name] = inode
+    return found
+
+
+def _inode_if_free(path: Path) -> int | None:
+    """The inode of a file or folder of this user without a lock."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            status = os.fstat(descriptor)
+            return status.st_ino if status.st_uid == os.getuid() else None
+        finally:
+            os.close(descriptor)
+    return None

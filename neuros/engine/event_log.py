@@ -1,0 +1,211 @@
+"""The event log of an engine: a row of numbers, from which a replay makes the events again.
+
+An engine decides by its events, and, where hooks have a period, by what its clock says. So both
+are noted, in their order, and each start of a hook besides, to check against. A number below zero
+is an event (its complement has the kind in 5 bits, a place in 20 and a position in 38), any other
+one a reading of the clock. An entry costs some 0.1 us.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from neuros.engine.engine import Engine
+from neuros.engine.hook import Hook
+from neuros.hooks import HookKind
+from neuros.project.model import Connection
+
+_KIND_BITS, _PLACE_BITS = 5, 20
+_POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
+
+
+class EventKind(IntEnum):
+    """The kinds of entries; ``place`` and ``position`` where they have one."""
+
+    BEGIN = 0  # never written: what comes before the first event
+    START = 1
+    PACKET = 2  # place: index of the connection
+    HEARD = 3  # place: of the input, bound to an external topic, among the inputs of the node
+    ACKNOWLEDGEMENT = 4  # place: index of the connection; position
+    REGISTERED = 5  # place: index of the connection
+    TIMER = 6
+    LOOP_BACK = 7
+    OFFER = 8
+    DRAIN = 9
+    STOP = 10  # no further hook starts: the log is whole
+    HOOK = 11  # place: of the hook that starts, in the order of declaration
+    PAUSE = 12
+    RESUME = 13
+    STEP = 14  # place: 1 if some node of the project drives it; position: how many
+    DEFERRED = 15  # the pass ended, for what had arrived; position: how many hooks it had started
+    LAST_ROUND = 16  # place: of a hook that starts at most once more when the node drains: next
+
+
+class Event(NamedTuple):
+    """An event, and what the clock said from then to the next one.
+
+    ``limit``: after so many starts its pass ended, for what had arrived; ``None``: it did not.
+    """
+
+    kind: EventKind
+    place: int
+    position: int
+    readings: list[int]
+    limit: int | None = None
+
+
+class LoggedEngine(Engine):
+    """Notes its events in :attr:`event_log`, until the packet log takes the entries away.
+
+    Its arguments are those of :class:`Engine`.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        node, connections, specs, effects, clock, types = arguments
+        self.event_log = array("q")
+        self._note = self.event_log.append
+        has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
+        own_clock = self._noting(clock) if has_ticks else clock
+        super().__init__(node, connections, specs, effects, own_clock, types)
+        self._has_taken_in = self._noting_deferral(effects.has_taken_in)
+        self._starts = 0
+        self._hook_entries = {
+            hook: _entry(EventKind.HOOK, place) for place, hook in enumerate(self.all_hooks)
+        }
+        self._packet_entries: dict[Connection | str, int] = {
+            connection: _entry(EventKind.PACKET, connection.index) for connection in connections
+        } | {port.name: _entry(EventKind.HEARD, place) for place, port in enumerate(node.inputs)}
+        self._acknowledgement_entries = {
+            connection: _entry(EventKind.ACKNOWLEDGEMENT, connection.index)
+            for connection in connections
+        }
+
+    def start(self) -> None:
+        self._note(_entry(EventKind.START))
+        super().start()
+
+    def on_packet(self, key: Connection | str, packet: Any) -> None:
+        self._note(self._packet_entries[key])
+        super().on_packet(key, packet)
+
+    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+        self._note(self._acknowledgement_entries[connection] - (position << _POSITION_SHIFT))
+        super().on_acknowledgement(connection, position)
+
+    def on_registered(self, connection: Connection) -> None:
+        self._note(_entry(EventKind.REGISTERED, connection.index))
+        super().on_registered(connection)
+
+    def on_timer(self) -> None:
+        self._note(_TIMER)
+        super().on_timer()
+
+    def on_loop_back(self) -> None:
+        self._note(_LOOP_BACK)
+        super().on_loop_back()
+
+    def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
+        self._note(_OFFER)
+        return super().offer(packets, accepted)
+
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        for place in last_round:
+            self._note(_entry(EventKind.LAST_ROUND, place))
+        self._note(_entry(EventKind.DRAIN))
+        super().drain(last_round)
+
+    def pause(self) -> None:
+        self._note(_entry(EventKind.PAUSE))
+        super().pause()
+
+    def resume(self) -> None:
+        if not self._lifecycle.is_draining:  # a drain resumes by itself, here and in the replay
+            self._note(_entry(EventKind.RESUME))
+        super().resume()
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        self._note(_entry(EventKind.STEP, int(is_driven), count))
+        super().step(count, is_driven=is_driven)
+
+    def stop_hooks(self) -> None:
+        super().stop_hooks()
+        self._note(_entry(EventKind.STOP))
+
+    def _pass(self, *, may_start: bool = False) -> None:
+        if not self._is_passing:
+            self._starts = 0
+        super()._pass(may_start=may_start)
+
+    def _run(self, hook: Hook) -> None:
+        self._starts += 1
+        entry = self._hook_entries.get(hook)  # packets from a plugin's thread have none
+        if entry is not None:
+            self._note(entry)
+        super()._run(hook)
+
+    def _noting_deferral(self, has_taken_in: Callable[[], bool]) -> Callable[[], bool]:
+        def noted() -> bool:
+            is_in = has_taken_in()
+            if not is_in:
+                self._note(_entry(EventKind.DEFERRED, position=self._starts))
+            return is_in
+
+        return noted
+
+    def _noting(self, clock: Callable[[], int]) -> Callable[[], int]:
+        note = self._note
+
+        def noted() -> int:
+            now_ns = clock()
+            note(now_ns)
+            return now_ns
+
+        return noted
+
+
+def events_of(event_log: Iterable[int]) -> Iterator[Event]:
+    """The events of a log; the first, ``BEGIN``, has the readings before all others."""
+    event = Event(EventKind.BEGIN, 0, 0, [])
+    for number in event_log:
+        if number >= 0:
+            event.readings.append(number)
+            continue
+        kind, place, position = _parts(number)
+        if kind is EventKind.DEFERRED:
+            event = event._replace(limit=position)
+        elif kind is not EventKind.HOOK:
+            yield event
+            event = Event(kind, place, position, [])
+    yield event
+
+
+def starts_of(event_log: Iterable[int]) -> Iterator[int]:
+    """The hooks that have started, by their places in the order of declaration."""
+    for number in event_log:
+        if number < 0 and (~number & _mask(_KIND_BITS)) == EventKind.HOOK:
+            yield _parts(number)[1]
+
+
+def is_whole(event_log: Iterable[int]) -> bool:
+    """Whether it goes to the end of the run."""
+    return _entry(EventKind.STOP) in event_log
+
+
+def _entry(kind: EventKind, place: int = 0, position: int = 0) -> int:
+    return ~(kind | place << _KIND_BITS | position << _POSITION_SHIFT)
+
+
+def _parts(entry: int) -> tuple[EventKind, int, int]:
+    value = ~entry
+    place = value >> _KIND_BITS & _mask(_PLACE_BITS)
+    return EventKind(value & _mask(_KIND_BITS)), place, value >> _POSITION_SHIFT
+
+
+def _mask(bits: int) -> int:
+    return (1 << bits) - 1
+
+
+_TIMER, _LOOP_BACK, _OFFER = map(_entry, (EventKind.TIMER, EventKind.LOOP_BACK, EventKind.OFFER))

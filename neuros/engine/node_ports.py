@@ -1,0 +1,131 @@
+"""The ports of a node in its engine: subscriptions, send windows, outputs and inputs of hooks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from neuros.engine.input_queue import HookInput, Subscription
+from neuros.engine.send_window import SendWindow
+from neuros.errors import HookError
+from neuros.hooks import HookSpec, InputSpec
+from neuros.project.model import Connection, Node, Port
+from neuros.project.qos import DEPTH
+
+
+class PacketType(NamedTuple):
+    """The type that a hook must return for an output.
+
+    Attributes:
+        kind: the message class.
+        check: returns a packet with the values that are sent, or raises ``WrongValue``.
+    """
+
+    kind: type
+    check: Callable[[Any], Any]
+
+
+class Output:
+    """One output of the node and the connections that it feeds.
+
+    ``packet_type`` is ``None`` if a hook may return anything for it.
+    """
+
+    __slots__ = ("elsewhere", "packet_type", "port", "to_itself", "windows")
+
+    def __init__(
+        self, port: Port, windows: Sequence[SendWindow], packet_type: PacketType | None
+    ) -> None:
+        self.port = port
+        self.windows = tuple(windows)
+        connections = [window.connection for window in windows]
+        self.to_itself = tuple(c for c in connections if c.destination_node == c.source_node)
+        self.elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
+        self.packet_type = packet_type
+
+
+class NodePorts:
+    """The ports of one node, joined to its connections.
+
+    Args:
+        connections: all that begin or end at the node, in the project's order.
+        packet_types: per output name; hooks may return anything where there is none.
+
+    Attributes:
+        subscriptions: by connection; those of external topics come last, by the name of the input.
+        send_windows: by connection; one to the node itself is registered from the start.
+        outputs: by name.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        connections: Sequence[Connection],
+        packet_types: Mapping[str, PacketType],
+    ) -> None:
+        self._node = node
+        self.subscriptions: dict[Connection | str, Subscription] = {
+            c: _subscription(c) for c in connections if c.destination_node == node.name
+        }
+        for port in node.inputs:
+            if port.external_topic is not None:
+                depth = DEPTH if port.qos is None else port.qos.depth or DEPTH
+                self.subscriptions[port.name] = Subscription(
+                    port.name, port.external_topic, port.name, depth
+                )
+        self.send_windows = {c: SendWindow(c) for c in connections if c.source_node == node.name}
+        for connection, window in self.send_windows.items():
+            window.is_registered = connection.destination_node == node.name
+        self.outputs = {
+            port.name: Output(
+                port,
+                [o for c, o in self.send_windows.items() if c.source_output == port.name],
+                packet_types.get(port.name),
+            )
+            for port in node.outputs
+        }
+
+    def inputs_of(self, spec: HookSpec) -> list[HookInput]:
+        """The inputs of a hook, after a check of all ports that it names.
+
+        Raises:
+            HookError: if the node has no such port, or a required input has no source.
+        """
+        inputs = [port.name for port in self._node.inputs]
+        for kind, ports, known in (
+            ("input", spec.inputs, inputs),
+            ("output", spec.outputs, [*self.outputs]),
+        ):
+            for port in ports:
+                if port.name not in known:
+                    text = undeclared(kind, port.name, known, self._node)
+                    raise HookError(text, hook=spec.name, where=spec.where)
+        return [self._hook_input(spec, port) for port in spec.inputs]
+
+    def _hook_input(self, spec: HookSpec, port: InputSpec) -> HookInput:
+        subscriptions = [s for s in self.subscriptions.values() if s.input_name == port.name]
+        if not subscriptions and not port.is_optional:
+            raise HookError(
+                f"needs input '{port.name}', but nothing is connected to"
+                f" {self._node.name}.{port.name}: connect it, or declare it Optional",
+                hook=spec.name,
+                where=spec.where,
+            )
+        return HookInput(port, subscriptions)
+
+
+def undeclared(kind: str, name: str, known: Iterable[str], node: Node) -> str:
+    """The message for a port that a node does not have."""
+    has = ", ".join(sorted(known)) or "none"
+    return f"node '{node.name}' declares no {kind} '{name}' (it has {has})"
+
+
+def _subscription(connection: Connection) -> Subscription:
+    return Subscription(
+        connection,
+        str(connection),
+        connection.destination_input,
+        connection.queue_size,
+        is_lossless=connection.discard_limit == 0,
+        is_acknowledged=connection.is_reliable,
+    )

@@ -1,0 +1,102 @@
+"""The sending end of a connection: it counts the packets that the receiver has not started on.
+
+"Publish and hope" loses packets, and asking a central controller costs a round trip for each. Here
+the receiver acknowledges a packet when a hook *starts* on it, neither earlier (then a packet could
+be lost behind a busy hook) nor later (then nothing would overlap). The sender counts: ``outstanding
+= sent - acknowledged``. It blocks while that reaches the window ``K + N``, where K is what the
+receiver's input queue holds and N what it may discard in a row. N = 0 is then lossless by
+construction: the queue always has room for what may be sent. Since an acknowledgement carries a
+position and not a mere "one more", it is cumulative; a repeated or late one does no harm.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Protocol
+
+from neuros.engine.metrics import Rest, State
+from neuros.errors import ProtocolError
+from neuros.project.model import Connection
+
+
+class Sender(Protocol):
+    """A hook, as its send windows see it; ``blocked`` counts those that are blocked now."""
+
+    blocked: int
+
+
+class SendWindow:
+    """The send window of one connection: it blocks its hooks while it is full.
+
+    Attributes:
+        is_blocked: whether nothing may be sent on it now.
+        is_registered: whether its receiver is known to be there.
+        size: packets that may be outstanding, K + N.
+        sent_ns: when each packet was sent, until the packet log takes the times away.
+        hooks: those that send on it.
+    """
+
+    __slots__ = (
+        "acknowledged",
+        "acknowledged_ns",
+        "connection",
+        "hooks",
+        "is_blocked",
+        "is_registered",
+        "is_reliable",
+        "rest",
+        "sent",
+        "sent_ns",
+        "size",
+    )
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self.rest = Rest(State.BLOCKED, str(connection))
+        self.size = connection.window
+        self.is_reliable = connection.is_reliable
+        self.is_registered = False
+        self.is_blocked = False
+        self.sent = 0
+        self.sent_ns = array("q")
+        self.acknowledged = 0
+        self.acknowledged_ns: int | None = None
+        self.hooks: list[Sender] = []
+
+    @property
+    def outstanding(self) -> int:
+        """Packets sent and not acknowledged yet; 0 on a connection without acknowledgements."""
+        return self.sent - self.acknowledged if self.is_reliable else 0
+
+    def spend(self, now_ns: int) -> None:
+        """Count a packet that is sent now."""
+        self.sent += 1
+        self.sent_ns.append(now_ns)
+        if self.is_reliable and self.sent - self.acknowledged >= self.size and not self.is_blocked:
+            self.is_blocked = True
+            for hook in self.hooks:
+                hook.blocked += 1
+
+    def credit(self, position: int, now_ns: int) -> None:
+        """Take an acknowledgement of all packets up to ``position``.
+
+        Raises:
+            ProtocolError: if more is acknowledged than was sent.
+        """
+        if position > self.sent:
+            raise ProtocolError(
+                f"{self.connection}: packet {position} was acknowledged, but only {self.sent}"
+                " were sent: is a node of the same name running in this ROS domain?"
+            )
+        if position <= self.acknowledged:
+            return
+        self.acknowledged = position
+        self.acknowledged_ns = now_ns
+        if self.is_blocked and self.sent - position < self.size:
+            self.is_blocked = False
+            for hook in self.hooks:
+                hook.blocked -= 1
+
+    def frees(self, position: int) -> bool:
+        """Whether an acknowledgement of ``position`` would leave it unblocked."""
+        return self.sent - max(self.acknowledged, position) < self.size

@@ -1,0 +1,151 @@
+"""The metrics of a running node as plain data: for reports, ``run.json`` and the table at the end.
+
+:func:`snapshot` may be called from any thread while the engine runs. It only reads, and it takes no
+lock, so figures of one snapshot can be an event apart; once the node has stopped they are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from neuros.engine.engine import Engine
+from neuros.engine.hook import Hook
+from neuros.engine.input_queue import Subscription
+from neuros.engine.metrics import IDLE, Rest, State
+from neuros.engine.send_window import SendWindow
+from neuros.hooks import HookKind
+
+_T = TypeVar("_T")
+
+_ATTEMPTS = 10
+
+
+def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
+    """The metrics of a node so far; JSON-serialisable. Any thread.
+
+    Args:
+        now_ns: the time now, on the engine's clock.
+
+    Returns:
+        ``state``: what it does now, ``{"state", "cause"}``.
+        ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
+        ``outgoing``: counters by connection (``a.out -> b.in``).
+        ``incoming``: likewise; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
+        is ready to start on the oldest unread packet.
+        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
+        those that initialise, how many of the seconds that took.
+        ``accounting``: seconds by cause; ``total`` is the sum of all others.
+    """
+    hooks = tuple(engine.all_hooks)
+    rest = steadily(engine.rest, IDLE)
+    return {
+        "state": {"state": rest.state.value, "cause": rest.cause},
+        "executing": _executing(engine, now_ns),
+        "outgoing": {str(o.connection): _outgoing(o) for o in engine.send_windows.values()},
+        "incoming": {
+            f"{subscription.name} -> {engine.node.name}.{subscription.input_name}"
+            if subscription.is_external
+            else subscription.name: _incoming(subscription)
+            for subscription in engine.subscriptions.values()
+        },
+        "hooks": _hooks(hooks),
+        "accounting": _accounting(engine, hooks, rest, now_ns),
+    }
+
+
+def steadily(read: Callable[[], _T], otherwise: _T) -> _T:
+    """Read what another thread changes meanwhile: again, if it changed while it was read."""
+    for _ in range(_ATTEMPTS):
+        try:
+            return read()
+        except (RuntimeError, LookupError, ValueError, StopIteration):
+            continue
+    return otherwise
+
+
+def _executing(engine: Engine, now_ns: int) -> dict[str, Any] | None:
+    hook = engine.executing
+    if hook is None:
+        return None
+    return {
+        "name": hook.name,
+        "for_s": max(0, now_ns - engine.since_ns) / 1e9,
+        "executions": hook.executions,
+    }
+
+
+def _outgoing(window: SendWindow) -> dict[str, Any]:
+    acknowledged = window.acknowledged  # before `sent`, which only grows: outstanding is never < 0
+    sent = window.sent
+    return {
+        "sent": sent,
+        "acknowledged": acknowledged,
+        "outstanding": sent - acknowledged if window.is_reliable else 0,
+        "window": window.size,
+        "is_reliable": window.is_reliable,
+        "is_blocked": window.is_blocked,
+    }
+
+
+def _incoming(subscription: Subscription) -> dict[str, Any]:
+    consumed = subscription.consumed  # before `received`, for that reason, too
+    discarded = subscription.discarded
+    received = subscription.received
+    return {
+        "received": received,
+        "consumed": consumed,
+        "discarded": discarded,
+        "longest_discard": subscription.longest_discard,
+        "unread": received - consumed - discarded,
+        "acknowledged": subscription.acknowledged,
+        "taker": steadily(lambda: _taker(subscription), None),
+    }
+
+
+def _taker(subscription: Subscription) -> str | None:
+    """A hook that could start now, and would take a packet of this subscription."""
+    hooks = (q.hook_input.hook for q in subscription.queues if q.hook_input.would_take(q))
+    return next((hook.name for hook in hooks if hook.is_ready()), None)
+
+
+def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
+    metrics: dict[str, dict[str, Any]] = {}
+    for hook in hooks:  # a function with two marks is two hooks of one name
+        entry = metrics.setdefault(hook.name, {"executions": 0, "busy_s": 0.0, "missed_ticks": 0})
+        entry["executions"] += hook.executions
+        entry["busy_s"] += hook.busy_ns / 1e9
+        entry["missed_ticks"] += hook.missed_ticks
+        if hook.spec.kind is HookKind.INITIALISE:
+            entry["initialise_s"] = entry.get("initialise_s", 0.0) + hook.busy_ns / 1e9
+        if hook.ticks is not None:
+            entry["ticks"] = steadily(hook.ticks.figures, None)
+    return metrics
+
+
+def _accounting(engine: Engine, hooks: tuple[Hook, ...], rest: Rest, now_ns: int) -> dict[str, Any]:
+    nothing: dict[Rest, int] = {}
+    spent = steadily(lambda: dict(engine.spent_ns), nothing)
+    for hook in hooks:
+        cause = Rest(State.EXECUTING, hook.name)
+        spent[cause] = spent.get(cause, 0) + hook.busy_ns
+    # What is not counted yet is what the node does now; a hook that has just ended may be ahead.
+    open_ns = max(0, now_ns - engine.created_ns - sum(spent.values()))
+    spent[rest] = spent.get(rest, 0) + open_ns
+
+    def by_cause(state: State) -> dict[str, float]:
+        return {cause.cause: ns / 1e9 for cause, ns in spent.items() if cause.state is state}
+
+    def in_all(state: State) -> float:
+        return sum(ns for cause, ns in spent.items() if cause.state is state) / 1e9
+
+    return {
+        "executing": by_cause(State.EXECUTING),
+        "waiting": by_cause(State.WAITING),
+        "blocked": by_cause(State.BLOCKED),
+        "idle": in_all(State.IDLE),
+        "registering": in_all(State.REGISTERING),
+        "scheduling": in_all(State.SCHEDULING),
+        "paused": in_all(State.PAUSED),
+        "total": sum(spent.values()) / 1e9,
+    }

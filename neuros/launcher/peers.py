@@ -1,0 +1,281 @@
+"""Launchers that run parts of one project: their states, and the common end.
+
+The launchers are *peers*, and meet through their nodes alone: each publishes its
+:class:`PeerState` through its nodes, and hears those of its peers. So peers can start in any order;
+each knows for which it still waits; and the end of one is the end of all.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
+
+from neuros.project.model import Connection, NodeFile
+
+Books = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
+"""``books[node]["outgoing" or "incoming"][connection]``: counters, as in a node's metrics."""
+
+RUNNING, DRAINING, DRAINED, STOPPING, OVER = "running", "draining", "drained", "stopping", "over"
+_BEGUN = (RUNNING, DRAINING, DRAINED)
+_FIRST_REMARK_S = 5.0
+_NEXT_REMARK_S = 10.0
+# A node that is gone may have said why a moment before, on a longer way.
+_GRACE_S = 0.3
+# How long a launcher that has come to its end waits for what a peer has counted.
+_PATIENCE_S = 2.0
+
+
+@dataclass(frozen=True)
+class PeerState:
+    """State that one launcher publishes to its peers: all of it, so that a missed one is no loss.
+
+    Attributes:
+        run: which run it is.
+        machine: its name.
+        number: a later state has a higher one.
+        phase: of the run there.
+        exit_code, reason: how it ends, from when it is to end on.
+        origin: the machine on which the cause of that lies.
+        drain_s: for how long it drains at most.
+        books: of the connections between peers, when drained or over.
+    """
+
+    run: str
+    machine: str
+    number: int = 0
+    phase: str = RUNNING
+    exit_code: int = 0
+    reason: str = ""
+    origin: str = ""
+    drain_s: float = 0.0
+    books: Books = field(default_factory=dict)
+
+    def to_text(self) -> str:
+        """As it travels."""
+        return json.dumps(asdict(self))
+
+    @property
+    def has_just_begun(self) -> bool:
+        """Whether a peer that starts now can still take part."""
+        return self.phase in _BEGUN
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the end has been asked for."""
+        return self.phase != RUNNING
+
+
+def state_from(text: str) -> PeerState | None:
+    """The inverse of :meth:`PeerState.to_text`; ``None`` for anything else."""
+    try:
+        return PeerState(**json.loads(text))
+    except (TypeError, ValueError):
+        return None
+
+
+def books_of(reports: Mapping[str, Mapping[str, Any]], crossing: Sequence[Connection]) -> Books:
+    """The counters of connections to peers, from the reports of the nodes here."""
+    keys = {str(connection) for connection in crossing}
+    return {
+        name: {
+            part: {key: dict(c) for key, c in report["metrics"][part].items() if key in keys}
+            for part in ("outgoing", "incoming")
+        }
+        for name, report in reports.items()
+        if report["metrics"] is not None
+    }
+
+
+def count(books: Books, node: str, part: str, connection: Connection, what: str) -> int | None:
+    """One counter, ``None`` where it is not known."""
+    found = books.get(node, {}).get(part, {}).get(str(connection), {}).get(what)
+    return None if found is None else int(found)
+
+
+class End(NamedTuple):
+    """The end of the project elsewhere: its exit code, its reason, and for how long it drains."""
+
+    exit_code: int
+    reason: str
+    drain_s: float
+
+
+class Peers:
+    """The peers of this launcher, and what it tells them.
+
+    Args:
+        run: marks this run.
+        elsewhere: the nodes of the project that are not started here; none: there are no peers.
+        files: the nodes that are.
+        hint: what to add where nodes elsewhere are waited for.
+    """
+
+    def __init__(
+        self, run: str, elsewhere: Sequence[str], files: Sequence[NodeFile], hint: str = ""
+    ) -> None:
+        self._elsewhere = elsewhere
+        self._hint = hint
+        here = {file.node.name for file in files}
+        self._crossing = sorted(
+            {c for file in files for c in file.connections if not _ends(c) <= here},
+            key=lambda connection: connection.index,
+        )
+        neighbours = {name for connection in self._crossing for name in _ends(connection)}
+        self._missing = neighbours - here
+        self._found: list[str] = []
+        self._say: Callable[[str], object] = lambda _: None
+        self._own = PeerState(run, socket.gethostname())
+        self._others: dict[str, PeerState] = {}
+        self._run_of: dict[str, str] = {}
+        self._gone_s: dict[str, float] = {}
+        self._next_remark_s: float | None = None
+        self._over_s: float | None = None
+
+    # ------------------------------------------------------------------ speaking
+
+    def speak_through(self, say: Callable[[str], object]) -> None:
+        """Have nodes say what there is to say by ``say(text)``."""
+        self._say = say
+
+    @property
+    def exist(self) -> bool:
+        """Whether there are any."""
+        return bool(self._elsewhere)
+
+    @property
+    def own_state(self) -> str:
+        """The newest state of this launcher, for nodes that have just come."""
+        return self._own.to_text()
+
+    def drain(self, reason: str, drain_s: float) -> None:
+        """The run here drains."""
+        self._utter(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
+
+    def settle(self, probes: Mapping[str, Mapping[str, Any]]) -> bool:
+        """The run here is drained by itself; returns whether peers agree, and nothing is under way.
+
+        Others count it as drained only while the counters of both ends are equal. A packet under
+        way shows in them (Mattern's counters, see :mod:`neuros.launcher.quiescence`).
+        """
+        books = books_of(probes, self._crossing)
+        if (self._own.phase, self._own.books) != (DRAINED, books):
+            self._utter(phase=DRAINED, books=books)
+        return all(self._agrees(state) for state in self._living())
+
+    def unsettle(self) -> None:
+        """There is still something to do here."""
+        if self._own.phase == DRAINED:
+            self._utter(phase=DRAINING)
+
+    def stop(self, exit_code: int, reason: str) -> None:
+        """The run here stops."""
+        self._utter(phase=STOPPING, **self._because(reason, exit_code))
+
+    def finish(self, reports: Mapping[str, Mapping[str, Any]], now_s: float) -> bool:
+        """All nodes here have made their final report; returns whether they may go."""
+        if self._over_s is None:
+            self._over_s = now_s
+            self._utter(phase=OVER, books=books_of(reports, self._crossing))
+        return not self._unfinished() or now_s - self._over_s >= _PATIENCE_S
+
+    # ------------------------------------------------------------------ hearing
+
+    def hear(self, node: str, text: str | None, now_s: float) -> None:
+        """A node elsewhere has said something, or is gone."""
+        if text is None:
+            if node in self._run_of:
+                self._gone_s.setdefault(node, now_s)
+            return
+        state = state_from(text)
+        if state is None or state.run == self._own.run:
+            return
+        if state.run not in self._others and not state.has_just_begun:
+            return  # the rest of a run before this one
+        if self._run_of.setdefault(node, state.run) != state.run:
+            self._gone_s.setdefault(node, now_s)  # another has taken its place
+            return
+        if node in self._missing:
+            self._missing.remove(node)
+            self._found.append(f"{node} ({state.machine})")
+        if state.run not in self._others or state.number > self._others[state.run].number:
+            self._others[state.run] = state
+
+    def end(self, now_s: float) -> End | None:
+        """The end of the project elsewhere, if there is one."""
+        for node, gone_s in self._gone_s.items():
+            state = self._others[self._run_of[node]]
+            if not state.is_ending and now_s - gone_s >= _GRACE_S:
+                machine = state.machine
+                return End(
+                    1,
+                    f"node '{node}' on {machine} is gone: it was killed, or {machine} or the"
+                    " network to it is down",
+                    0.0,
+                )
+        ending = [state for state in self._others.values() if state.is_ending]
+        if not ending:
+            return None
+        worst = max(ending, key=lambda state: state.exit_code)
+        reason = f"the project ended elsewhere ({worst.origin}): {worst.reason}"
+        return End(worst.exit_code, reason, worst.drain_s)
+
+    def books(self) -> Mapping[str, Mapping[str, Any]]:
+        """Counters of nodes elsewhere on connections to here, of peers that are over."""
+        over = [state for state in self._others.values() if state.phase == OVER]
+        return {node: metrics for state in over for node, metrics in state.books.items()}
+
+    def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
+        """Remarks for the user now, as ``(severity, text)``."""
+        if self._found:
+            yield "INFO", f"found elsewhere: {', '.join(self._found)}"
+            self._found.clear()
+        if self._next_remark_s is None:
+            self._next_remark_s = now_s + _FIRST_REMARK_S
+        if self._missing and now_s >= self._next_remark_s:
+            self._next_remark_s = now_s + _NEXT_REMARK_S
+            yield "INFO", f"nodes elsewhere are still waited for: {self._names()}{self._hint}"
+
+    # ------------------------------------------------------------------ inside
+
+    def _names(self) -> str:
+        return ", ".join(sorted(self._missing))
+
+    def _utter(self, **changes: Any) -> None:
+        if self._elsewhere:
+            self._own = replace(self._own, number=self._own.number + 1, **changes)
+            self._say(self.own_state)
+
+    def _because(self, reason: str, exit_code: int) -> dict[str, Any]:
+        """The cause of the end; the first one stays, and where it is known from elsewhere."""
+        for state in self._others.values():
+            if state.is_ending and state.reason and reason.endswith(state.reason):
+                return {"reason": state.reason, "origin": state.origin, "exit_code": exit_code}
+        return {"reason": reason, "origin": self._own.machine, "exit_code": exit_code}
+
+    def _living(self) -> list[PeerState]:
+        """The states of peers whose nodes run hooks."""
+        return [state for state in self._others.values() if state.has_just_begun]
+
+    def _unfinished(self) -> bool:
+        """Whether a peer that is there has not said what it has counted in all."""
+        gone = {self._run_of[node] for node in self._gone_s}
+        return any(s.phase != OVER and s.run not in gone for s in self._others.values())
+
+    def _agrees(self, other: PeerState) -> bool:
+        if other.phase != DRAINED:
+            return False
+        books = {**self._own.books, **other.books}
+        return all(
+            count(books, c.source_node, "outgoing", c, sent)
+            == count(books, c.destination_node, "incoming", c, arrived)
+            for c in self._crossing
+            if c.is_reliable and _ends(c) & other.books.keys()
+            for sent, arrived in (("sent", "received"), ("acknowledged", "acknowledged"))
+        )
+
+
+def _ends(connection: Connection) -> set[str]:
+    return {connection.source_node, connection.destination_node}

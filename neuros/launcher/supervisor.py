@@ -1,0 +1,287 @@
+"""Supervises a run: starts its nodes, watches them, and brings it to its end.
+
+The supervisor takes no part in the data path. It hears of the nodes over the control channel, of
+their processes from the back end, and of the user by signals; all in one thread, which never waits
+for a node or for a reader of its output.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuros.control import Lines
+from neuros.launcher.channels import Channels
+from neuros.launcher.declarations import Declarations
+from neuros.launcher.observers import Observers, Overheard, Pause
+from neuros.launcher.outcome import Outcome, Output, Phase
+from neuros.launcher.peers import Peers
+from neuros.launcher.processes import Processes
+from neuros.launcher.quiescence import Probing, Verdict, connections_among
+from neuros.launcher.shutdown import STOP_S, Shutdown
+from neuros.launcher.stall_detector import Backlog, StallDetector
+from neuros.ports import Launcher
+from neuros.project.model import NodeFile
+from neuros.stacks import remove_stack_files
+
+# How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
+_TICK_S = 0.02
+_QUIET_TICK_S = 0.2
+
+
+class Supervisor:
+    """Runs one project on one back end.
+
+    Args:
+        files: the nodes to start; ``connections`` among them.
+        launcher: the back end.
+        environment: added to the environment of every node.
+        run_folder: the control socket is put there.
+        output: for log records; its ``poll`` shows what nodes have logged.
+        signals: numbers of the signals that have arrived, appended to by a signal handler.
+        wishes: reasons for which this program wants the run to end, drained; appended to by any
+            thread.
+        duration_s: wall time from the first hook to a drained end, ``None``: no limit.
+        peers: who starts the other nodes of the project, where not all are started here.
+        waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
+            processes that end before they have connected, are seen a fifth of a second late.
+
+    Attributes:
+        pause: lets the run stand still.
+        observers: who watches it.
+
+    Raises:
+        EnvironmentFault: if there can be no control socket in the run folder.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[NodeFile],
+        launcher: Launcher,
+        environment: Mapping[str, str],
+        run_folder: Path,
+        output: Output,
+        signals: list[int],
+        *,
+        wishes: Sequence[str] = (),
+        duration_s: float | None = None,
+        peers: Peers | None = None,
+        waker: socket.socket | None = None,
+    ) -> None:
+        self._files = files
+        self._run_folder = run_folder
+        self._launcher = launcher
+        self._environment = environment
+        self._output = output = Overheard(output, lambda *a, **k: self.observers.tell(*a, **k))
+        self._wishes = wishes
+        self._duration_s = duration_s
+        self._paused_before_s = 0.0  # the first hook
+        self._peers = peers or Peers("", (), files)
+        names = [file.node.name for file in files]
+        self._channels = Channels(run_folder)
+        if waker is not None:
+            self._channels.wake_on(waker)
+        self.outcome = Outcome()
+        self._detector = StallDetector(names, time.monotonic(), run_folder)
+        self._processes = Processes(self._detector, self.outcome)
+        self._peers.speak_through(lambda text: self._channels.send("say", text=text))
+        connections = connections_among(files)
+        self._backlog = Backlog(connections)
+        self._probing = Probing(
+            names,
+            connections,
+            self._channels.send,
+            self._peers if self._peers.exist else None,
+        )
+        self._declarations = Declarations(files)
+        self._shutdown = Shutdown(
+            self._channels,
+            self._processes,
+            self._detector,
+            self._declarations,
+            self._probing,
+            self._peers,
+            self.outcome,
+            output,
+            signals,
+        )
+        self.pause = Pause(self._channels.send, time.monotonic)
+        self.observers = Observers(
+            self._channels,
+            self.pause,
+            lambda: self._detector.is_driven,
+            lambda reason: self._shutdown.drain(reason, STOP_S),
+        )
+        self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
+            "hello": self._on_hello,
+            "report": self._on_report,
+            "hooks": lambda _, message: self._declarations.take(message),
+            "finalising": lambda _, message: self._declarations.note_finalising(
+                message["node"], message["hook"]
+            ),
+            "first_hook": self._on_first_hook,
+            "shutdown": self._on_shutdown,
+            "failed": self._on_failed,
+            "explanation": self._on_explanation,
+            "heard": self._on_heard,
+            **self.observers.handlers,
+            "signal": lambda *_: signals.append(signal.SIGINT),
+        }
+
+    def run(self) -> Outcome:
+        """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
+        try:
+            self._shutdown.heed_signals()  # one may have come before anything was started
+            if self._shutdown.phase is Phase.RUNNING:
+                self._processes.add(self._launcher.start(self._files, self._environment))
+            has_shown = True
+            while self._processes and not self._shutdown.is_hopeless:
+                self._channels.wait(self._pause_s(has_shown))
+                self._shutdown.heed_signals()
+                self._hear()
+                self._look_at_processes()
+                self._look_at_time()
+                self._channels.flush()
+                has_shown = bool(self._output.poll())
+        finally:
+            for process in self._processes:
+                process.kill()
+            self._hear()
+            self.observers.part(self.outcome)
+            self._channels.close()
+            remove_stack_files([self._run_folder / file.node.name for file in self._files])
+            self.outcome.elsewhere = self._peers.books()
+            self.outcome.ended_s = time.monotonic()
+        return self.outcome
+
+    # ------------------------------------------------------------------ what arrives
+
+    def _hear(self) -> None:
+        messages = list(self._channels.receive())
+        # Who ends the project may have been set going by a node whose report was read later.
+        messages.sort(key=lambda pair: pair[1]["kind"] in ("shutdown", "failed"))
+        for lines, message in messages:
+            self._handlers[message["kind"]](lines, message)
+
+    def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
+        self._detector.greet(message["nodes"])
+        if self._peers.exist:
+            self._channels.send_to(lines, "say", text=self._peers.own_state)
+        if self.pause.is_on:
+            self._channels.send_to(lines, "pause")
+        if self._shutdown.phase is not Phase.RUNNING:
+            self._channels.send_to(lines, "stop")
+
+    def _on_report(self, _: Lines, message: Mapping[str, Any]) -> None:
+        name, now_s = message["node"], time.monotonic()
+        self.outcome.take(name, message, now_s)
+        self._detector.report(name, message, now_s)
+        self._backlog.report(message, now_s)
+        self._probing.take(name, message)
+
+    def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
+        if self.outcome.started_s is None:
+            self.outcome.started_s = time.monotonic()
+            self._paused_before_s = self.pause.total_s
+
+    def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
+        reason = f": {message['reason']}" if message["reason"] else ""
+        self._shutdown.drain(
+            f"{message['node']} ended the project{reason}",
+            float(message["drain_s"]),
+            stopped=message["node"],
+        )
+
+    def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
+        self._processes.note_failure(message["node"])
+        first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
+        self._shutdown.fail(f"node '{message['node']}' failed: {first_line}")
+
+    def _on_heard(self, _: Lines, message: Mapping[str, Any]) -> None:
+        self._peers.hear(message["node"], message["text"], time.monotonic())
+
+    def _on_explanation(self, _: Lines, message: Mapping[str, Any]) -> None:
+        if self._shutdown.phase is Phase.RUNNING:
+            self._output.log("WARN", f"{message['node']} {'; '.join(message['lines'])}")
+
+    # ------------------------------------------------------------------ processes
+
+    def _look_at_processes(self) -> None:
+        ended = self._processes.ended()
+        if ended:
+            self._hear()  # what they said last has arrived by now
+        for process, how in ended:
+            is_stopping = self._shutdown.phase is Phase.STOPPING
+            if not self._processes.may_end(process, is_stopping=is_stopping):
+                self._shutdown.fail(
+                    self._processes.how_it_failed(process, how, is_stopping=is_stopping),
+                    exit_code=4 if process.is_abandoned else 1,
+                )
+
+    # ------------------------------------------------------------------ time
+
+    def _pause_s(self, has_shown: bool) -> float:
+        """Seconds until the next look; ``has_shown``: nodes are logging now."""
+        if has_shown or self._shutdown.phase is not Phase.RUNNING:
+            return _TICK_S
+        end_s = self._end_s
+        if end_s is None:
+            return _QUIET_TICK_S
+        return min(_QUIET_TICK_S, max(0.0, end_s - time.monotonic()))
+
+    @property
+    def _end_s(self) -> float | None:
+        """When its duration is over, ``None``: never, or not known yet."""
+        limit_s, started_s = self._duration_s, self.outcome.started_s
+        if limit_s is None or started_s is None:
+            return None
+        return started_s + limit_s + self.pause.total_s - self._paused_before_s
+
+    def _look_at_time(self) -> None:
+        now_s = time.monotonic()
+        self._shutdown.heed_peers()
+        self._shutdown.look(now_s)
+        self._keep_pause()
+        for severity, text in self._detector.remarks_on_hooks():
+            self._output.log(severity, text)
+        if self._shutdown.phase in (Phase.RUNNING, Phase.DRAINING):
+            for severity, text in self._detector.remarks_on_silence(now_s, self._processes.killed):
+                self._output.log(severity, text)
+        self.observers.look_at(self._shutdown.phase)
+        if self._shutdown.phase is Phase.RUNNING:
+            self._look_at_run(now_s)
+
+    def _keep_pause(self) -> None:
+        """Note how long the run has stood still; nodes that are stopped meanwhile do not go on."""
+        outcome = self.outcome
+        outcome.is_paused = self.pause.is_on
+        if outcome.started_s is not None:
+            outcome.paused_s = self.pause.total_s - self._paused_before_s
+        if self._shutdown.phase is Phase.STOPPING and outcome.is_paused:
+            outcome.ending_s = self.pause.since_s
+
+    def _look_at_run(self, now_s: float) -> None:
+        if self._wishes:
+            self._shutdown.drain(self._wishes[0], STOP_S)
+            return
+        if self.pause.is_on:
+            self._detector.begin_anew(now_s)
+            self._backlog.begin_anew()
+            return
+        end_s = self._end_s
+        if end_s is not None and now_s >= end_s:
+            self._shutdown.drain(f"{self._duration_s:g} s are over", STOP_S)
+            return
+        for source in (self._detector, self._backlog, self._peers):
+            for severity, text in source.remarks(now_s):
+                self._output.log(severity, text)
+        if self._detector.has_just_stalled(now_s):
+            self._channels.send("explain")
+        if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
+            return
+        if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
+            self._shutdown.fail(self._probing.why_dead())

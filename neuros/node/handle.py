@@ -1,0 +1,329 @@
+"""The ``node`` that every hook receives, the services behind it, and its results file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from neuros.engine.engine import Engine
+from neuros.errors import ModelError, NodeError
+from neuros.node.failures import Failures, as_node_error
+from neuros.node.simulated_time import SimulatedTime
+from neuros.ports import EventLoop, Logger, Transport
+from neuros.project.model import Node, NodeFile
+from neuros.project.suggest import did_you_mean
+
+_POLL_S = 0.05
+_EMPTY = "std_msgs/msg/Empty"
+
+
+class PluginServices:
+    """Requests of a plugin, from its hooks and from its own threads, made through ``node``.
+
+    Args:
+        ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
+
+    Attributes:
+        closers: called once when the node ends, last added first.
+        engine: the node's, ``None`` until its plugin is loaded.
+        is_ending: whether no further hook starts.
+        make_packet: a new message with default values, for a type in ROS notation.
+        time: that of the node, if it has one.
+        waiting_threads: those that wait until packets that they have offered are sent.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        loop: EventLoop,
+        time: SimulatedTime,
+        failures: Failures,
+        ask_for_end: Callable[..., object],
+    ) -> None:
+        self.engine: Engine | None = None
+        self.is_ending = False
+        self.waiting_threads: set[threading.Thread] = set()
+        self.make_packet = transport.make_packet
+        self._loop = loop
+        self.time = time
+        self._failures = failures
+        self._ask_for_end = ask_for_end
+        self.closers: list[Callable[[], None]] = []
+
+    def stop(self) -> None:
+        """Start no further hook. Any thread."""
+        self.is_ending = True
+        if self.engine is not None:
+            self.engine.stop_hooks()
+
+    def shutdown(self, reason: str, drain_s: float) -> None:
+        """Ask the supervisor for a drained end; this node starts no further hook."""
+        if self.engine is not None:
+            self.engine.stop_hooks()
+        self._ask_for_end(reason=reason, drain_s=drain_s)
+
+    def close(self) -> None:
+        """Give up what the plugin holds, last opened first."""
+        for close in reversed(self.closers):
+            try:
+                close()
+            except BaseException as error:  # the others must still be closed
+                self._failures.report(as_node_error(error, "failed while it was closed: "))
+
+    def fail_from_thread(self, error: BaseException) -> None:
+        """End the project with an error that happened outside the hooks."""
+        self._loop.post_from_thread(lambda: self._failures.report(error))
+
+    def offer_from_thread(
+        self, packets: Mapping[str, Any], accepted: Callable[[], None]
+    ) -> Callable[[Callable[[], None]], None]:
+        """Offer packets from another thread; returns a function that withdraws them."""
+        withdrawals: list[Callable[[], None]] = []
+        thread = threading.current_thread()
+
+        def accept() -> None:
+            self.waiting_threads.discard(thread)
+            accepted()
+
+        def offer() -> None:
+            assert self.engine is not None
+            self.waiting_threads.add(thread)
+            withdrawals.append(self.engine.offer(packets, accept))
+            if self.time.is_watched:
+                self.time.look()
+
+        def withdraw(done: Callable[[], None]) -> None:
+            def event() -> None:
+                self.waiting_threads.discard(thread)
+                for each in withdrawals:
+                    each()
+                done()
+
+            self._loop.post_from_thread(event)
+
+        self._loop.post_from_thread(lambda: self._failures.guard(offer))
+        return withdraw
+
+
+class NodeHandle:
+    """A node as its plugin sees it."""
+
+    def __init__(self, file: NodeFile, ros_node: Any, services: PluginServices) -> None:
+        self._file = file
+        self._ros_node = ros_node
+        self._services = services
+        self._types = {port.name: port.type for port in file.node.outputs}
+        self._user_data: Any = None
+        self._results = Results(self.run_dir)
+
+    @property
+    def name(self) -> str:
+        """The node's name in the project."""
+        return self._file.node.name
+
+    @property
+    def run_dir(self) -> Path:
+        """This node's own writable folder in the run folder."""
+        return self._file.folders.run / self.name
+
+    @property
+    def description(self) -> Node:
+        """The node as its file declares it."""
+        return self._file.node
+
+    def make_packet(self, output: str | None = None) -> Any:
+        """A new message of the type of an output, with default values.
+
+        Args:
+            output: its name; ``None`` where only one type can be meant: all outputs have it, or
+                it is ``std_msgs/msg/Empty`` and one of them has that.
+
+        Raises:
+            NodeError: if the node has no such output, or several could be meant.
+        """
+        if output is None:
+            return self._services.make_packet(self._only_type())
+        try:
+            type_name = self._types[output]
+        except KeyError:
+            known = ", ".join(self._types) or "none"
+            raise NodeError(
+                f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
+            ) from None
+        return self._services.make_packet(type_name)
+
+    def get_ros_node(self) -> Any:
+        """The real ``rclpy.node.Node``; what is created on it is served between hooks."""
+        return self._ros_node
+
+    def get_topic_list(self) -> list[str]:
+        """The names of all topics on the ROS graph; to look around, while a plugin is written."""
+        return [name for name, _ in self._ros_node.get_topic_names_and_types()]
+
+    def get_topic_info(self, topic: str) -> str:
+        """Its type, and how many publish on it and listen to it, as ``ros2 topic info`` says it.
+
+        Raises:
+            NodeError: if there is no such topic on the ROS graph.
+        """
+        known = dict(self._ros_node.get_topic_names_and_types())
+        name = self._file.names.full(topic, self.name)
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise NodeError(
+                f"get_topic_info: there is no topic '{name}' now{hint and f' ({hint})'}"
+            )
+        types = known[name]
+        return (
+            f"Type: {types[0] if len(types) == 1 else types}\n"
+            f"Publisher count: {self._ros_node.count_publishers(name)}\n"
+            f"Subscription count: {self._ros_node.count_subscribers(name)}"
+        )
+
+    def get_logger(self) -> Logger:
+        """The logger of the ROS node."""
+        logger: Logger = self._ros_node.get_logger()
+        return logger
+
+    def set_user_data(self, data: Any) -> None:
+        """Keep something for the next hook."""
+        self._user_data = data
+
+    def get_user_data(self) -> Any:
+        """The data of the last :meth:`set_user_data`, ``None`` before."""
+        return self._user_data
+
+    def set_result(self, name: str, value: Any) -> None:
+        """Note a result of the run: it is in ``run.json``, and a column of a sweep's table.
+
+        A later one of the same name takes its place. Each is written to ``results.json`` in
+        :attr:`run_dir` at once: for figures at the end, or now and then, not for every packet.
+
+        Args:
+            value: what JSON knows, or NumPy's numbers and arrays. A float that is no finite number
+                becomes ``None``.
+
+        Raises:
+            NodeError: for anything else.
+        """
+        try:
+            self._results.set(name, value)
+        except (TypeError, ValueError) as error:
+            raise NodeError(f"set_result: '{name}' cannot be kept: {error}") from error
+
+    def shutdown(self, reason: str = "", drain_s: float = 5.0) -> None:
+        """End the project: drained within ``drain_s`` seconds, with exit code 0."""
+        self._services.shutdown(str(reason), float(drain_s))
+
+    def resolve_path(self, path: str) -> Path:
+        """An existing file: absolute, or relative to plugin, node file or project folder.
+
+        Raises:
+            ModelError: if there is none, naming all places that were looked at, or if it lies
+                outside of project, workspace and run folder.
+        """
+        node, folders = self._file.node, self._file.folders
+        if path.startswith("@"):
+            wanted = path[1:].lstrip("/")
+            workspaces = (folders.project / "workspace", folders.workspace)
+            places = [*(folder / wanted for folder in workspaces), *self._built(wanted)]
+        else:
+            wanted = path[1:].lstrip("/") if path.startswith("#") else path
+            bases = dict.fromkeys((node.plugin.parent, node.file.parent, folders.project))
+            places = [base / wanted for base in bases]
+        for place in places:
+            if place.exists():
+                built = (python.parent for python in self._file.messages)
+                roots = (folders.project, folders.workspace, folders.run, *built)
+                if not any(place.resolve().is_relative_to(root.resolve()) for root in roots):
+                    raise ModelError(
+                        f"'{path}' leaves the project's folder: files may be in the folder of the"
+                        " project file, in the run folder, and with '@' in the workspace"
+                    )
+                return place
+        raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
+
+    def expect_end(self, sim_s: float) -> None:
+        """Tell after how many seconds of simulated time this plugin will end the project.
+
+        It is for those who watch the run; the end itself is :meth:`shutdown`.
+        """
+        self._services.time.expected_end_s = float(sim_s)
+
+    def _only_type(self) -> str:
+        types = {*self._types.values()}
+        if _EMPTY in types:
+            return _EMPTY  # as the published NeuROS does
+        if len(types) == 1:
+            return types.pop()
+        known = ", ".join(self._types) or "none"
+        raise NodeError(f"make_packet: say for which output of node '{self.name}': {known}")
+
+    def _built(self, wanted: str) -> list[Path]:
+        """Where ``install/PACKAGE/path`` may be: in the folder of a built message package."""
+        install, _, inner = wanted.partition("/")
+        package, _, rest = inner.partition("/")
+        folders = [python.parent for python in self._file.messages if install == "install"]
+        return [f / rest for f in folders if f.name.rpartition("-")[0] == package]
+
+    def own_simulated_time(self, read_s: Callable[[], float]) -> None:
+        """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
+        self._services.time.own(read_s)
+
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call ``callback`` once when the node ends, after its finalise hooks."""
+        self._services.closers.append(callback)
+
+    def fail(self, error: BaseException) -> None:
+        """End the node as failed, from any thread: for errors that no hook can raise."""
+        self._services.fail_from_thread(error)
+
+    def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
+        """Send from another thread, as if a hook with those outputs had returned them.
+
+        Waits while a reliable connection of one of the outputs is blocked; returns False, without
+        having sent, once ``cancelled()`` is true or the node ends.
+        """
+        sent = threading.Event()
+        withdraw = self._services.offer_from_thread(packets, sent.set)
+        while not sent.wait(_POLL_S):
+            if self._services.is_ending:
+                return sent.is_set()
+            if cancelled():
+                withdrawn = threading.Event()
+                withdraw(withdrawn.set)
+                while not withdrawn.wait(_POLL_S) and not self._services.is_ending:
+                    pass
+                return sent.is_set()
+        return True
+
+
+class Results:
+    """Results by name, on the disk as soon as they are known: a killed node keeps them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "results.json"
+        self._values: dict[str, Any] = {}
+
+    def set(self, name: str, value: Any) -> None:
+        """Keep a value. Raises ``TypeError`` or ``ValueError`` for what JSON does not know."""
+        value = _plain(value) if hasattr(value, "tolist") else value
+        is_finite = not isinstance(value, float) or math.isfinite(value)
+        values = {**self._values, str(name): value if is_finite else None}
+        text = json.dumps(values, indent=2, default=_plain, allow_nan=False)
+        new = self._file.with_suffix(".new")
+        new.write_text(text + "\n", "utf-8")
+        os.replace(new, self._file)  # a reader never finds half of it
+        self._values = values
+
+
+def _plain(value: Any) -> Any:
+    """A number or an array of NumPy as Python's own."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is nothing that JSON knows")

@@ -1,0 +1,255 @@
+"""One running node: its plugin on an engine, the engine on a transport."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from neuros.engine.engine import Engine
+from neuros.engine.node_ports import PacketType
+from neuros.errors import NeurosError
+from neuros.hooks import HookKind, HookSpec
+from neuros.node.context import ContextSwitch
+from neuros.node.effects import NodeEffects, NodeRecorder
+from neuros.node.failures import Failures
+from neuros.node.handle import NodeHandle, PluginServices
+from neuros.node.plugin import load_plugin
+from neuros.node.reports import NodeReports
+from neuros.node.sampling import Sampler
+from neuros.node.simulated_time import SimulatedTime
+from neuros.ports import Middleware, PacketRecorder, Way
+from neuros.project.model import Connection, NodeFile, Port
+
+
+class NodeRuntime:
+    """Joins plugin, engine and transport of one node, and takes it through its lifecycle.
+
+    It is the inbox of the transport; :class:`NodeEffects` are those of the engine, and
+    :class:`PluginServices` those of ``node``.
+
+    Args:
+        tell: reports to the supervisor, ``tell(kind, **fields)``.
+        fail: called with an error that ends the project.
+        recorder: where packets go that are recorded, ``None``: none are.
+        duration_sim_s: simulated time at which this node ends the project, ``None``: never.
+        on_initialised: called after each initialise hook.
+        clock: monotonic clock in nanoseconds.
+        make_engine: the engine, called like its class.
+
+    Attributes:
+        engine: ``None`` until :meth:`load`.
+        specs: the hooks of its plugin, once that is loaded.
+        handle: the ``node`` that hooks receive.
+        failures: reports its errors.
+        reports: what it says of itself.
+    """
+
+    def __init__(
+        self,
+        file: NodeFile,
+        middleware: Middleware,
+        contexts: ContextSwitch,
+        *,
+        tell: Callable[..., object],
+        fail: Callable[[str, NeurosError], None],
+        recorder: PacketRecorder | None = None,
+        log_file: Path | None,
+        duration_sim_s: float | None,
+        on_initialised: Callable[[], None] = lambda: None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        make_engine: Callable[..., Engine] = Engine,
+    ) -> None:
+        self.file = file
+        self.name = file.node.name
+        self.specs: Sequence[HookSpec] = ()
+        self.engine: Engine | None = None
+        self._middleware = middleware
+        self._clock = clock
+        self._make_engine = make_engine
+        self._tell = tell
+        self._contexts = contexts
+        environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
+        self._context = contexts.make_context(
+            environment, file.node.plugin, file.folders.project, log_file
+        )
+        self._enter = partial(contexts.enter, self._context)
+        self._enter()
+        self._transport = middleware.transport(file)
+        ros_node = middleware.ros_node(file)
+        self._logger = ros_node.get_logger()
+        self.failures = Failures(self.name, file.node.plugin, self._logger, fail)
+        self._guard = self.failures.guard
+        self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
+        self._services = PluginServices(
+            self._transport,
+            middleware.loop,
+            self._time,
+            self.failures,
+            partial(tell, "shutdown", node=self.name),
+        )
+        self.handle = NodeHandle(file, ros_node, self._services)
+        self._recorder: NodeRecorder | None = None
+        self._kept_on_arrival: frozenset[Connection] = frozenset()
+        if recorder is not None:
+            self._recorder = NodeRecorder(recorder, middleware.encode, self._time, self._logger)
+            self._kept_on_arrival = self._recorder.wanted_on_arrival(file.connections)
+        self._sampler = Sampler()
+        self._effects = NodeEffects(
+            middleware,
+            self._transport,
+            self.handle,
+            self.failures,
+            self._time,
+            self._recorder,
+            self._sampler,
+            enter=self._enter,
+            on_first_hook=lambda: tell("first_hook", node=self.name),
+            on_initialised=on_initialised,
+        )
+        self.reports = NodeReports(
+            file, middleware, self._transport, self._time, self._effects, self._sampler, clock
+        )
+
+    @property
+    def run_dir(self) -> Path:
+        """The node's own folder."""
+        return self.file.folders.run / self.name
+
+    @property
+    def has_context(self) -> bool:
+        """Whether the context of this node is in place now."""
+        return self._contexts.has(self._context)
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulated seconds, ``None`` where the node owns no time."""
+        return self._time.now_s
+
+    @property
+    def waiting_threads(self) -> set[threading.Thread]:
+        """Threads that wait until the packets that they have offered are sent."""
+        return self._services.waiting_threads
+
+    # ------------------------------------------------------------------ lifecycle
+
+    def load(self) -> None:
+        """Open the transport (others may look for it from now on) and import the plugin.
+
+        Raises:
+            PluginError, HookError: if the plugin is at fault.
+        """
+        self._enter()
+        self._transport.open(self)
+        self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
+        node = self.file.node
+        self.specs = load_plugin(node.plugin, self.name)
+        types = {port.name: self._packet_type(port) for port in node.outputs}
+        self.engine = self._services.engine = self._make_engine(
+            node, self.file.connections, self.specs, self._effects, self._clock, types
+        )
+        self.reports.open(self.engine, self._logger)
+
+    def start(self) -> None:
+        """Let the engine run hooks as soon as every receiver is there."""
+        if any(spec.kind is HookKind.TICK for spec in self.specs):
+            engine = self._loaded
+            self._middleware.loop.add_timer(lambda: engine.next_due_ns, self.on_timer)
+        self._guard(self._loaded.start)
+
+    def drain(self, last_round: Sequence[int] = ()) -> None:
+        """Stop the hooks that send unasked; after a pause, the others go on.
+
+        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        """
+        self._guard(lambda: self._loaded.drain(last_round))
+
+    def pause(self) -> None:
+        """Start no further hook until :meth:`resume`."""
+        self._loaded.pause()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        self._guard(self._loaded.resume)
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        """While paused, let the hooks that drive the project start so many times more."""
+        self._guard(lambda: self._loaded.step(count, is_driven=is_driven))
+
+    def stop(self) -> None:
+        """Start no further hook. Any thread."""
+        self._services.stop()
+
+    def finalise(self) -> None:
+        """Run the finalise hooks and give up what the plugin holds; each fault is reported."""
+        self.stop()
+        self._enter()
+        if self.engine is not None:
+            for spec in self.specs:
+                if spec.kind is HookKind.FINALISE:
+                    self._tell("finalising", node=self.name, hook=spec.name)
+                    self._guard(partial(self._effects.run, spec))
+        self._tell("finalising", node=self.name, hook="")
+        if self._recorder is not None:
+            self._recorder.close()
+        self._services.close()
+        self._tell("finalising", node=self.name, hook=None)
+
+    # ------------------------------------------------------------------ inbox
+
+    def on_packet(self, connection: Connection, packet: Any) -> None:
+        """A packet has arrived on a connection."""
+        if self._kept_on_arrival and connection in self._kept_on_arrival:
+            assert self._recorder is not None
+            self._recorder.keep(Way.RECEIVED, str(connection), packet)
+        engine = self.engine
+        assert engine is not None
+        # What a hook sends on of a packet (its stamp, say) is shared while that is held.
+        arrived = [packet]
+        del packet
+        try:
+            engine.on_packet(connection, arrived.pop())
+        except NeurosError as error:
+            self.failures.report(error)
+
+    def on_external_packet(self, port: Port, packet: Any) -> None:
+        """A packet has arrived on an external topic."""
+        if self._recorder is not None:
+            self._recorder.keep(Way.HEARD, port.name, packet)
+        if self._sampler.requests:
+            self._sampler.note(str(port.external_topic), packet)
+        self._guard(lambda: self._loaded.on_packet(port.name, packet))
+
+    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+        """The receiver of a connection has started on packets."""
+        engine = self.engine
+        assert engine is not None
+        try:
+            engine.on_acknowledgement(connection, position)
+        except NeurosError as error:
+            self.failures.report(error)
+
+    def on_registered(self, connection: Connection) -> None:
+        """The receiver of a connection is there."""
+        self._guard(lambda: self._loaded.on_registered(connection))
+
+    def on_timer(self) -> None:
+        """The next due time of a hook has come."""
+        self._guard(self._loaded.on_timer)
+
+    # ------------------------------------------------------------------ inside
+
+    def _packet_type(self, port: Port) -> PacketType:
+        kind = self._middleware.message_class(port.type)
+        return PacketType(kind, self._middleware.checker(kind))
+
+    @property
+    def _loaded(self) -> Engine:
+        assert self.engine is not None
+        return self.engine
+
+    def _end_by_duration(self, duration_s: float) -> None:
+        self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)

@@ -1,0 +1,167 @@
+"""Reports of a node: its state and counters for the supervisor, its status for observers."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from neuros.engine.engine import Engine
+from neuros.engine.explain import explain
+from neuros.engine.snapshot import snapshot, steadily
+from neuros.node.effects import NodeEffects
+from neuros.node.packet_log import PacketLog
+from neuros.node.sampling import Sampler
+from neuros.node.simulated_time import SimulatedTime
+from neuros.ports import Logger, Middleware, Transport
+from neuros.project.model import Connection, NodeFile
+from neuros.stacks import LONG_S, Stack, stack_in
+
+_MAIN = threading.main_thread()
+_LAST_SENT = 16
+
+
+class NodeReports:
+    """State and counters of one running node.
+
+    Args:
+        clock: monotonic clock in nanoseconds.
+    """
+
+    def __init__(
+        self,
+        file: NodeFile,
+        middleware: Middleware,
+        transport: Transport,
+        time: SimulatedTime,
+        effects: NodeEffects,
+        sampler: Sampler,
+        clock: Callable[[], int],
+    ) -> None:
+        self._file = file
+        self._middleware = middleware
+        self._transport = transport
+        self._time = time
+        self._effects = effects
+        self._sampler = sampler
+        self._clock = clock
+        self._engine: Engine | None = None
+        self._packet_log: PacketLog | None = None
+
+    def open(self, engine: Engine, logger: Logger) -> None:
+        """There is an engine to report of; what is special about it is logged."""
+        self._engine = engine
+        folder = self._file.folders.run / self._file.node.name
+        self._packet_log = PacketLog(engine, self._transport.digests, folder)
+        for hook in engine.free_running_hooks():
+            logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
+        for subscription in engine.untaken_subscriptions():
+            logger.warning(
+                f"no hook takes input '{subscription.input_name}': packets on"
+                f" {subscription.name} are acknowledged on arrival and dropped"
+            )
+
+    def write_packet_log(self) -> None:
+        """Write out when packets were sent and taken. Any thread."""
+        if self._packet_log is not None:
+            self._packet_log.write()
+
+    def state(self) -> dict[str, Any]:
+        """State and counters. Any thread."""
+        now_ns, engine = self._clock(), self._engine
+        metrics = None if engine is None else snapshot(engine, now_ns)
+        return {
+            "node": self._file.node.name,
+            "has_run": self._effects.has_run,
+            "waiting_for": [str(each) for each in self._transport.waiting_for()],
+            **self._time.report(now_ns),
+            "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
+            "metrics": metrics,
+            "stack": self._stack(metrics),
+            "fault": None if self._packet_log is None else self._packet_log.failure,
+            "is_driving": engine is not None and engine.is_driving,
+        }
+
+    def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
+        """The stack of the plugin, if its hook runs for long, or the node is to end."""
+        engine = self._engine
+        if engine is None or metrics is None or threading.current_thread() is _MAIN:
+            return None
+        executing = metrics["executing"]
+        if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
+            return stack_in(self._file.node.name, self._file.node.plugin)
+        return None
+
+    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> dict[str, Any]:
+        """What an observer is shown: the node, and what was sampled of its packets. Any thread.
+
+        Args:
+            wanted: what to sample for the next time (see :class:`Sampler`).
+            asker: the number of the observer.
+        """
+        engine = self._engine
+        return {
+            "node": self._file.node.name,
+            "asker": asker,
+            "sim_time": self._time.now_s,
+            "books": None if engine is None else node_status(engine, self._clock()),
+            "samples": self._sampler.ask(wanted, asker),
+        }
+
+    def probe(self) -> dict[str, Any]:
+        """The state with what only a moment between two events can tell. Loop thread only."""
+        engine = self._engine
+        assert engine is not None
+        return {
+            **self.state(),
+            "is_startable": engine.has_startable_packet,
+            "is_wakeable": engine.is_wakeable
+            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
+            "is_running": engine.is_running,
+        }
+
+    def explain(self) -> list[str]:
+        """Why nothing moves here. Any thread."""
+        engine = self._engine
+        if engine is None:
+            return [f"imports its plugin {self._file.node.plugin.name}"]
+        return explain(engine, self._clock())
+
+
+def node_status(engine: Engine, now_ns: int) -> dict[str, Any]:
+    """Counters, state and latest times, short enough to be sent often. Any thread.
+
+    Besides what :func:`neuros.engine.snapshot.snapshot` tells: ``now_s``, the time of the status;
+    ``sent_ns``, by connection the position of the last packet sent and when the last few were;
+    ``taken_ns``, the position of the packet that a hook has started on last, and when that was.
+    Both lack the connections whose packet log has just been written out.
+    """
+    status = snapshot(engine, now_ns)
+    nothing: dict[str, list[Any]] = {}
+    status["hooks"] = {
+        name: [hook["executions"], hook["busy_s"]] for name, hook in status["hooks"].items()
+    }
+    return {
+        **status,
+        "now_s": now_ns / 1e9,
+        "sent_ns": steadily(lambda: _sent(engine), nothing),
+        "taken_ns": steadily(lambda: _taken(engine), nothing),
+        "is_paused": engine.is_paused,
+    }
+
+
+def _sent(engine: Engine) -> dict[str, list[Any]]:
+    return {
+        str(window.connection): [window.sent, window.sent_ns[-_LAST_SENT:].tolist()]
+        for window in engine.send_windows.values()
+        if window.is_reliable and window.sent_ns
+    }
+
+
+def _taken(engine: Engine) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for key, subscription in engine.subscriptions.items():
+        count = min(len(subscription.taken), len(subscription.taken_ns))
+        if isinstance(key, Connection) and count:
+            found[str(key)] = [subscription.taken[count - 1], subscription.taken_ns[count - 1]]
+    return found

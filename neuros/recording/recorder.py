@@ -1,0 +1,227 @@
+"""Recorder: moves packets from the spools of a run into its bag, ordered by wall time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from neuros.errors import EnvironmentFault
+from neuros.recording.bag_writer import BagWriter, Definitions
+from neuros.recording.plan import BAG_NAME, LISTENER, RecordingPlan, Topic
+from neuros.recording.spool import (
+    NO_TIME,
+    ForwardClock,
+    SpoolReader,
+    forget_listened,
+    listened_topics,
+)
+from neuros.recording.stored import Stored
+
+# A packet is in its spool this long after its time at the latest, unless its process was kept from
+# running. Readers of bags sort, so a packet that comes later is only less convenient.
+_SETTLED_NS = 20_000_000
+_MOST_BYTES = 8 << 20
+_CHECKPOINT_S = 1.0
+_CHECKPOINT_BYTES = 16 << 20
+# A checkpoint writes about every topic and every megabyte, so it takes longer as they become more;
+# the pause after it is this many times as long, for a recorder must not take the nodes' time.
+_CHECKPOINT_PAUSE = 50
+_ALL_NS = (1 << 63) - 1
+
+_Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
+_IsNew: TypeAlias = Callable[[int, int], bool]
+
+
+class Recorder:
+    """Writes the bag of a run.
+
+    Args:
+        run: the run folder.
+        complain: is told of each problem, in a sentence.
+        is_new: asked with the number of a topic and a wall time whether the bag lacks that packet.
+        clock: monotonic, in seconds: when a checkpoint is due.
+
+    Raises:
+        OSError: if the bag cannot be made.
+    """
+
+    def __init__(
+        self,
+        plan: RecordingPlan,
+        run: Path,
+        complain: Callable[[str], object],
+        is_new: _IsNew | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._plan = plan
+        self._run = run
+        self._complain = complain
+        self._is_new = is_new
+        self._clock = clock
+        self._definitions = Definitions()
+        self.bag = BagWriter(run / BAG_NAME, plan.storage, plan.custom)
+        self.topics: dict[Topic, int | None] = {}
+        for topic in plan.topics:
+            self.number_of(topic)
+        self._sources = [
+            _SpoolSource(
+                SpoolReader(run / node),
+                [
+                    self._numbers(plan.topics[place] for place in stream.topics)
+                    for stream in streams
+                ],
+                owns_time=node == plan.time_owner,
+            )
+            for node, streams in plan.streams.items()
+        ]
+        self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
+        self._sources.append(self._listener)
+        self._held: list[_Kept] = []
+        self._wall_clock = ForwardClock()
+        self._sim_ns = 0
+        self.bag.checkpoint()
+        self._due_s = self._clock() + _CHECKPOINT_S
+        self._written = self._checked = 0
+
+    def number_of(self, topic: Topic) -> int | None:
+        """The number of a topic in the bag, ``None`` if it cannot be recorded."""
+        if topic not in self.topics:
+            try:
+                self.topics[topic] = self.bag.add_topic(topic, self._definitions)
+            except EnvironmentFault as error:
+                self.topics[topic] = None
+                self._complain(f"{topic.name} is not recorded: {error}")
+        return self.topics[topic]
+
+    def poll(self) -> bool:
+        """Move what there is; returns whether there is more right now. Raises ``OSError``."""
+        has_more = self._move(self._wall_clock() - _SETTLED_NS)
+        is_due = self._clock() >= self._due_s
+        if self._written > self._checked and (
+            is_due or self.bag.pending_bytes >= _CHECKPOINT_BYTES
+        ):
+            self._checkpoint()
+        return has_more
+
+    @property
+    def is_fed(self) -> bool:
+        """Whether a process still has a spool open for writing."""
+        return any(source.reader.is_fed for source in self._sources)
+
+    def copy(self, topic: Topic, message: Stored) -> int | None:
+        """Put a message of another bag into this one; returns the number of its topic, as
+        :meth:`number_of`. Raises ``OSError``."""
+        number = self.number_of(topic)
+        if number is not None:
+            self.bag.put(number, message.log_ns, message.publish_ns, message.data)
+            self._write_out()
+        return number
+
+    def complete(self) -> None:
+        """Move all that is left, and close the bag. Raises ``OSError``."""
+        while self._move(None):
+            self._write_out()
+        self.bag.close()
+
+    def clean_up(self) -> None:
+        """Remove the spools, whose packets are in the bag."""
+        for source in self._sources:
+            source.reader.close(remove=True)
+        forget_listened(self._run)
+
+    def abandon(self) -> None:
+        """Stop, and leave bag and spools unfinished."""
+        self.bag.shut()
+        for source in self._sources:
+            source.reader.close(remove=False)
+
+    def counts(self) -> dict[str, int]:
+        """Packets in the bag, by topic."""
+        found: dict[str, int] = {}
+        for topic, number in self.topics.items():
+            count = 0 if number is None else self.bag.counts[number]
+            found[topic.name] = found.get(topic.name, 0) + count
+        return found
+
+    # ------------------------------------------------------------------ inside
+
+    def _move(self, horizon_ns: int | None) -> bool:
+        """Write what is not later than ``horizon_ns``; returns whether a spool has more."""
+        has_more = False
+        for source in self._sources:
+            records, is_capped = source.reader.read(_MOST_BYTES)
+            if source is self._listener and records:
+                self._listener.topics = [
+                    self._numbers([topic]) for topic in listened_topics(self._run)
+                ]
+            self._held += [
+                (wall_ns, sim_ns, source.topics[stream], data, source.owns_time)
+                for wall_ns, sim_ns, stream, data in records
+            ]
+            if is_capped and records:
+                has_more = True
+                last_ns = records[-1].wall_ns
+                horizon_ns = last_ns if horizon_ns is None else min(horizon_ns, last_ns)
+        self._held.sort(key=itemgetter(0))
+        written = 0
+        for kept in self._held:
+            if horizon_ns is not None and kept[0] > horizon_ns:
+                break
+            self._write(*kept)
+            written += 1
+        del self._held[:written]
+        self._written += written
+        return has_more
+
+    def _write(
+        self, wall_ns: int, sim_ns: int, topics: tuple[int, ...], data: bytes, owns_time: bool
+    ) -> None:
+        publish_ns = wall_ns
+        if sim_ns != NO_TIME:
+            publish_ns = sim_ns
+            if owns_time:
+                self._sim_ns = sim_ns
+        elif self._plan.time_owner is not None:
+            publish_ns = self._sim_ns
+        for topic in topics:
+            if self._is_new is None or self._is_new(topic, wall_ns):
+                self.bag.put(topic, wall_ns, publish_ns, data)
+
+    def _write_out(self) -> None:
+        """Bags may be larger than memory."""
+        if self.bag.pending_bytes >= _CHECKPOINT_BYTES:
+            self.bag.checkpoint()
+
+    def _checkpoint(self) -> None:
+        began_s = self._clock()
+        self.bag.checkpoint()
+        took_s = self._clock() - began_s
+        self._due_s = began_s + took_s + max(_CHECKPOINT_S, _CHECKPOINT_PAUSE * took_s)
+        self._checked = self._written
+        # Whatever was read and is not held is in the bag.
+        safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
+        for source in self._sources:
+            source.reader.remove_up_to(safe_ns)
+
+    def _numbers(self, topics: Any) -> tuple[int, ...]:
+        numbers = (self.number_of(topic) for topic in topics)
+        return tuple(number for number in numbers if number is not None)
+
+
+class _SpoolSource:
+    """A spool, and the topics of its streams."""
+
+    def __init__(
+        self, reader: SpoolReader, topics: list[tuple[int, ...]], *, owns_time: bool
+    ) -> None:
+        self.reader = reader
+        self.topics = topics
+        self.owns_time = owns_time
+
+
+def has_spools(run: Path, nodes: Collection[str]) -> bool:
+    """Whether packets of a run wait to be put into its bag."""
+    return any(any((run / name / "spool").glob("*")) for name in (*nodes, LISTENER))

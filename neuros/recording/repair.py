@@ -1,0 +1,119 @@
+"""Repair of the bag of a run that was cut off, from its file and from the spools."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rosbags.rosbag2 import Reader, ReaderError
+
+from neuros.errors import EnvironmentFault
+from neuros.recording.plan import (
+    BAG_NAME,
+    LISTENER,
+    PLAN_NAME,
+    RecordingPlan,
+    Topic,
+    load_plan,
+)
+from neuros.recording.recorder import Recorder, has_spools
+from neuros.recording.spool import SpoolReader, listened_topics
+from neuros.recording.stored import is_whole, stored_messages
+
+DAMAGED_NAME = "bag.damaged"
+
+
+@contextlib.contextmanager
+def the_only_recorder(run: Path) -> Iterator[bool]:
+    """Whether no other process writes the bag of a run, now and within the block."""
+    descriptor = os.open(run / PLAN_NAME, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+            return
+        yield True
+    finally:
+        os.close(descriptor)
+
+
+def needs_repair(run: Path, plan: RecordingPlan) -> bool:
+    """Whether the bag of a run that has ended is not complete."""
+    bag = run / BAG_NAME
+    return (run / DAMAGED_NAME).exists() or not is_whole(bag) or has_spools(run, [*plan.streams])
+
+
+def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | None:
+    """Complete the bag of a run; ``None`` if it is complete, else its packets by topic.
+
+    Raises:
+        UsageError: if the run was not recorded, or by another version.
+        EnvironmentFault: if it is still being recorded, or cannot be written.
+    """
+    plan = load_plan(run)
+    try:
+        with the_only_recorder(run) as is_alone:
+            if not is_alone or _is_fed(run, plan):
+                raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
+            return _rebuild(run, plan, complain) if needs_repair(run, plan) else None
+    except OSError as error:
+        raise EnvironmentFault(
+            f"the bag of {run} cannot be completed: {error.strerror}; what is there was left as it"
+            " is"
+        ) from error
+
+
+def counts_of(run: Path) -> dict[str, int]:
+    """Packets in the bag of a run, by topic. Raises ``OSError`` if it cannot be read."""
+    try:
+        with Reader(run / BAG_NAME) as reader:
+            return {connection.topic: connection.msgcount for connection in reader.connections}
+    except ReaderError as error:
+        raise OSError(errno.EIO, str(error)) from error
+
+
+def _is_fed(run: Path, plan: RecordingPlan) -> bool:
+    """Whether a node of the run goes on, though its recorder does not."""
+    return any(SpoolReader(run / name).is_fed for name in (*plan.streams, LISTENER))
+
+
+def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -> dict[str, int]:
+    bag, damaged = run / BAG_NAME, run / DAMAGED_NAME
+    if not damaged.exists():
+        if bag.exists():
+            bag.rename(damaged)
+    elif bag.exists():  # a repair that did not come to its end
+        shutil.rmtree(bag)
+    present: set[tuple[int, int]] = set()
+    recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
+    try:
+        _copy(damaged, recorder, _topics(run, plan), present)
+        recorder.complete()
+    except BaseException:
+        recorder.abandon()
+        raise
+    # In this order: cut off in between, the next repair finds all that is not in the bag.
+    if damaged.exists():
+        shutil.rmtree(damaged)
+    recorder.clean_up()
+    return recorder.counts()
+
+
+def _topics(run: Path, plan: RecordingPlan) -> dict[str, Topic]:
+    return {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
+
+
+def _copy(
+    damaged: Path, recorder: Recorder, topics: dict[str, Topic], present: set[tuple[int, int]]
+) -> None:
+    for message in stored_messages(damaged):
+        topic = topics.get(message.topic)
+        number = None if topic is None else recorder.copy(topic, message)
+        if number is not None:
+            present.add((number, message.log_ns))

@@ -1,0 +1,283 @@
+"""Spool: the packets that one node keeps, on their way into the bag.
+
+Files, each appended to until it has some size: the recorder reads behind the writer and removes a
+file once all of it is safe in the bag. A packet is one ``write`` to the page cache: it costs 2 us,
+or 0.2 ms for a megabyte, and it outlives its process, however that ends.
+
+Each record is a header (length of the packet, number of its stream, wall time and simulated time in
+nanoseconds, -1: none) and the packet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import struct
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+from neuros.ports import Way
+from neuros.recording.plan import LISTENER, RecordingPlan, Stream, Topic
+
+FILE_BYTES = 8 << 20
+NO_TIME = -1
+
+_FOLDER = "spool"
+_HEADER = struct.Struct("<IIqq")
+_SMALL_BYTES = 4096  # up to here a copy costs less than a write in two parts
+
+
+class Record(NamedTuple):
+    """A packet that a node has kept; times in nanoseconds."""
+
+    wall_ns: int
+    sim_ns: int
+    stream: int
+    data: bytes
+
+
+class ForwardClock:
+    """Wall time in nanoseconds that goes on evenly where the clock is set back."""
+
+    def __init__(self) -> None:
+        self._ahead_ns = time.time_ns() - time.monotonic_ns()
+
+    def __call__(self) -> int:
+        # In this order, a pause between the two can only make the difference smaller.
+        wall_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        self._ahead_ns = max(self._ahead_ns, wall_ns - monotonic_ns)
+        return monotonic_ns + self._ahead_ns
+
+
+class SpoolWriter:
+    """Keeps the packets of one node (:class:`neuros.ports.PacketRecorder`).
+
+    Args:
+        folder: the node's own in the run folder.
+        streams: what is kept; records name a stream by its place in here.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        streams: Sequence[Stream],
+        *,
+        file_bytes: int = FILE_BYTES,
+        clock: Callable[[], int] | None = None,
+    ) -> None:
+        self._folder = folder / _FOLDER
+        self._numbers: Mapping[tuple[Way, str], int] = {
+            (Way(stream.way), stream.name): number for number, stream in enumerate(streams)
+        }
+        self._file_bytes = file_bytes
+        self._clock = clock or ForwardClock()
+        self._descriptor = -1
+        self._files = 0
+        self._size = 0
+        self._last_ns = 0
+
+    def stream(self, way: Way, name: str) -> int | None:
+        """The number of such packets; ``None``: they are not kept."""
+        return self._numbers.get((way, name))
+
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+        """Keep a packet. Raises ``OSError``, and is not to be called again then."""
+        now_ns = self._clock()
+        # No two packets of a spool have the same time, so that a packet can be told by it.
+        self._last_ns = now_ns = now_ns if now_ns > self._last_ns else self._last_ns + 1
+        sim_ns = NO_TIME if sim_time_s is None else max(0, round(sim_time_s * 1e9))
+        self.append(now_ns, sim_ns, stream, data)
+
+    def append(self, wall_ns: int, sim_ns: int, stream: int, data: bytes) -> None:
+        """Write what will be read as a :class:`Record`. Raises ``OSError``."""
+        if self._descriptor < 0 or self._size >= self._file_bytes:
+            self._begin_file()
+        header = _HEADER.pack(len(data), stream, wall_ns, sim_ns)
+        if len(data) <= _SMALL_BYTES:
+            written = os.write(self._descriptor, header + data)
+        else:
+            written = os.writev(self._descriptor, (header, data))
+        if written < _HEADER.size + len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._size += written
+
+    def close(self) -> None:
+        """Keep nothing any more."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _begin_file(self) -> None:
+        self.close()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        path = self._folder / f"{self._files:08d}"
+        self._descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND, 0o644)
+        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # as long as there is somebody who may write
+        self._files += 1
+        self._size = 0
+
+
+def open_recorder(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
+    """The spool of a node, for writing."""
+    return SpoolWriter(run / node, plan.streams.get(node, ()))
+
+
+class SpoolReader:
+    """Reads a spool behind its writer, or after its end."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / _FOLDER
+        self._file: int | None = None
+        self._descriptor = -1
+        self._rest = b""
+        self._last_ns = 0
+        self._done: list[tuple[Path, int]] = []
+
+    def read(self, most_bytes: int) -> tuple[list[Record], bool]:
+        """The next complete records, and whether there is more now."""
+        records: list[Record] = []
+        left = most_bytes
+        while left > 0:
+            if self._descriptor < 0 and not self._open_next():
+                return records, False
+            data = os.read(self._descriptor, left)
+            if data:
+                left -= len(data)
+                self._rest = _split(self._rest + data if self._rest else data, records)
+                self._last_ns = records[-1].wall_ns if records else self._last_ns
+            elif not self._leave_file():
+                return records, False
+        return records, True
+
+    @property
+    def is_fed(self) -> bool:
+        """Whether its writer has a file open now."""
+        numbers = self._numbers()
+        if not numbers:
+            return False
+        descriptor = os.open(self._path(numbers[-1]), os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
+
+    def remove_up_to(self, wall_ns: int) -> None:
+        """Remove the files that were read to their end and have nothing later than that."""
+        while self._done and self._done[0][1] <= wall_ns:
+            with contextlib.suppress(OSError):
+                self._done[0][0].unlink()
+            del self._done[0]
+
+    def close(self, *, remove: bool) -> None:
+        """Stop reading; ``remove``: and remove all that was read."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+            self._done.append((self._path(self._file or 0), self._last_ns))
+        if remove:
+            self.remove_up_to(self._last_ns)
+            with contextlib.suppress(OSError):
+                self._folder.rmdir()
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:08d}"
+
+    def _numbers(self) -> list[int]:
+        with contextlib.suppress(OSError):
+            return sorted(int(name) for name in os.listdir(self._folder) if name.isdigit())
+        return []
+
+    def _open_next(self) -> bool:
+        numbers = [n for n in self._numbers() if self._file is None or n > self._file]
+        if not numbers:
+            return False
+        self._descriptor = os.open(self._path(numbers[0]), os.O_RDONLY)
+        self._file = numbers[0]
+        self._rest = b""
+        return True
+
+    def _leave_file(self) -> bool:
+        """Whether the writer has gone on to another file, so that this one will not grow."""
+        assert self._file is not None
+        if not self._path(self._file + 1).exists():
+            return False
+        # It may have grown between the look at its end and the look for the next.
+        if os.fstat(self._descriptor).st_size > os.lseek(self._descriptor, 0, os.SEEK_CUR):
+            return True
+        os.close(self._descriptor)
+        self._descriptor = -1
+        self._done.append((self._path(self._file), self._last_ns))
+        return True
+
+
+def _split(data: bytes, records: list[Record]) -> bytes:
+    """Take the complete records off the front; returns the rest."""
+    at, end, head = 0, len(data), _HEADER.size
+    unpack = _HEADER.unpack_from
+    while at + head <= end:
+        length, stream, wall_ns, sim_ns = unpack(data, at)
+        after = at + head + length
+        if after > end:
+            break
+        records.append(Record(wall_ns, sim_ns, stream, data[at + head : after]))
+        at = after
+    return data[at:]
+
+
+_LIST = "topics.json"
+
+
+class ListenedSpool:
+    """Spool of the recorder itself, for topics that become known as the run goes on.
+
+    Their types and qualities of service are known only when a sender appears; so the list of topics
+    is written before the first packet of each, for all readers of the spool.
+    """
+
+    def __init__(self, run: Path) -> None:
+        self._folder = run / LISTENER
+        self._topics: list[Topic] = []
+        self._spool = SpoolWriter(self._folder, ())
+
+    def add(self, topic: Topic) -> int:
+        """The number of a new topic. Raises ``OSError``."""
+        self._topics.append(topic)
+        self._folder.mkdir(exist_ok=True)
+        text = json.dumps([asdict(each) for each in self._topics])
+        new = self._folder / f"{_LIST}.new"
+        new.write_text(text, "utf-8")
+        new.replace(self._folder / _LIST)
+        return len(self._topics) - 1
+
+    def keep(self, number: int, wall_ns: int, data: bytes) -> None:
+        """Keep a packet. Raises ``OSError``."""
+        self._spool.append(wall_ns, NO_TIME, number, data)
+
+    def close(self) -> None:
+        """Keep nothing any more."""
+        self._spool.close()
+
+
+def listened_topics(run: Path) -> list[Topic]:
+    """The topics that have been heard so far, in the order of their numbers."""
+    try:
+        return [Topic(**each) for each in json.loads((run / LISTENER / _LIST).read_text("utf-8"))]
+    except FileNotFoundError:
+        return []
+
+
+def forget_listened(run: Path) -> None:
+    """Remove the list; its spool must have been removed before."""
+    for name in (_LIST, f"{_LIST}.new"):
+        (run / LISTENER / name).unlink(missing_ok=True)
+    if (run / LISTENER).is_dir():
+        (run / LISTENER).rmdir()

@@ -1,0 +1,289 @@
+"""Meshes of a description: files that MuJoCo reads, converted ones, and flat ones.
+
+MuJoCo collides the convex hull of a mesh, and a flat mesh (a floor of two triangles, say) has none:
+a thin box collides in its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from neuros.simulators.convert.elements import Element
+from neuros.simulators.convert.find import Finder, NotFound
+from neuros.simulators.convert.report import Report
+from neuros.simulators.convert.values import Pose, Vector, from_quaternion
+
+_READ_BY_MUJOCO = (".obj", ".stl", ".msh")
+_CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
+_CONVERTERS = ("trimesh", "collada")
+_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+_HOW = "`pip install 'neuros[meshes]'` converts it"
+
+Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
+"""Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
+
+_FLAT = 1e-4  # how thick, at most, by how long
+_THICKNESS_M = 0.01
+_RECTANGULAR = 0.999  # of its area, at least
+
+
+@dataclass
+class Meshes:
+    """The mesh assets of a model: each file and scale once.
+
+    Attributes:
+        made: those that MuJoCo cannot read itself, by the names of their assets.
+    """
+
+    spec: Any
+    finder: Finder
+    report: Report
+    made: dict[str, Triangles] = field(default_factory=dict)
+    _names: dict[tuple[Path, tuple[float, ...], bool], str | None] = field(default_factory=dict)
+    _places: dict[str, Element] = field(default_factory=dict)
+
+    def add(
+        self, uri: Element, scale: tuple[float, ...], *, is_solid: bool, is_needed: bool
+    ) -> str | None:
+        """The name of the asset for the file that ``uri`` names.
+
+        ``None`` if there is none: a missing file is a problem where it ``is_needed``, else a note.
+        A solid one has a volume, from which MuJoCo computes its mass.
+        """
+        try:
+            file = self.finder.find_file(uri.text, uri.file.parent)
+        except NotFound as error:
+            if is_needed:
+                self.report.problem(uri, str(error), error.hint)
+            else:
+                self.report.note(uri, f"{error} ({error.hint})" if error.hint else str(error))
+            return None
+        key = (file, scale, is_solid)
+        if key not in self._names:
+            self._names[key] = self._new(uri, file, scale, is_solid)
+        elif self._names[key] is None:
+            self.report.note(uri, why_unread(file))
+        return self._names[key]
+
+    def blame(self) -> None:
+        """Report the meshes that MuJoCo cannot use, once a model with them does not compile."""
+        for mesh in self.spec.meshes:
+            try:
+                _compile_alone(mesh, self.made.get(mesh.name))
+            except ValueError as error:
+                text = " ".join(str(error).removeprefix("Error: ").split())
+                self.report.problem(self._places[mesh.name], f"MuJoCo cannot use the mesh: {text}")
+
+    def _new(
+        self, uri: Element, file: Path, scale: tuple[float, ...], is_solid: bool
+    ) -> str | None:
+        triangles = None
+        if needs_conversion(file):
+            triangles = triangles_of(file)
+            if triangles is None:
+                self.report.note(uri, why_unread(file))
+                return None
+        name, number = file.stem, 1
+        while name in self._places:
+            number += 1
+            name = f"{file.stem}_{number}"
+        self._places[name] = uri
+        mesh = self.spec.add_mesh(name=name, scale=scale)
+        if not is_solid:  # a thin shell may be open, or flat
+            mesh.inertia = _SHELL
+        if triangles is None:
+            mesh.file = str(file)
+        else:
+            fill(mesh, triangles)
+            self.made[name] = triangles
+        return name
+
+
+def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
+    """The ``MjModel`` of one mesh, which collides unless it ``is_shown_only``.
+
+    ``triangles`` are its own, if it has no file. Raises ``ValueError``.
+    """
+    trial = mujoco.MjSpec()
+    alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
+    alone.inertia = _SHELL if is_shown_only else mesh.inertia
+    if triangles is not None:
+        fill(alone, triangles)
+    geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+    if is_shown_only:
+        geom.contype = geom.conaffinity = 0
+    return trial.compile()
+
+
+def why_unread(file: Path) -> str:
+    """Why a file that needs conversion has no triangles here, and what to do."""
+    kind = "STL in text form" if _is_text_stl(file) else f"{file.suffix or 'such'} files"
+    if file.suffix.lower() not in (*_CONVERTED, ".stl"):
+        return f"MuJoCo does not read {kind}: convert it to OBJ"
+    if not all(map(find_spec, _CONVERTERS)):
+        return f"MuJoCo does not read {kind}: {_HOW}"
+    return "no triangles can be read from it (is it damaged?): convert it to OBJ"
+
+
+def needs_conversion(file: Path) -> bool:
+    """Whether MuJoCo does not read a file of this kind."""
+    return file.suffix.lower() not in _READ_BY_MUJOCO or _is_text_stl(file)
+
+
+def fill(mesh: Any, triangles: Triangles) -> None:
+    """Give a mesh of a spec its triangles."""
+    vertices, faces = triangles
+    mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
+
+
+def _is_text_stl(file: Path) -> bool:
+    """Whether an STL file is one in text form, by its size: a binary one says how long it is."""
+    if file.suffix.lower() != ".stl":
+        return False
+    with file.open("rb") as stl:
+        head = stl.read(84)
+    count = int.from_bytes(head[80:84], "little")
+    return head.startswith(b"solid") and file.stat().st_size != 84 + 50 * count
+
+
+def triangles_of(file: Path) -> Triangles | None:
+    """The triangles of a file of another kind in metres; ``None`` if nothing here reads it.
+
+    The axes stay unchanged, as in Gazebo, whichever of them the file calls up.
+    """
+    try:
+        import trimesh
+
+        scene = trimesh.load_scene(str(file))
+        mesh = scene.to_geometry()
+        unit = float(trimesh.units.unit_conversion(mesh.units or "meters", "meters"))
+    except Exception:  # readers of other people's make raise anything for a damaged file
+        return None
+    if not len(getattr(mesh, "faces", ())):
+        return None
+    return np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces, np.int32)
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A flat mesh as a box: half lengths in metres; ``pose`` is seen from the mesh."""
+
+    half_lengths: Vector
+    pose: Pose
+    is_rectangular: bool
+
+    def __str__(self) -> str:
+        size = " x ".join(f"{2 * length:.4g}" for length in self.half_lengths)
+        outline = "" if self.is_rectangular else ", which is more than the mesh covers"
+        return f"MuJoCo cannot collide a flat mesh: a box of {size} m stands in its place{outline}"
+
+
+def has_flat_meshes(model: Any) -> bool:
+    """Whether a mesh collides that is flat but for rounding: it compiles, and holds nothing."""
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
+    sizes = model.geom_size[is_mesh & ((model.geom_contype | model.geom_conaffinity) != 0)]
+    return bool(np.any(sizes.min(axis=1) <= _FLAT * sizes.max(axis=1)))
+
+
+def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
+    """Turn the colliding geoms of flat meshes into boxes, in a spec that was never compiled.
+
+    ``made`` are the triangles of meshes that have no file. Returns the geoms; those that only show
+    a flat mesh stay unchanged.
+    """
+    boxed = []
+    for mesh in list(spec.meshes):
+        slab = _slab_of(mesh, made.get(mesh.name))
+        if slab is None:
+            continue
+        geoms = [geom for geom in spec.geoms if geom.meshname == mesh.name]
+        colliding = [geom for geom in geoms if geom.contype or geom.conaffinity]
+        for geom in colliding:
+            pose = from_quaternion(geom.pos, geom.quat) @ slab.pose
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_BOX, ""
+            geom.size, geom.pos, geom.quat = slab.half_lengths, pose.position, pose.quaternion
+            boxed.append((geom, slab))
+        if len(colliding) < len(geoms):
+            mesh.inertia = _SHELL
+        else:
+            made.pop(mesh.name, None)
+            spec.delete(mesh) if hasattr(spec, "delete") else mesh.delete()  # until MuJoCo 3.3
+    return boxed
+
+
+def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
+    """``None`` where a mesh is not flat, or is at fault in another way."""
+    try:
+        model = _compile_alone(mesh, triangles, is_shown_only=True)
+    except ValueError:
+        return None
+    # MuJoCo moves a mesh to its centre of mass, and turns it to its principal axes.
+    moved = from_quaternion(model.mesh_pos[0], model.mesh_quat[0])
+    vertices = model.mesh_vert @ moved.rotation.T + moved.position
+    corners = vertices[model.mesh_face]
+    return _fit(vertices, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
+def _fit(vertices: Vector, normals: Vector) -> Slab | None:
+    """The slab behind the plane of ``vertices``, or around it where triangles show both sides."""
+    front, centre = normals.sum(axis=0), vertices.mean(axis=0)
+    axes = np.linalg.svd(vertices - centre, full_matrices=False)[2]
+    if axes[2] @ front < 0:
+        axes[2] = -axes[2]
+    axes[1] = np.cross(axes[2], axes[0])
+    along, across, up = axes @ (vertices - centre).T
+    if np.ptp(up) > _FLAT * np.ptp(along):
+        return None
+    turn, low, high, share = _rectangle(np.column_stack((along, across)))
+    rotation = np.column_stack((axes[:2].T @ turn, axes[2]))
+    sides = high - low
+    thickness = min(_THICKNESS_M, float(sides.min()) / 10)
+    is_one_sided = np.linalg.norm(front) > _FLAT * np.linalg.norm(normals, axis=1).sum()
+    middle = np.append((low + high) / 2, -thickness / 2 if is_one_sided else 0.0)
+    return Slab(
+        np.append(sides, thickness) / 2,
+        Pose(centre + rotation @ middle, rotation),
+        share >= _RECTANGULAR,
+    )
+
+
+def _rectangle(points: Vector) -> tuple[Vector, Vector, Vector, float]:
+    """The smallest rectangle around points, shape (n, 2): axes, corners, and how full it is.
+
+    One of its sides lies along an edge of the convex hull (Freeman and Shapira 1975).
+    """
+    hull = _convex_hull(points)
+    edges = np.roll(hull, -1, axis=0) - hull
+    x, y = (edges / np.linalg.norm(edges, axis=1, keepdims=True)).T
+    turns = np.stack((np.column_stack((x, -y)), np.column_stack((y, x))), axis=1)  # (edge, 2, 2)
+    placed = hull @ turns  # along every edge and across it: (edge, corner, 2)
+    low, high = placed.min(axis=1), placed.max(axis=1)
+    areas = np.prod(high - low, axis=1)
+    best = int(areas.argmin())
+    following = np.roll(hull, -1, axis=0)
+    area = abs(np.sum(hull[:, 0] * following[:, 1] - hull[:, 1] * following[:, 0])) / 2
+    return turns[best], low[best], high[best], float(area / areas[best])
+
+
+def _convex_hull(points: Vector) -> Vector:
+    """Its corners in their order, shape (n, 2) (Andrew's monotone chain)."""
+    ordered = sorted(set(map(tuple, points.tolist())))
+    corners: list[tuple[float, float]] = []
+    for way in (ordered, ordered[::-1]):
+        chain: list[tuple[float, float]] = []
+        for x, y in way:
+            while len(chain) > 1:
+                (ax, ay), (bx, by) = chain[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                chain.pop()
+            chain.append((x, y))
+        corners += chain[:-1]
+    return np.array(corners)

@@ -1,0 +1,245 @@
+"""Names and places in SDF: every model and world is a scope with frames in it.
+
+A frame is a link, a joint, a nested model or a ``<frame>``; each is placed relative to another one
+of its scope, or of a scope within (``arm::hand``). A scope places them relative to its own frame,
+which is called ``__model__`` (in a world: ``world``). See http://sdformat.org, "Pose frame
+semantics".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from neuros.simulators.convert.elements import Element
+from neuros.simulators.convert.report import Report
+from neuros.simulators.convert.values import Pose, is_true, read_pose, text_of
+
+_OWN = ("", "__model__", "world")
+_KINDS = ("link", "joint", "frame", "model")
+
+
+@dataclass(eq=False)
+class Frame:
+    """A named place; ``base`` is the name of what it is placed relative to in its scope."""
+
+    element: Element
+    base: str
+    raw: Pose
+
+
+@dataclass(eq=False)
+class Link:
+    """A rigid body.
+
+    Attributes:
+        name: as MuJoCo is to call it: the names of the models around it, and its own, by slashes.
+        pose: in the world.
+    """
+
+    name: str
+    element: Element
+    scope: Scope
+    pose: Pose
+    is_static: bool
+
+
+@dataclass(eq=False)
+class Scope:
+    """A model, or a world.
+
+    Attributes:
+        prefix: what the names of its elements begin with in MuJoCo: empty, or ``arm/hand/``.
+        pose: in the world.
+        models: the models in it, by name.
+    """
+
+    element: Element
+    report: Report
+    parent: Scope | None = None
+    prefix: str = ""
+    pose: Pose = field(default_factory=Pose)
+    is_static: bool = False
+    self_collides: bool = False
+    frames: dict[str, Frame] = field(default_factory=dict)
+    models: dict[str, Scope] = field(default_factory=dict)
+    links: dict[str, Link] = field(default_factory=dict)
+    _places: dict[str, Pose | None] = field(default_factory=dict)
+
+    @property
+    def is_world(self) -> bool:
+        return self.parent is None
+
+    @property
+    def outermost(self) -> Scope:
+        """The model that it belongs to and that belongs to no other one."""
+        return self if self.parent is None or self.parent.is_world else self.parent.outermost
+
+    def and_models(self) -> Iterator[Scope]:
+        """This scope, and all within, outer ones first."""
+        yield self
+        for model in self.models.values():
+            yield from model.and_models()
+
+    def each(self, tag: str) -> Iterator[tuple[Scope, Element]]:
+        """All elements of one tag in this scope and those within."""
+        for scope in self.and_models():
+            yield from ((scope, element) for element in scope.element.each(tag))
+
+    def place(self, name: str, asking: Element) -> Pose:
+        """The pose of a frame in this scope's own frame; problems are reported of ``asking``."""
+        head, _, rest = name.partition("::")
+        if rest:
+            if head in self.models:
+                return self.place(head, asking) @ self.models[head].place(rest, asking)
+            self.report.problem(asking, f"there is no model '{head}' for '{name}'")
+            return Pose()
+        if head in _OWN and (head != "world" or self.is_world):
+            return Pose()
+        if head not in self.frames:
+            self._unknown(name, asking)
+            return Pose()
+        if head not in self._places:
+            self._places[head] = None
+            self._places[head] = self._placed(head)
+        place = self._places[head]
+        if place is None:
+            self.report.problem(asking, f"'{name}' is placed relative to itself")
+            return Pose()
+        return place
+
+    def _placed(self, name: str) -> Pose:
+        frame = self.frames[name]
+        place = self.place(frame.base, frame.element) @ frame.raw
+        model = self.models.get(name) if frame.element.tag == "model" else None
+        anchor = model and model.element.attributes.get("placement_frame")
+        if model and anchor:
+            return place @ model.place(anchor, model.element).inverse()
+        return place
+
+    def read_pose(self, owner: Element, default: Pose) -> Pose:
+        """The pose of something without a name (a collision, a sensor), in the world.
+
+        It is relative to ``default`` (in the world) unless it says otherwise.
+        """
+        base = relative_to(owner)
+        if base:
+            default = self.pose @ self.place(base, owner)
+        return default @ read_pose(owner, self.report)
+
+    def body(self, name: str, asking: Element) -> Link | None:
+        """The link that a frame is attached to; ``None`` is the world. Problems are reported."""
+        seen: set[tuple[int, str]] = set()
+        scope: Scope = self
+        while (id(scope), name) not in seen:
+            seen.add((id(scope), name))
+            head, _, rest = name.partition("::")
+            if name == "world" or (scope.is_world and name in _OWN):
+                return None
+            if rest and head in scope.models:
+                scope, name = scope.models[head], rest
+            elif name in _OWN:
+                name = scope.canonical()
+                if not name:
+                    break
+            elif name in scope.links:
+                return scope.links[name]
+            elif name in scope.frames:
+                scope, name = scope._attachment(name)
+            else:
+                scope._unknown(name, asking)
+                return None
+        self.report.problem(asking, f"'{name or self.element.name}' is attached to no link")
+        return None
+
+    def canonical(self) -> str:
+        """The name of the link that stands for the model: the one it names, or the first."""
+        named = self.element.attributes.get("canonical_link")
+        if named:
+            return named
+        if self.links:
+            return next(iter(self.links))
+        inner = (f"{name}::__model__" for name, model in self.models.items() if model.canonical())
+        return next(inner, "")
+
+    def _attachment(self, name: str) -> tuple[Scope, str]:
+        element = self.frames[name].element
+        if element.tag == "model":
+            return self.models[name], "__model__"
+        if element.tag == "joint":
+            return self, text_of(element, "child")
+        return self, element.attributes.get("attached_to") or "__model__"
+
+    def _unknown(self, name: str, asking: Element) -> None:
+        names = ", ".join(sorted(self.frames)[:8])
+        hint = f"there are: {names}" if names else ""
+        self.report.problem(asking, f"there is no link, joint, frame or model '{name}'", hint)
+
+
+def relative_to(owner: Element) -> str:
+    """The frame that the pose of ``owner`` is relative to; empty if it names none."""
+    pose = owner.child("pose")
+    if pose is None:
+        return ""
+    # Until SDF 1.6 the attribute was called "frame".
+    return pose.attributes.get("relative_to") or pose.attributes.get("frame") or ""
+
+
+def read_scope(
+    element: Element, report: Report, *, parent: Scope | None, prefix: str = ""
+) -> Scope:
+    """A world or model with all that is in it, poses in the world still unknown."""
+    scope = Scope(element, report, parent, prefix)
+    placement = element.child("placement_frame")
+    if placement is not None:
+        element.attributes["placement_frame"] = placement.text
+    if not scope.is_world:
+        is_static = is_true(element, "static", report, default=False)
+        scope.is_static = is_static or (parent is not None and parent.is_static)
+        scope.self_collides = is_true(element, "self_collide", report, default=False)
+    for kind in _KINDS:
+        for child in element.each(kind):
+            _add_frame(scope, child)
+    for child in element.each("model"):
+        if child.name and child.name not in scope.models:
+            inner = f"{prefix}{child.name}/" if _needs_prefix(scope) else ""
+            scope.models[child.name] = read_scope(child, report, parent=scope, prefix=inner)
+    return scope
+
+
+def place_all(scope: Scope) -> None:
+    """Place every model and link in the world."""
+    for name, model in scope.models.items():
+        model.pose = scope.pose @ scope.place(name, model.element)
+        place_all(model)
+    for name in scope.frames:
+        scope.place(name, scope.frames[name].element)  # also those that nothing is relative to
+    for name, link in scope.links.items():
+        link.pose = scope.pose @ scope.place(name, link.element)
+
+
+def _needs_prefix(scope: Scope) -> bool:
+    """A model that stands alone in its file needs none."""
+    return not scope.is_world or scope.element.tag == "world"
+
+
+def _add_frame(scope: Scope, element: Element) -> None:
+    if not element.name:
+        scope.report.problem(element, f"the <{element.tag}> has no name")
+        return
+    if element.name in scope.frames:
+        first = scope.frames[element.name].element
+        scope.report.problem(
+            element, f"the name '{element.name}' occurs twice", f"see {first.place}"
+        )
+        return
+    default = ""
+    if element.tag == "joint":
+        default = text_of(element, "child")
+    elif element.tag == "frame":
+        default = element.attributes.get("attached_to", "")
+    base = relative_to(element) or default
+    scope.frames[element.name] = Frame(element, base, read_pose(element, scope.report))
+    if element.tag == "link":
+        name = scope.prefix + element.name
+        scope.links[element.name] = Link(name, element, scope, Pose(), scope.is_static)

@@ -1,0 +1,264 @@
+"""Live metrics of the page, from counters of nodes: rates, shares, latencies, losses."""
+
+from __future__ import annotations
+
+import itertools
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+from neuros.engine.time_budget import time_budget_of
+
+WINDOW_S = 1.0
+"""Rates and shares are those of about the last second."""
+
+_STATES = ("executing", "waiting", "blocked", "idle", "registering", "scheduling", "paused")
+_COUNTS = ("sent", "outstanding", "received", "discarded", "unread")
+_MOST_SENT = 4096
+_MOST_TAKEN = 8
+_MOST_SHOWN = 256
+_UNDER_WAY_S = 0.02
+_LATE_S = 2.0
+
+
+class Latency:
+    """Latency of one connection: from the sending of a packet to the start of a hook on it.
+
+    Sender and receiver show themselves at different moments; what belongs together is told by the
+    packets' positions. Both count on the monotonic clock of one machine.
+    """
+
+    def __init__(self) -> None:
+        self._sent_ns: OrderedDict[int, int] = OrderedDict()
+        self._taken: deque[tuple[int, int]] = deque(maxlen=_MOST_TAKEN)
+        self._last_ms: deque[float] = deque(maxlen=5)
+
+    def sent(self, last: int, times_ns: Sequence[int]) -> None:
+        """The last packets sent have been up to position ``last``."""
+        for position, time_ns in enumerate(times_ns, last - len(times_ns) + 1):
+            self._sent_ns[position] = time_ns
+        while len(self._sent_ns) > _MOST_SENT:
+            self._sent_ns.popitem(last=False)
+        self._match()
+
+    def taken(self, position: int, time_ns: int) -> None:
+        """A hook has started on a packet."""
+        if not self._taken or self._taken[-1][0] != position:
+            self._taken.append((position, time_ns))
+            self._match()
+
+    @property
+    def ms(self) -> float | None:
+        """The mean over the last few, ``None`` before the first."""
+        return fmean(self._last_ms) if self._last_ms else None
+
+    def _match(self) -> None:
+        for position, time_ns in tuple(self._taken):
+            sent_ns = self._sent_ns.get(position)
+            if sent_ns is not None:
+                self._taken.remove((position, time_ns))
+                self._last_ms.append(max(0, time_ns - sent_ns) / 1e6)
+
+
+class Speed:
+    """Growth of a counter, over :data:`WINDOW_S`."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque()
+
+    def note(self, now_s: float, value: float) -> None:
+        """It has that value now."""
+        self._points.append((now_s, value))
+        while len(self._points) > 2 and now_s - self._points[1][0] >= WINDOW_S:
+            self._points.popleft()
+
+    @property
+    def per_s(self) -> float:
+        """0 before there are two values."""
+        (first_s, first), (last_s, last) = self._points[0], self._points[-1]
+        return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
+
+
+class Loss:
+    """Packets of a best-effort connection that were lost on their way, so far.
+
+    Both ends show their counts at different moments, and what arrives while a hook executes is
+    taken in after it. So the receiver's count is compared with what had been sent shortly before it
+    last took in, and the least difference of a while counts: late packets are not lost.
+    """
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, int]] = deque(maxlen=_MOST_SHOWN)
+        self._missing: deque[tuple[float, float]] = deque()
+        self.count = 0
+
+    def sent(self, now_s: float, count: int) -> None:
+        """So many have been sent by now."""
+        self._sent.append((now_s, count))
+
+    def received(self, now_s: float, taken_in_s: float, count: int) -> None:
+        """So many have arrived of those that were there when the receiver last took in."""
+        sent = self._sent_by(taken_in_s - _UNDER_WAY_S)
+        if sent is None:
+            return
+        self._missing.append((now_s, sent - count))
+        if now_s - self._missing[0][0] >= _LATE_S:
+            self.count = max(self.count, int(min(missing for _, missing in self._missing)))
+            self._missing.popleft()
+
+    def _sent_by(self, then_s: float) -> float | None:
+        """The count of packets sent by then, if known."""
+        for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
+            if a_s <= then_s <= b_s:
+                return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
+        is_since = self._sent and self._sent[-1][0] <= then_s
+        return self._sent[-1][1] if is_since else None
+
+
+class LiveMetrics:
+    """Live metrics of all nodes and connections, with as much of the past as they need.
+
+    Attributes:
+        nodes, connections: by name, ready for JSON.
+        sim_time: simulated seconds, ``None`` where no node owns time.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, dict[str, Any]] = {}
+        self.connections: dict[str, dict[str, Any]] = {}
+        self.sim_time: float | None = None
+        self._speeds: dict[tuple[str, str], Speed] = {}
+        self._latencies: dict[str, Latency] = {}
+        self._losses: dict[str, Loss] = {}
+        self._ended_factor: float | None = None
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated seconds per second: now, and of the whole run once that is over."""
+        if self._ended_factor is not None:
+            return self._ended_factor
+        speed = self._speeds.get(("sim", ""))
+        return None if speed is None else speed.per_s
+
+    def take(self, status: Mapping[str, Any]) -> None:
+        """A node has shown itself."""
+        books = status["books"]
+        if books is None:
+            self.nodes[status["node"]] = {"state": "loading", "cause": ""}
+            return
+        now_s = books["now_s"]
+        if status["sim_time"] is not None:
+            self.sim_time = status["sim_time"]
+            self._speed("sim", "", now_s, status["sim_time"])
+        self._take_node(status["node"], books, now_s)
+        for name, counters in books["outgoing"].items():
+            shown = self.connections.setdefault(name, {})
+            shown |= {key: counters[key] for key in ("sent", "outstanding", "is_blocked")}
+            shown["rate_hz"] = self._speed("sent", name, now_s, counters["sent"])
+            if counters["is_reliable"]:
+                shown["lost"] = 0
+            else:
+                self._losses.setdefault(name, Loss()).sent(now_s, counters["sent"])
+        for name, counters in books["incoming"].items():
+            shown = self.connections.setdefault(name, {})
+            shown |= {key: counters[key] for key in ("received", "discarded", "unread")}
+            rate_hz = self._speed("received", name, now_s, counters["received"])
+            shown.setdefault("rate_hz", rate_hz)
+            if "sent" not in shown:  # an external topic, or a sender of another launcher
+                shown["rate_hz"] = rate_hz
+            if name in self._losses:
+                executing = books["executing"]
+                taken_in_s = now_s - (executing["for_s"] if executing else 0.0)
+                self._losses[name].received(now_s, taken_in_s, counters["received"])
+                shown["lost"] = self._losses[name].count
+        self._take_times(books)
+
+    def end(self, reports: Mapping[str, Mapping[str, Any]], running_s: float | None) -> None:
+        """The run is over: counts are final, and rates and shares are those of the whole run.
+
+        Args:
+            reports: the last one of each node that has made one.
+            running_s: how long all nodes ran.
+        """
+        self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
+        ends: dict[str, dict[str, int]] = {}
+        for name, report in reports.items():
+            books = report["metrics"]
+            if books is None:
+                continue
+            self._end_node(name, books, running_s)
+            for connection, counters in (*books["outgoing"].items(), *books["incoming"].items()):
+                shown = self.connections.setdefault(connection, {})
+                shown |= {key: counters[key] for key in _COUNTS if key in counters}
+                if report.get("is_final"):
+                    ends.setdefault(connection, {}).update(counters)
+        for connection, shown in self.connections.items():
+            count, final = shown.get("sent", shown.get("received")), ends.get(connection, {})
+            is_known = {"sent", "received"} <= {*final}
+            shown |= {
+                "is_blocked": False,
+                "latency_ms": None,
+                "rate_hz": count / running_s if count is not None and running_s else None,
+                "lost": final["sent"] - final["received"] if is_known else None,
+            }
+        if self.sim_time is not None and running_s:
+            self._ended_factor = self.sim_time / running_s
+
+    def _end_node(self, name: str, books: Mapping[str, Any], running_s: float | None) -> None:
+        spent = time_budget_of(books, running_s)
+        self.nodes[name] = {
+            "state": "ended",
+            "cause": "",
+            "shares": {} if spent is None else spent.shares,
+            "hooks": {
+                hook: _hook(each["executions"], each["busy_s"], None)
+                for hook, each in books["hooks"].items()
+            },
+        }
+
+    def _take_node(self, name: str, books: Mapping[str, Any], now_s: float) -> None:
+        shares = {
+            state: self._speed(f"share {state}", name, now_s, _seconds(books, state))
+            for state in _STATES
+        }
+        executing = books["executing"]
+        self.nodes[name] = {
+            **books["state"],
+            "executing": executing["name"] if executing else None,
+            "executing_s": executing["for_s"] if executing else 0.0,
+            "shares": shares,
+            "hooks": {
+                hook: _hook(count, busy_s, self._speed(f"hook {hook}", name, now_s, count))
+                for hook, (count, busy_s) in books["hooks"].items()
+            },
+        }
+
+    def _take_times(self, books: Mapping[str, Any]) -> None:
+        for name, (last, times_ns) in books["sent_ns"].items():
+            self._latency(name).sent(last, times_ns)
+        for name, (position, time_ns) in books["taken_ns"].items():
+            self._latency(name).taken(position, time_ns)
+        for name, latency in self._latencies.items():
+            self.connections[name]["latency_ms"] = latency.ms
+
+    def _latency(self, name: str) -> Latency:
+        return self._latencies.setdefault(name, Latency())
+
+    def _speed(self, kind: str, name: str, now_s: float, value: float) -> float:
+        speed = self._speeds.setdefault((kind, name), Speed())
+        speed.note(now_s, value)
+        return speed.per_s
+
+
+def _seconds(books: Mapping[str, Any], cause: str) -> float:
+    spent = books["accounting"][cause]
+    return sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
+
+
+def _hook(executions: int, busy_s: float, rate_hz: float | None) -> dict[str, Any]:
+    return {
+        "executions": executions,
+        "rate_hz": rate_hz,
+        "mean_ms": busy_s / executions * 1e3 if executions else None,
+    }

@@ -1,0 +1,262 @@
+"""Web server of a run: a page, a stream of events, and a few requests.
+
+======== ============= ===========================================================
+method   path          what it does
+======== ============= ===========================================================
+GET      /             the page
+GET      /static/...   what it consists of
+GET      /events       a stream of server-sent events, as long as the page is open
+POST     /want         what the page shows of packets: ``{"page": ..., "wanted": ...}``
+POST     /do/pause     the run stands still
+POST     /do/resume    it goes on
+POST     /do/step      while it stands still, ``{"count": n}`` steps
+POST     /do/stop      it ends, drained, with exit code 0
+======== ============= ===========================================================
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import urlencode, urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import URL
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import (
+    FileResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+    StreamingResponse,
+)
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from neuros.viewers.dashboard.link import Link, Pages, wanted_of
+
+STATIC = Path(__file__).parent / "static"
+_LOG_S = 0.2
+_LOAD_S = 1.0
+_KEPT_LINES = 1000
+_CLOSING_S = 1
+_MOST_STEPS = 1_000_000
+_HEADERS = {
+    "Cache-Control": "no-store",
+    # In a frame of another page, buttons could be clicked by those who do not see them.
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:;"
+    " style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+_NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
+
+
+class LogSource(Protocol):
+    """New lines of the logs of a run."""
+
+    def read(self) -> list[str]: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Readings of this machine while a page is open.
+
+    Attributes:
+        open_log: begins to read the logs, with the last lines that there are.
+        load: the load of the machine and of each node, since it was last asked; JSON-serialisable.
+    """
+
+    open_log: Callable[[], LogSource]
+    load: Callable[[], Mapping[str, Any]]
+
+
+class Dashboard:
+    """Serves one run until that is over.
+
+    Args:
+        plan: what :func:`neuros.viewers.dashboard.plan.plan` tells of the project.
+        names: the nodes of the run.
+        start_s: monotonic time from which the page counts.
+    """
+
+    def __init__(
+        self, plan: Mapping[str, Any], names: tuple[str, ...], sources: Sources, start_s: float
+    ) -> None:
+        self._plan = plan
+        self._sources = sources
+        self._pages = Pages()
+        self._link = Link(self._pages, names, start_s)
+        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+
+    async def serve(self, listening: socket.socket, token: str, run: str, folder: Path) -> None:
+        """Answer requests until the supervisor hangs up. Raises ``OSError`` if it is not there."""
+        config = uvicorn.Config(
+            self.app(token, run),
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=_CLOSING_S,
+        )
+        server = uvicorn.Server(config)
+        serving = asyncio.create_task(server.serve([listening]))
+        tasks = [asyncio.create_task(each) for each in (self._read_logs(), self._read_load())]
+        try:
+            await self._link.run(folder)
+        finally:
+            for task in tasks:
+                task.cancel()
+            self._pages.part()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._pages.are_gone.wait(), _CLOSING_S)
+            server.should_exit = True
+            await serving
+
+    def app(self, token: str, run: str) -> Starlette:
+        """The ASGI application."""
+        return Starlette(
+            routes=[
+                Route("/", self._index),
+                Route("/events", self._events),
+                Route("/want", self._want, methods=["POST"]),
+                Route("/do/{what}", self._do, methods=["POST"]),
+                Mount("/static", StaticFiles(directory=STATIC)),
+            ],
+            middleware=[Middleware(Access, token=token, run=run)],
+        )
+
+    # ------------------------------------------------------------------ requests
+
+    async def _index(self, _: Request) -> Response:
+        return FileResponse(STATIC / "index.html", headers=_HEADERS)
+
+    async def _events(self, _: Request) -> Response:
+        return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
+
+    async def _stream(self) -> AsyncIterator[str]:
+        name, page = self._pages.open()
+        try:
+            page.send("begin", {"page": name, **self._plan})
+            page.send("phase", self._link.phase)
+            page.send("log", list(self._lines))
+            while (event := await page.next_event()) is not None:
+                yield event
+        finally:
+            self._pages.close(name)
+
+    async def _want(self, request: Request) -> Response:
+        try:
+            asked = await request.json()
+            name, wanted = str(asked["page"]), wanted_of(asked["wanted"])
+        except _NOT_UNDERSTOOD:
+            return JSONResponse({"error": "this is no question of a page"}, 400)
+        is_there = self._pages.want(name, wanted)
+        return Response(status_code=204 if is_there else 410)
+
+    async def _do(self, request: Request) -> Response:
+        what = request.path_params["what"]
+        if what in ("pause", "resume"):
+            self._link.tell(what)
+        elif what == "step":
+            try:
+                count = int((await request.json())["count"])
+            except _NOT_UNDERSTOOD:
+                return JSONResponse({"error": "how many steps?"}, 400)
+            self._link.tell("step", count=min(count, _MOST_STEPS))
+        elif what == "stop":
+            self._link.tell("end", reason="ended from the dashboard")
+        else:
+            return JSONResponse({"error": f"nothing is called '{what}'"}, 404)
+        return Response(status_code=204)
+
+    # ------------------------------------------------------------------ what is read here
+
+    async def _read_logs(self) -> None:
+        while True:
+            await self._pages.are_watched.wait()
+            log = self._sources.open_log()
+            try:
+                while self._pages.are_watched.is_set():
+                    lines = log.read()
+                    if lines:
+                        self._lines.extend(lines)
+                        self._pages.send("log", lines)
+                    else:
+                        await asyncio.sleep(_LOG_S)
+                    await asyncio.sleep(0)
+            finally:
+                log.close()
+                self._lines.clear()  # the next page begins with the last lines of then
+
+    async def _read_load(self) -> None:
+        while True:
+            await self._pages.are_watched.wait()
+            self._pages.send("load", await asyncio.to_thread(self._sources.load))
+            await asyncio.sleep(_LOAD_S)
+
+
+_LOCAL_NAMES = {"127.0.0.1", "localhost", "[::1]", "::1"}
+
+
+class Access:
+    """ASGI middleware that lets only the user's own browser through: it has the printed token.
+
+    The server listens on 127.0.0.1 only, but other users of the machine, and any page that the
+    user's browser shows, can reach that, too. So every request needs the token: once in the URL,
+    from then on in a cookie that no script can read. A request that a page of another origin has
+    made is refused, and so is one under another name for this machine (DNS rebinding).
+
+    Args:
+        run: the run's id, for the name of the cookie: cookies do not tell ports apart.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, run: str) -> None:
+        self._app = app
+        self._token = token
+        self._cookie = f"neuros_{run[:8]}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope, receive)
+        answer = self._refusal(request) or self._welcome(request)
+        await (answer or self._app)(scope, receive, send)
+
+    def _refusal(self, request: Request) -> Response | None:
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
+            return PlainTextResponse("this dashboard answers to localhost only", 403)
+        if origin is not None and urlsplit(origin).netloc != host:
+            return PlainTextResponse("another page may not speak for this one", 403)
+        given = request.query_params.get("token") or request.cookies.get(self._cookie, "")
+        if not secrets.compare_digest(given.encode(), self._token.encode()):
+            return PlainTextResponse(
+                "wrong or missing token: open the whole address that NeuROS printed,"
+                " http://127.0.0.1:.../?token=...",
+                403,
+            )
+        return None
+
+    def _welcome(self, request: Request) -> Response | None:
+        """Move the token from the address, which others may see, into a cookie."""
+        if "token" not in request.query_params:
+            return None
+        rest = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]
+        url = URL(request.url.path).replace(query=urlencode(rest))
+        answer = RedirectResponse(str(url), 303)
+        answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
+        return answer

@@ -1,0 +1,171 @@
+"""Visual types: poses, points, numbers and pictures that viewers show of a message type.
+
+Poses and scans stand in one world, images beside it, and all other numbers are curves. The
+fields of an unknown message type are asked for once; its first numbers are shown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+MOST_NUMBERS = 16
+_MOST_BEAMS = 1500
+_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+
+# Where position and orientation are; "" for one that there is not.
+_POSES = {
+    "geometry_msgs/msg/Point": (".", ""),
+    "geometry_msgs/msg/PointStamped": ("point.", ""),
+    "geometry_msgs/msg/Pose": ("position.", "orientation."),
+    "geometry_msgs/msg/PoseStamped": ("pose.position.", "pose.orientation."),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (
+        "pose.pose.position.",
+        "pose.pose.orientation.",
+    ),
+    "geometry_msgs/msg/Quaternion": ("", "."),
+    "geometry_msgs/msg/QuaternionStamped": ("", "quaternion."),
+    "geometry_msgs/msg/Transform": ("translation.", "rotation."),
+    "geometry_msgs/msg/TransformStamped": ("transform.translation.", "transform.rotation."),
+    "nav_msgs/msg/Odometry": ("pose.pose.position.", "pose.pose.orientation."),
+    "sensor_msgs/msg/Imu": ("", "orientation."),
+}
+# What else is shown of a message; of the time, nothing: everything has one.
+_NUMBERS: dict[str, list[str]] = {
+    "rosgraph_msgs/msg/Clock": [],
+    "sensor_msgs/msg/Imu": [
+        f"{part}.{axis}" for part in ("angular_velocity", "linear_acceleration") for axis in _XYZ
+    ],
+}
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_NOT_FINITE = ("nan", "inf", "-inf")  # as a sample tells them; the next may be a number
+_SCAN = "sensor_msgs/msg/LaserScan"
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position in metres and orientation (x, y, z, w) at a time, seconds."""
+
+    time_s: float
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points in the plane of a scan, metres."""
+
+    positions: Sequence[tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Fields of a packet at a time, seconds; what is no number is left out."""
+
+    time_s: float
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image, as :mod:`neuros.node.sampling` encodes it."""
+
+    image: Mapping[str, Any]
+
+
+Mark = Pose | Points | Numbers | Picture
+
+
+class VisualTypes:
+    """Visual types of one output or external input."""
+
+    def __init__(self, type_name: str) -> None:
+        self.is_image = type_name in _IMAGES
+        self.is_scan = type_name == _SCAN
+        self._position, self._orientation = _POSES.get(type_name, ("", ""))
+        self.is_in_space = bool(self._position or self._orientation or self.is_scan)
+        self._numbers: list[str] | None = _NUMBERS.get(type_name)
+        if self._numbers is None and (self.is_in_space or self.is_image):
+            self._numbers = []
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether there are curves to draw of it, or may be."""
+        return self._numbers is None or bool(self._numbers)
+
+    def wanted(self) -> dict[str, Any]:
+        """Fields to sample next (see :class:`neuros.node.sampling.Sampler`)."""
+        if self.is_image:
+            return {"image": True}
+        if self.is_scan:
+            return {"all": True, "most_elements": _MOST_BEAMS}
+        if self._numbers is None:
+            return {"all": True}
+        return {"fields": [*self._pose_fields(), *self._numbers]}
+
+    def marks(self, sample: Mapping[str, Any]) -> Iterator[Mark]:
+        """Marks of a sample."""
+        if "image" in sample:
+            yield Picture(sample["image"])
+        if "all" in sample:
+            if self.is_scan:
+                yield Points(_beams(sample["all"]))
+            elif self._numbers is None:
+                self._numbers = list(_numbers_of(sample["all"]))
+        for row in sample.get("values", ()):
+            yield from self._of_row(row[0], dict(zip(sample["fields"], row[1:], strict=True)))
+
+    def _of_row(self, time_s: float, values: Mapping[str, float | None]) -> Iterator[Mark]:
+        if self._position or self._orientation:
+            position = _vector(values, self._position, _XYZ) or (0.0, 0.0, 0.0)
+            orientation = _vector(values, self._orientation, _XYZW)
+            if orientation is None or not any(orientation):  # as in a message that was not filled
+                orientation = (0.0, 0.0, 0.0, 1.0)
+            yield Pose(time_s, position, orientation)
+        numbers = {
+            name: value for name in self._numbers or () if (value := values[name]) is not None
+        }
+        if numbers:
+            yield Numbers(time_s, numbers)
+
+    def _pose_fields(self) -> list[str]:
+        parts = ((self._position, _XYZ), (self._orientation, _XYZW))
+        return [f"{prefix}{axis}".lstrip(".") for prefix, axes in parts if prefix for axis in axes]
+
+
+def _vector(
+    values: Mapping[str, float | None], prefix: str, axes: Sequence[str]
+) -> tuple[float, ...] | None:
+    """``None`` where there is no such field, or it holds no number."""
+    if not prefix:
+        return None
+    found = [values.get(f"{prefix}{axis}".lstrip(".")) for axis in axes]
+    numbers = tuple(each for each in found if each is not None)
+    return numbers if len(numbers) == len(axes) else None
+
+
+def _numbers_of(fields: Mapping[str, Any]) -> Iterator[str]:
+    count = 0
+    for path, value in fields.items():
+        is_number = isinstance(value, int | float) or value in _NOT_FINITE
+        is_about_it = path.startswith("header.") or path.endswith(".length") or "covariance" in path
+        if is_number and not is_about_it:
+            yield path
+            count += 1
+            if count == MOST_NUMBERS:
+                return
+
+
+def _beams(scan: Mapping[str, Any]) -> list[tuple[float, float, float]]:
+    points = []
+    angle, step = scan["angle_min"], scan["angle_increment"]
+    for place in range(_MOST_BEAMS):
+        distance = scan.get(f"ranges[{place}]")
+        if distance is None:
+            break
+        if not isinstance(distance, str) and scan["range_min"] <= distance <= scan["range_max"]:
+            direction = angle + place * step
+            points.append((distance * math.cos(direction), distance * math.sin(direction), 0.0))
+    return points

@@ -1,0 +1,334 @@
+"""From spools to a bag that every reader of bags opens."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from observe.recordings import ANSWER, NUMBER, answer, fail, number, plan, record, spool
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from neuros.recording import recorder as recording
+from neuros.recording.bag_writer import BagWriter
+from neuros.recording.plan import RecordingPlan, Stream, Topic, load_plan
+from neuros.recording.recorder import Recorder
+from neuros.recording.repair import repair
+from neuros.recording.spool import NO_TIME, SpoolWriter
+from neuros.recording.stored import Stored, stored_messages
+
+
+def bag_file(run: Path) -> Path:
+    return run / "bag" / "bag.mcap"
+
+
+def test_a_packet_for_two_connections_is_kept_once_and_recorded_on_both(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    recorder = record(tmp_path, plan())
+    assert recorder.counts() == {
+        "/neuros/a/number/b/number/data": 1,
+        "/neuros/a/number/c/number/data": 1,
+        "/answer": 0,
+    }
+
+
+def test_packets_of_all_nodes_are_in_the_order_of_their_wall_time(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1)), (30, None, number(3))])
+    spool(tmp_path, "b", [(20, None, answer()), (40, None, answer())])
+    record(tmp_path, plan())
+    times = [message.log_ns for message in stored_messages(tmp_path / "bag")]
+    assert times == [10, 10, 20, 30, 30, 40]
+
+
+def test_publish_time_is_simulated_time_where_a_node_owns_it(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, 500, number(1)), (30, 600, number(3))])
+    spool(tmp_path, "b", [(5, None, answer()), (20, None, answer()), (40, None, answer())])
+    record(tmp_path, plan(time_owner="a"))
+    times = {(m.topic, m.log_ns): m.publish_ns for m in stored_messages(tmp_path / "bag")}
+    assert times[NUMBER.name, 10] == 500
+    assert [times[ANSWER.name, wall_ns] for wall_ns in (5, 20, 40)] == [0, 500, 600]
+
+
+def test_publish_time_is_wall_time_where_nobody_owns_time(tmp_path: Path) -> None:
+    spool(tmp_path, "b", [(20, None, answer())])
+    record(tmp_path, plan())
+    assert next(stored_messages(tmp_path / "bag")) == Stored("/answer", 20, 20, answer())
+
+
+def test_rosbags_reads_types_quality_of_service_and_custom_data(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(-3))])
+    record(tmp_path, plan())
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(tmp_path / "bag") as reader:
+        offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
+        read = [
+            (c.topic, at, store.deserialize_cdr(data, c.msgtype).data)
+            for c, at, data in reader.messages()
+        ]
+        digests = {c.digest for c in reader.connections if c.msgtype == NUMBER.type}
+    assert offered[NUMBER.name].reliability.name == "RELIABLE"
+    assert offered["/neuros/a/number/c/number/data"].reliability.name == "BEST_EFFORT"
+    assert read == [
+        ("/neuros/a/number/b/number/data", 10, -3),
+        ("/neuros/a/number/c/number/data", 10, -3),
+    ]
+    assert digests == {store.hash_rihs01(NUMBER.type)}
+    metadata = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())
+    assert metadata["rosbag2_bagfile_information"]["custom_data"] == {"run_id": "0123"}
+
+
+def test_mcap_reads_index_and_both_times(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, 500, number(1)), (30, 600, number(3))])
+    record(tmp_path, plan(time_owner="a"))
+    with bag_file(tmp_path).open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 4
+        found = [(m.log_time, m.publish_time, m.sequence) for _, _, m in reader.iter_messages()]
+    assert found == [(10, 500, 1), (10, 500, 1), (30, 600, 2), (30, 600, 2)]
+
+
+def test_mcap_ros2_support_decodes_the_messages(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1)), (30, None, number(3))])
+    record(tmp_path, plan())
+    with bag_file(tmp_path).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = reader.iter_decoded_messages(topics=[NUMBER.name])
+        assert [each.decoded_message.data for each in decoded] == [1, 3]
+
+
+def test_sqlite3_on_request(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1))])
+    record(tmp_path, plan("sqlite3"))
+    assert (tmp_path / "bag" / "bag.db3").is_file()
+    with Reader(tmp_path / "bag") as reader:
+        assert [(at, data) for _, at, data in reader.messages()] == [(10, number(1))] * 2
+
+
+def test_a_bag_is_readable_before_the_first_packet_and_at_every_checkpoint(tmp_path: Path) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    for count in range(5):
+        with Reader(tmp_path / "bag") as reader:
+            assert reader.message_count == 2 * count
+            assert len(list(reader.messages())) == 2 * count
+        recorder.bag.put(1, 10 + count, 0, number(count))
+        recorder.bag.put(2, 10 + count, 0, bytes(2_000_000))
+        recorder.bag.checkpoint()
+    recorder.abandon()
+
+
+@pytest.mark.parametrize(("took_s", "pause_s"), [(0.001, 1.0), (0.1, 5.0)])
+def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, pause_s: float
+) -> None:
+    now_s, begun_s = 0.0, []
+    recorder = Recorder(plan(), tmp_path, fail, clock=lambda: now_s)
+
+    def checkpoint() -> None:
+        nonlocal now_s
+        begun_s.append(now_s)
+        now_s += took_s
+
+    monkeypatch.setattr(recorder.bag, "checkpoint", checkpoint)
+    sender = SpoolWriter(tmp_path / "a", ())
+    for place in range(100):
+        sender.append(10 + place, NO_TIME, 0, number(1))
+        recorder.poll()
+        now_s += 0.125
+    sender.close()
+    recorder.abandon()
+    pauses_s = [after - before - took_s for before, after in pairwise(begun_s)]
+    assert pauses_s
+    assert all(-1e-9 < each - pause_s < 0.13 for each in pauses_s)
+
+
+def test_spools_are_gone_when_their_packets_are_in_the_bag(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1))])
+    record(tmp_path, plan())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "bag", "recording.json"]
+    assert list((tmp_path / "a").iterdir()) == []
+
+
+def test_a_type_without_definition_is_said_and_the_others_are_recorded(tmp_path: Path) -> None:
+    what = RecordingPlan(
+        storage="mcap",
+        topics=(Topic("/odd", "odd_msgs/msg/Odd"), ANSWER),
+        streams={"b": (Stream("sent", "odd", (0,)), Stream("sent", "answer", (1,)))},
+    )
+    spool(tmp_path, "b", [(10, None, b"whatever")])
+    complaints: list[str] = []
+    recorder = Recorder(what, tmp_path, complaints.append)
+    recorder.complete()
+    (complaint,) = complaints
+    assert complaint.startswith("/odd is not recorded: message type odd_msgs/msg/Odd")
+    assert recorder.counts() == {"/odd": 0, "/answer": 0}
+
+
+def test_packets_do_not_pile_up_where_somebody_sets_the_clock_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    now_ns = time.time_ns()
+    spool(tmp_path, "b", [(now_ns - 50_000_000, None, answer())])
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns - 3600 * 10**9)
+    recorder.poll()
+    assert recorder.counts()[ANSWER.name] == 1
+    recorder.abandon()
+
+
+def test_a_spool_stays_while_a_packet_of_it_is_held_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "_CHECKPOINT_S", 0.0)
+    monkeypatch.setattr(recording, "_CHECKPOINT_PAUSE", 0)
+    monkeypatch.setattr(recording, "_MOST_BYTES", 72)  # two packets of a node at a time
+    recorder = Recorder(plan(), tmp_path, fail)
+    recorder.poll()
+    spool(tmp_path, "a", [(wall_ns, None, number(0)) for wall_ns in (110, 150, 160, 170, 180)])
+    late = SpoolWriter(tmp_path / "b", (), file_bytes=1)
+    for wall_ns in (100, 200, 300):
+        late.append(wall_ns, NO_TIME, 0, answer())
+    late.close()
+    recorder.poll()
+    recorder.poll()  # a has more to tell up to 180, so 200 has to wait
+    assert recorder.counts()[ANSWER.name] == 1
+    assert sorted(os.listdir(tmp_path / "b" / "spool")) == ["00000001", "00000002"]
+    recorder.abandon()
+
+
+def test_a_full_disk_leaves_the_bag_of_the_last_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    recorder.bag.put(1, 10, 10, number(1))
+    recorder.bag.checkpoint()
+    room = 100  # bytes that still fit behind what was written before
+    pwrite = os.pwrite
+    end = bag_file(tmp_path).stat().st_size + room
+
+    def little_room(descriptor: int, data: bytes, at: int) -> int:
+        if at >= end:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return pwrite(descriptor, memoryview(data)[: end - at], at)
+
+    monkeypatch.setattr(os, "pwrite", little_room)
+    recorder.bag.put(1, 20, 20, bytes(50_000))
+    with pytest.raises(OSError, match="No space left"):
+        recorder.bag.checkpoint()
+    recorder.abandon()
+    with Reader(tmp_path / "bag") as reader:
+        assert [at for _, at, _ in reader.messages()] == [10]
+
+
+# ---------------------------------------------------------------------- what was cut off
+
+
+def test_a_complete_bag_needs_no_repair(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1))])
+    record(tmp_path, plan())
+    assert repair(tmp_path, fail) is None
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    numbers=st.lists(st.integers(-9, 9), min_size=1, max_size=30),
+    moved=st.integers(0, 30),
+    kept=st.floats(0, 1),
+    storage=st.sampled_from(["mcap", "sqlite3"]),
+)
+def test_repair_brings_together_the_file_and_the_spools_without_doubles(
+    tmp_path_factory: pytest.TempPathFactory,
+    numbers: list[int],
+    moved: int,
+    kept: float,
+    storage: str,
+) -> None:
+    run = tmp_path_factory.mktemp("run")
+    plan(storage).save(run)
+    packets = [(10 * k, None, number(value)) for k, value in enumerate(numbers, start=1)]
+    spool(run, "a", packets)
+    recorder = Recorder(plan(storage), run, fail)
+    for wall_ns, _, data in packets[:moved]:
+        for topic in (1, 2):
+            recorder.bag.put(topic, wall_ns, wall_ns, data)
+    recorder.bag.checkpoint()
+    recorder.abandon()
+    if storage == "mcap":  # cut off anywhere: the spools still have it all
+        os.truncate(bag_file(run), int(kept * bag_file(run).stat().st_size))
+    counts = repair(run, fail)
+    assert counts == {NUMBER.name: len(numbers), plan().topics[1].name: len(numbers), "/answer": 0}
+    with Reader(run / "bag") as reader:
+        found = [data for c, _, data in reader.messages() if c.topic == NUMBER.name]
+    assert found == [data for _, _, data in packets]
+    assert repair(run, fail) is None
+
+
+def test_a_truncated_bag_keeps_what_is_left_of_it(tmp_path: Path) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    plan().save(tmp_path)
+    sizes = []
+    for k in range(3):
+        recorder.bag.put(1, k + 1, k + 1, number(k))
+        recorder.bag.checkpoint()
+        sizes.append(bag_file(tmp_path).stat().st_size)
+    recorder.abandon()
+    os.truncate(bag_file(tmp_path), sizes[0])
+    counts = repair(tmp_path, fail)
+    assert counts is not None
+    assert counts[NUMBER.name] >= 1
+    with Reader(tmp_path / "bag") as reader:
+        assert len(list(reader.messages())) == counts[NUMBER.name]
+
+
+def test_a_repair_that_was_cut_off_is_repeated(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(1))])
+    record(tmp_path, plan())
+    (tmp_path / "bag").rename(tmp_path / "bag.damaged")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "bag.mcap").write_bytes(b"half")
+    counts = repair(tmp_path, fail)
+    assert counts is not None
+    assert counts[NUMBER.name] == 1
+    assert not (tmp_path / "bag.damaged").exists()
+
+
+def test_a_bag_larger_than_memory_can_be_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    plan().save(tmp_path)
+    for k in range(40):
+        recorder.bag.put(1, k + 1, k + 1, bytes(1 << 20))
+    recorder.bag.checkpoint()
+    recorder.abandon()
+    os.truncate(bag_file(tmp_path), bag_file(tmp_path).stat().st_size - 10)
+    most_bytes = 0
+    put = BagWriter.put
+
+    def watched(bag: BagWriter, *arguments: Any) -> None:
+        nonlocal most_bytes
+        put(bag, *arguments)
+        most_bytes = max(most_bytes, bag.pending_bytes)
+
+    monkeypatch.setattr(BagWriter, "put", watched)
+    counts = repair(tmp_path, fail)
+    assert counts is not None
+    assert counts[NUMBER.name] == 40
+    assert most_bytes < 20 << 20
+
+
+def test_a_plan_survives_its_file(tmp_path: Path) -> None:
+    plan(time_owner="a").save(tmp_path)
+    assert load_plan(tmp_path) == plan(time_owner="a")

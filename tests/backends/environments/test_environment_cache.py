@@ -1,0 +1,113 @@
+"""The cache of environments: what is whole, who makes what, what goes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from neuros.backends.environments.cache import Entry, cache_folder, sweep
+
+MONTHS_AGO_S = time.time() - 90 * 24 * 3600
+KEY = "0123456789ab"
+
+
+def make(entry: Entry) -> None:
+    """As a virtual environment, as far as the cache looks at it."""
+    entry.future_python.parent.mkdir(parents=True)
+    entry.future_python.symlink_to(sys.executable)
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> Entry:
+    return Entry(tmp_path / "environments" / f"snn.old-{KEY}")
+
+
+def test_it_is_where_caches_are() -> None:
+    assert cache_folder({"XDG_CACHE_HOME": "/c", "HOME": "/h"}) == Path("/c/neuros/environments")
+    assert cache_folder({"HOME": "/h"}) == Path("/h/.cache/neuros/environments")
+    relative = {"XDG_CACHE_HOME": "c", "HOME": "/h"}  # which the specification has one ignore
+    assert cache_folder(relative) == Path("/h/.cache/neuros/environments")
+
+
+def test_what_has_not_been_settled_is_not_there(entry: Entry) -> None:
+    make(entry)
+    assert entry.python() is None
+    entry.settle(is_here=False)
+    assert entry.python() == entry.folder / "bin/python"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"is_he'])
+def test_half_a_stamp_settles_nothing(entry: Entry, text: str) -> None:
+    make(entry)
+    entry.stamp.write_text(text)
+    assert entry.python() is None
+
+
+def test_an_environment_whose_python_has_gone_is_not_there(entry: Entry) -> None:
+    make(entry)
+    entry.settle(is_here=False)
+    entry.future_python.unlink()
+    entry.future_python.symlink_to("/nowhere/python3.11")
+    assert entry.python() is None
+
+
+def test_that_this_python_does_is_remembered_without_a_folder(entry: Entry) -> None:
+    entry.settle(is_here=True)
+    assert entry.python() == Path(sys.executable)
+    assert not entry.folder.exists()
+
+
+def test_only_one_can_have_it_and_the_next_sees_what_was_made(entry: Entry) -> None:
+    seen: list[Path | None] = []
+
+    def wait_and_look() -> None:
+        with entry.locked():
+            seen.append(entry.python())
+
+    with entry.locked() as is_mine:
+        assert is_mine
+        with entry.locked(wait=False) as is_others:
+            assert not is_others
+        waiting = threading.Thread(target=wait_and_look)
+        waiting.start()
+        entry.settle(is_here=True)
+    waiting.join(10)
+    assert seen == [Path(sys.executable)]
+    assert not list(entry.folder.parent.glob("*.lock"))
+
+
+def test_what_was_interrupted_and_what_nobody_uses_is_swept(tmp_path: Path) -> None:
+    used, unused, interrupted, working = (
+        Entry(tmp_path / f"{name}-{KEY}") for name in ("used", "unused", "interrupted", "working")
+    )
+    for each in (used, unused, interrupted, working):
+        make(each)
+    for each in (used, unused):
+        each.settle(is_here=False)
+        os.utime(each.stamp, (MONTHS_AGO_S, MONTHS_AGO_S))
+    used.note_use()
+    (tmp_path / "of-somebody-else").mkdir()
+    with working.locked():
+        sweep(tmp_path)
+        assert working.folder.is_dir()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"used-{KEY}",
+        f"used-{KEY}.json",
+        f"working-{KEY}",
+        "of-somebody-else",
+    }
+
+
+def test_the_log_of_what_failed_stays_for_a_month(entry: Entry) -> None:
+    entry.folder.parent.mkdir()
+    entry.log.write_text("ERROR: no")
+    sweep(entry.folder.parent)
+    assert entry.log.exists()
+    os.utime(entry.log, (MONTHS_AGO_S, MONTHS_AGO_S))
+    sweep(entry.folder.parent)
+    assert not list(entry.folder.parent.iterdir())

@@ -1,0 +1,146 @@
+"""`neuros ps` and `neuros stop`: runs are seen by their reapers."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from endings import RUNS
+from launching import Running, start
+
+from neuros.backends.reaper import Reaper
+from neuros.backends.sessions import Session, reaper_environment, sessions, this_process
+
+PLUGIN = f"from neuros.hooks import neuros_tick\n{RUNS}"
+PROJECT = """
+{"nodes": [{"name": "a", "container": "neuros_python", "plugin": "plugin.py"},
+           {"name": "b", "container": "neuros_python", "plugin": "plugin.py"}],
+ "connections": []}
+"""
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    """A run of this process, that has a reaper and nothing else."""
+    session = Session(
+        *(secrets.token_hex(8), "demo", "process", ("a",), "/runs/1", time.time(), this_process())
+    )
+    reaper = Reaper.start(session.run, None, reaper_environment(session))
+    yield session
+    reaper.finish()
+    assert session not in sessions()
+
+
+def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) -> None:
+    ((variable, text),) = reaper_environment(session).items()
+    said = json.loads(text)
+    newer = {**said, "run": secrets.token_hex(8), "colour": "red"}
+    older = {"run": secrets.token_hex(8), "project": "demo"}
+    reapers = [
+        Reaper.start(each["run"], None, {variable: json.dumps(each)}) for each in (newer, older)
+    ]
+    runs = {each.run for each in sessions()}
+    for reaper in reapers:
+        reaper.finish()
+    assert newer["run"] in runs
+    assert older["run"] not in runs
+
+
+def test_a_run_is_its_reapers_users_whatever_that_says(session: Session) -> None:
+    ((variable, text),) = reaper_environment(session).items()
+    forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}
+    reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
+    users = {each.run: each.user for each in sessions()}
+    reaper.finish()
+    assert users[forged["run"]] == os.getuid()
+
+
+def test_a_launcher_of_another_user_is_none(session: Session) -> None:
+    assert not replace(session, user=os.getuid() + 1).is_led
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo/plugin.py").write_text(PLUGIN)
+    (tmp_path / "demo/project.json").write_text(PROJECT)
+    return tmp_path
+
+
+def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "neuros.cli", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30.0,
+        check=False,
+    )
+
+
+def run_of(running: Running) -> Session:
+    return next(each for each in sessions() if each.launcher[0] == running.process.pid)
+
+
+def test_a_run_is_there_as_long_as_its_reaper(session: Session) -> None:
+    assert session in sessions()
+    assert session.is_led
+    assert session.states() == {"a": "not running"}
+
+
+def test_another_process_with_the_number_of_the_launcher_is_not_the_launcher() -> None:
+    stale = Session("1", "demo", "process", (), "/runs/1", 0.0, (os.getpid(), 1))
+    assert not stale.is_led
+    stale.interrupt()  # and it does not interrupt this test
+
+
+@pytest.mark.parametrize("back_end", ["process", "in-process"])
+def test_ps_shows_the_nodes_and_stop_ends_them_as_ctrl_c_does(folder: Path, back_end: str) -> None:
+    with start(folder / "demo", "--backend", back_end, cwd=folder) as running:
+        running.wait_for("[b]: running", 30.0)
+        run = run_of(running).run
+        shown = [line.split() for line in neuros("ps").stdout.splitlines()]
+        rows = [row for row in shown if row[0] == run[:8]]
+        assert [(row[1], row[2], row[3], row[-1]) for row in rows] == [
+            ("demo", "a", back_end, "running"),
+            ("demo", "b", back_end, "running"),
+        ]
+        stopped = neuros("stop", run[:8])
+        assert stopped.returncode == 0
+        assert stopped.stdout.startswith(f"stopped {run[:8]} (demo); run folder {folder}")
+        finished = running.finish(3.0)
+    assert finished.exit_code == 130
+    assert "ended by Ctrl+C" in finished.output
+
+
+def test_a_run_whose_launcher_was_killed_is_ending_until_nothing_is_left(folder: Path) -> None:
+    holding = PLUGIN.replace('"running")', '"running")\n        ctypes.PyDLL(None).sleep(60)')
+    (folder / "demo/plugin.py").write_text("import ctypes\n" + holding)
+    with start(folder / "demo", "--backend", "process", cwd=folder) as running:
+        for node in ("a", "b"):
+            running.wait_for(f"[{node}]: running", 30.0)
+        session = run_of(running)
+        assert session.states() == {"a": "running", "b": "running"}
+        running.signal(signal.SIGKILL)
+        running.process.wait()
+        assert session.states() == {"a": "ending", "b": "ending"}
+        deadline_s = time.monotonic() + 15.0
+        while session in sessions():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+    assert set(session.states().values()) == {"not running"}
+
+
+def test_a_run_that_is_not_there_is_wrong_usage(session: Session) -> None:
+    refused = neuros("stop", "nonsense")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("neuros: no run of yours is called 'nonsense'; there are ")
+    assert f"{session.run[:8]} (demo)" in refused.stderr

@@ -1,0 +1,215 @@
+"""A second, naive engine, written straight from the specification and as slow as it likes.
+
+It shares no code with :mod:`neuros.engine`: it keeps every packet in lists and works out readiness
+from nothing at each turn. The tests compare what the two do with the same events.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from neuros.hooks import HookKind, HookSpec, InputSpec
+from neuros.project.model import Connection
+
+Produce = Callable[[HookSpec, int], list[Any]]
+"""``produce(spec, count)``: what a hook returns at its count-th execution, one per output."""
+
+
+class NaiveHook:
+    def __init__(self, spec: HookSpec, place: int, sources: dict[str, list[Connection]]) -> None:
+        self.spec = spec
+        self.place = place
+        self.last_turn = 0
+        self.executions = 0
+        self.last_run_ns = 0
+        self.queue: dict[Connection, list[tuple[int, int, Any]]] = {
+            c: [] for port in spec.inputs for c in sources.get(port.name, [])
+        }
+        self.position = dict.fromkeys(self.queue, 0)
+        self.lost: dict[Connection, set[int]] = {c: set() for c in self.queue}
+        self.started: dict[Connection, set[int]] = {c: set() for c in self.queue}
+
+
+class NaiveNode:
+    def __init__(
+        self,
+        name: str,
+        connections: Sequence[Connection],
+        specs: Sequence[HookSpec],
+        produce: Produce,
+        now_ns: Callable[[], int],
+    ) -> None:
+        self.name = name
+        self.produce = produce
+        self.now_ns = now_ns
+        self.incoming = [c for c in connections if c.destination_node == name]
+        self.outgoing = [c for c in connections if c.source_node == name]
+        self.sources: dict[str, list[Connection]] = {}
+        for c in self.incoming:
+            self.sources.setdefault(c.destination_input, []).append(c)
+        self.hooks = [NaiveHook(spec, i, self.sources) for i, spec in enumerate(specs)]
+        self.registered = {c for c in self.outgoing if c.destination_node == name}
+        self.sent = dict.fromkeys(self.outgoing, 0)
+        self.acknowledged_by_receiver = dict.fromkeys(self.outgoing, 0)
+        self.arrived = dict.fromkeys(self.incoming, 0)
+        self.acknowledged = dict.fromkeys(self.incoming, 0)
+        self.arrivals = 0
+        self.turn = 0
+        self.start_ns: int | None = None
+        self.events: deque[tuple[Any, ...]] = deque()
+        self.log: list[tuple[Any, ...]] = []
+
+    # ---- events
+
+    def start(self) -> None:
+        self.one_pass()
+
+    def on_registered(self, c: Connection) -> None:
+        self.registered.add(c)
+        self.one_pass()
+
+    def on_acknowledgement(self, c: Connection, position: int) -> None:
+        self.acknowledged_by_receiver[c] = max(self.acknowledged_by_receiver[c], position)
+        self.one_pass()
+
+    def on_timer(self) -> None:
+        self.one_pass()
+
+    def on_packet(self, c: Connection, packet: Any) -> None:
+        self.arrivals += 1
+        self.arrived[c] += 1
+        for hook in self.hooks:
+            if c in hook.queue:
+                queue = hook.queue[c]
+                if len(queue) == c.queue_size:  # full: the oldest unread one is discarded
+                    assert c.discard_limit != 0
+                    hook.lost[c].add(queue.pop(0)[1])
+                queue.append((self.arrivals, self.arrived[c], packet))
+        if not self.takers(c):
+            self.acknowledge(c, self.arrived[c])
+        self.one_pass()
+
+    def posted_event(self) -> None:
+        kind, *rest = self.events.popleft()
+        if kind == "own packet":
+            self.on_packet(*rest)
+        else:
+            self.one_pass(has_taken_in=True)
+
+    # ---- rules
+
+    def one_pass(self, *, has_taken_in: bool = False) -> None:
+        for hook in sorted(self.hooks, key=lambda each: (each.last_turn, each.place)):
+            if self.is_ready(hook):
+                is_own_coming = any(event[0] == "own packet" for event in self.events)
+                if is_own_coming and not has_taken_in:
+                    break
+                has_taken_in = False
+                self.run(hook)
+        is_loop_back_waiting = any(event[0] == "loop-back" for event in self.events)
+        if not is_loop_back_waiting and any(self.is_ready(hook) for hook in self.hooks):
+            self.events.append(("loop-back",))
+
+    def is_ready(self, hook: NaiveHook) -> bool:
+        if self.registered != set(self.outgoing):
+            return False
+        is_initialised = all(h.spec.kind is not HookKind.INITIALISE for h in self.hooks)
+        if not is_initialised and hook.spec.kind is not HookKind.INITIALISE:
+            return False
+        if is_initialised and self.start_ns is None:
+            self.start_ns = self.now_ns()
+            for each in self.hooks:
+                each.last_run_ns = self.start_ns
+        return (
+            all(self.has_input(hook, port) for port in hook.spec.inputs)
+            and not any(
+                self.is_blocked(hook, c)
+                for port in hook.spec.outputs
+                for c in self.outgoing
+                if c.source_output == port.name
+            )
+            and self.is_due(hook)
+        )
+
+    def has_input(self, hook: NaiveHook, port: InputSpec) -> bool:
+        filled = [bool(hook.queue[c]) for c in self.sources.get(port.name, [])]
+        return port.is_optional or (all(filled) if port.is_all else any(filled))
+
+    def is_due(self, hook: NaiveHook) -> bool:
+        """A due time start + k x period lies between its last run and now."""
+        if hook.spec.period_s is None:
+            return True
+        assert self.start_ns is not None
+        period_ns = round(hook.spec.period_s * 1e9)
+        ticks = (self.now_ns() - self.start_ns) // period_ns
+        return ticks > (hook.last_run_ns - self.start_ns) // period_ns
+
+    def would_take(self, hook: NaiveHook) -> list[Connection]:
+        taken = []
+        for port in hook.spec.inputs:
+            filled = [c for c in self.sources.get(port.name, []) if hook.queue[c]]
+            if port.is_all:
+                taken += filled
+            elif filled:  # whose oldest packet has waited longest
+                taken.append(min(filled, key=lambda c: hook.queue[c][0][0]))
+        return taken
+
+    def is_blocked(self, hook: NaiveHook, c: Connection) -> bool:
+        if c.discard_limit is None:
+            return False
+        acknowledged = self.acknowledged_by_receiver[c]
+        if c.destination_node == self.name and c in self.would_take(hook):
+            positions = [h.queue[c][0][1] if h is hook else h.position[c] for h in self.takers(c)]
+            acknowledged = max(acknowledged, min(positions))
+        return self.sent[c] - acknowledged >= c.queue_size + c.discard_limit
+
+    def takers(self, c: Connection) -> list[NaiveHook]:
+        return [hook for hook in self.hooks if c in hook.queue]
+
+    def acknowledge(self, c: Connection, position: int) -> None:
+        if c.discard_limit is None or position <= self.acknowledged[c]:
+            return
+        self.acknowledged[c] = position
+        if c.source_node == self.name:
+            self.acknowledged_by_receiver[c] = position
+        else:
+            self.log.append(("acknowledge", str(c), position))
+
+    def run(self, hook: NaiveHook) -> None:
+        self.turn += 1
+        hook.last_turn = self.turn
+        hook.last_run_ns = self.now_ns()
+        taken = {}
+        for c in self.would_take(hook):
+            _, hook.position[c], taken[c] = hook.queue[c].pop(0)
+            hook.started[c].add(hook.position[c])
+        arguments = []
+        for port in hook.spec.inputs:
+            sources = self.sources.get(port.name, [])
+            if port.is_all:
+                arguments.append([taken.get(c) for c in sources])
+            else:
+                arguments.append(next((taken[c] for c in sources if c in taken), None))
+        for c in taken:
+            self.acknowledge(c, min(h.position[c] for h in self.takers(c)))
+        hook.executions += 1
+        self.log.append(("run", hook.spec.name, arguments))
+        for port, packet in zip(
+            hook.spec.outputs, self.produce(hook.spec, hook.executions), strict=True
+        ):
+            if packet is None:
+                continue
+            for c in self.outgoing:
+                if c.source_output == port.name:
+                    self.sent[c] += 1
+                    if c.destination_node == self.name:
+                        self.events.append(("own packet", c, packet))
+                    else:
+                        self.log.append(("send", str(c), packet))
+        if hook.spec.kind is HookKind.INITIALISE:
+            self.hooks.remove(hook)
+            for c in hook.queue:
+                takers = self.takers(c)
+                self.acknowledge(c, min((h.position[c] for h in takers), default=self.arrived[c]))

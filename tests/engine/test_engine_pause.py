@@ -1,0 +1,190 @@
+"""Pause, resume and step: what stands still, and what goes on by how much."""
+
+from __future__ import annotations
+
+from engine_bench import SECOND, Bench, function, initialise, tick, wire
+
+from neuros.engine.explain import explain
+from neuros.engine.metrics import PAUSED
+from neuros.engine.snapshot import snapshot
+from neuros.hooks import Optional
+
+IN, OUT = "a.o -> node.x", "node.o -> b.x"
+
+
+def main_loop() -> Bench:
+    """A simulation, as most are: it steps whenever its output may be sent."""
+    return Bench(function("step", outputs="o", returns="reading"), connections=[wire(OUT, 0)])
+
+
+def test_a_paused_node_starts_no_hook_and_forgets_no_packet():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0, queue_size=2)])
+    bench.engine.pause()
+    assert bench.packet(IN) == []
+    assert bench.packet(IN) == []
+    assert bench.acknowledged == []
+    bench.engine.resume()
+    bench.settle()
+    assert bench.ran == ["f", "f"]
+
+
+def test_a_paused_node_asks_for_no_further_pass():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.packet(IN)
+    assert bench.waiting == []
+
+
+def test_initialisation_goes_on_while_paused():
+    bench = Bench(initialise("begin"), function("loop"), is_started=False)
+    bench.engine.pause()
+    bench.engine.start()
+    bench.settle()
+    assert bench.ran == ["begin"]
+
+
+def test_one_step_is_one_start_of_the_main_loop():
+    bench = main_loop()
+    bench.engine.pause()
+    bench.acknowledge_to_node(OUT, 1)
+    assert bench.ran == ["step"]
+    bench.engine.step(1, is_driven=True)
+    bench.acknowledge_to_node(OUT, 2)
+    assert bench.ran == ["step"] * 2
+
+
+def test_steps_add_up_where_a_receiver_holds_them_up():
+    bench = main_loop()
+    bench.engine.pause()
+    for _ in range(2):
+        bench.engine.step(1, is_driven=True)
+    for position in range(1, 6):
+        bench.acknowledge_to_node(OUT, position) if bench.hook("step").blocked else None
+        bench.settle()
+    assert bench.ran == ["step"] * 3
+
+
+def test_in_a_step_hooks_answer_all_that_they_receive():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)
+    assert [bench.packet(IN) for _ in range(3)] == [["f"]] * 3
+
+
+def test_where_nothing_drives_the_project_each_hook_starts_once_per_step():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0, queue_size=3)])
+    bench.engine.pause()
+    for _ in range(3):
+        bench.packet(IN)
+    bench.engine.step(2, is_driven=False)
+    bench.settle()
+    assert bench.ran == ["f", "f"]
+
+
+def test_a_step_outside_a_pause_does_nothing():
+    bench = main_loop()
+    bench.engine.step(5, is_driven=True)
+    bench.engine.pause()
+    bench.acknowledge_to_node(OUT, 1)
+    assert bench.ran == ["step"]
+
+
+def test_a_step_starts_a_tick_hook_though_no_time_passes():
+    bench = Bench(tick("t", 1.0))
+    bench.engine.pause()
+    bench.engine.step(2, is_driven=True)
+    bench.settle()
+    assert bench.ran == ["t", "t"]
+
+
+def test_a_pause_is_no_time_for_ticks():
+    bench = Bench(tick("t", 1.0))
+    bench.pass_time(1.0)
+    bench.clock.advance(0.25)
+    bench.engine.pause()
+    assert bench.engine.next_due_ns is None
+    bench.clock.advance(100.0)
+    bench.engine.resume()
+    assert bench.ran == ["t"]
+    assert bench.engine.next_due_ns == bench.clock.now_ns + 0.75 * SECOND
+    bench.pass_time(0.75)
+    figures = snapshot(bench.engine, bench.clock.now_ns)["hooks"]["t"]
+    assert figures["missed_ticks"] == 0
+    assert figures["ticks"]["max_ms"] == 1000.0
+
+
+def test_a_tick_that_a_step_could_not_start_waits_for_its_own_time():
+    bench = Bench(tick("t", 1.0, outputs="o", returns="reading"), connections=[wire(OUT, 0)])
+    bench.pass_time(1.0)
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)  # its receiver is behind
+    bench.clock.advance(0.5)
+    bench.engine.resume()
+    bench.acknowledge_to_node(OUT, 1)
+    assert bench.ran == ["t"]
+    bench.pass_time(1.0)
+    assert bench.ran == ["t", "t"]
+    assert bench.hook("t").missed_ticks == 0
+
+
+def test_a_tick_that_was_due_when_the_pause_began_is_due_when_it_ends():
+    bench = Bench(tick("t", 1.0, outputs="o", returns="reading"), connections=[wire(OUT, 0)])
+    bench.pass_time(1.0)
+    bench.pass_time(1.0)
+    assert bench.ran == ["t"]
+    bench.engine.pause()
+    bench.clock.advance(10.0)
+    bench.acknowledge_to_node(OUT, 1)
+    bench.engine.resume()
+    assert bench.ran == ["t", "t"]
+    assert bench.hook("t").missed_ticks == 0
+
+
+def test_paused_time_has_an_account_of_its_own():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.clock.advance(1.0)
+    bench.engine.pause()
+    bench.clock.advance(5.0)
+    assert bench.engine.rest() == PAUSED
+    assert explain(bench.engine, bench.clock.now_ns) == ["is paused"]
+    bench.engine.resume()
+    bench.clock.advance(2.0)
+    spent = snapshot(bench.engine, bench.clock.now_ns)["accounting"]
+    assert (spent["waiting"], spent["paused"]) == ({"x": 3.0}, 5.0)
+
+
+def test_a_node_that_is_stopped_while_paused_was_paused_until_then():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.clock.advance(5.0)
+    bench.engine.stop_hooks()
+    spent = snapshot(bench.engine, bench.clock.now_ns)["accounting"]
+    assert (spent["idle"], spent["paused"]) == (0.0, 5.0)
+
+
+def test_draining_ends_a_pause():
+    bench = Bench(function("f", "x"), tick("t", 1.0), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.packet(IN)
+    bench.engine.drain()
+    assert bench.ran == ["f"]
+    bench.engine.pause()
+    assert not bench.engine.is_paused
+
+
+def test_stopping_while_paused_starts_nothing():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.packet(IN)
+    bench.engine.stop_hooks()
+    bench.engine.resume()
+    assert bench.ran == []
+
+
+def test_who_drives_a_project():
+    driven = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    polite = Bench(function("f", Optional("x")), connections=[wire(IN, 0)])
+    assert not driven.engine.is_driving
+    assert polite.engine.is_driving
+    assert Bench(tick("t", 1.0)).engine.is_driving
+    assert main_loop().engine.is_driving

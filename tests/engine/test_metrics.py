@@ -1,0 +1,55 @@
+"""The intervals of a timed hook, counted as they pass."""
+
+from __future__ import annotations
+
+import pytest
+
+from neuros.engine.metrics import TickIntervals
+
+MS = 1_000_000
+
+
+def book(*starts_ms: float, period_ms: float = 20.0) -> TickIntervals:
+    ticks = TickIntervals(round(period_ms * MS))
+    for start_ms in starts_ms:
+        ticks.note(round(start_ms * MS))
+    return ticks
+
+
+def test_one_tick_makes_no_interval() -> None:
+    assert book().figures() is None
+    assert book(5).figures() is None
+
+
+def test_regular_ticks_are_all_within_a_millisecond() -> None:
+    figures = book(*range(0, 220, 20)).figures()
+    assert figures["intervals"] == 10
+    assert figures["mean_ms"] == 20.0
+    assert figures["std_ms"] == 0.0
+    assert figures["largest_error_ms"] == 0.0
+    assert figures["within"] == {"1 ms": 1.0, "2 ms": 1.0, "5 ms": 1.0, "10 ms": 1.0}
+    assert figures["histogram"] == [[20.0, 10]]
+
+
+def test_shares_count_who_is_off_by_no_more_than_that_in_either_direction() -> None:
+    # Off by +1, -1.5, +4, -6 and +20 ms.
+    figures = book(0, 21, 39.5, 63.5, 77.5, 117.5).figures()
+    assert figures["within"] == {"1 ms": 0.2, "2 ms": 0.4, "5 ms": 0.6, "10 ms": 0.8}
+    assert figures["min_ms"] == 14.0
+    assert figures["max_ms"] == 40.0
+    assert figures["largest_error_ms"] == 20.0
+
+
+def test_the_standard_deviation_is_that_of_the_intervals() -> None:
+    figures = book(0, 19, 40, 59, 80).figures()
+    assert figures["mean_ms"] == 20.0
+    assert figures["std_ms"] == pytest.approx(1.0)
+
+
+def test_an_interval_that_is_too_short_can_be_the_worst() -> None:
+    assert book(0, 12, 32).figures()["largest_error_ms"] == 8.0
+
+
+def test_its_memory_does_not_grow_with_the_length_of_an_interval() -> None:
+    figures = book(0, 1e5, 3e5).figures()
+    assert figures["histogram"] == [[2000.0, 2]]

@@ -1,0 +1,230 @@
+"""What one launcher knows of the others of its project, and says to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuros.launcher.peers import (
+    DRAINED,
+    DRAINING,
+    OVER,
+    RUNNING,
+    STOPPING,
+    Peers,
+    PeerState,
+    state_from,
+)
+from neuros.project.model import Connection, Folders, Node, NodeFile
+
+FOLDER = Path("/")
+HERE_TO_THERE = Connection("a", "o", "b", "x", 0)
+ELSEWHERE = PeerState("other", "far", 1)
+GONE_S = 0.3
+WAITS_S = 2.0
+
+
+class Launcher:
+    """This launcher, with node ``a``; ``b`` and ``c`` are elsewhere, and ``a`` sends to ``b``."""
+
+    def __init__(self) -> None:
+        file = NodeFile(
+            Node("a", "", Path("/a.py")), (HERE_TO_THERE,), Folders(FOLDER, FOLDER, FOLDER)
+        )
+        self.said: list[PeerState] = []
+        self.peers = Peers("own", ["b", "c"], [file], " (hint)")
+        self.peers.speak_through(self._note)
+
+    def _note(self, text: str) -> None:
+        state = state_from(text)
+        assert state is not None
+        self.said.append(state)
+
+    def hears(self, node: str, state: PeerState | None, now_s: float = 0.0) -> None:
+        self.peers.hear(node, None if state is None else state.to_text(), now_s)
+
+    def remarks(self, now_s: float) -> list[str]:
+        return [text for _, text in self.peers.remarks(now_s)]
+
+
+@pytest.fixture
+def launcher() -> Launcher:
+    return Launcher()
+
+
+def sent(number: int, acknowledged: int | None = None) -> dict[str, Any]:
+    """A report of ``a``."""
+    counters = {"sent": number, "acknowledged": number if acknowledged is None else acknowledged}
+    return {"a": {"metrics": {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}}}
+
+
+def received(number: int) -> dict[str, Any]:
+    """The books of ``b``."""
+    counters = {"received": number, "acknowledged": number}
+    return {"b": {"outgoing": {}, "incoming": {str(HERE_TO_THERE): counters}}}
+
+
+def said_last(launcher: Launcher) -> PeerState:
+    return launcher.said[-1]
+
+
+# ------------------------------------------------------------------ finding each other
+
+
+def test_neighbours_that_are_missing_are_named_after_five_seconds_and_then_every_ten(
+    launcher: Launcher,
+) -> None:
+    waits = "nodes elsewhere are still waited for: b (hint)"
+    heard = {now_s: texts for now_s in range(20) if (texts := launcher.remarks(float(now_s)))}
+    assert heard == {5: [waits], 15: [waits]}, "c is no neighbour of a"
+
+
+def test_who_has_come_is_said_once_and_not_waited_for(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    assert launcher.remarks(0.0) == ["found elsewhere: b (far)"]
+    assert launcher.remarks(100.0) == []
+
+
+def test_the_rest_of_a_run_before_this_one_is_not_heeded(launcher: Launcher) -> None:
+    for phase in (STOPPING, OVER):
+        launcher.hears("b", replace(ELSEWHERE, phase=phase, exit_code=1))
+    launcher.hears("b", None)
+    assert launcher.peers.end(100.0) is None
+    assert launcher.remarks(100.0) == []
+    assert launcher.remarks(105.0) != []
+
+
+def test_nor_is_what_is_none_of_ours(launcher: Launcher) -> None:
+    for text in ("", "ready", "[1]", '{"a": 1}'):
+        launcher.peers.hear("b", text, 0.0)
+    assert launcher.peers.end(100.0) is None
+
+
+def test_alone_there_is_nothing_to_say() -> None:
+    alone = Peers("own", [], [])
+    said: list[str] = []
+    alone.speak_through(said.append)
+    alone.drain("enough", 5.0)
+    assert alone.settle({})
+    alone.stop(0, "enough")
+    assert not alone.exist
+    assert said == []
+
+
+# ------------------------------------------------------------------ ending
+
+
+@pytest.mark.parametrize(("phase", "code"), [(DRAINING, 0), (STOPPING, 130), (STOPPING, 1)])
+def test_the_end_elsewhere_is_the_end_here_with_the_same_code(
+    launcher: Launcher, phase: str, code: int
+) -> None:
+    launcher.hears("b", ELSEWHERE)
+    assert launcher.peers.end(0.0) is None
+    ending = replace(
+        ELSEWHERE, number=2, phase=phase, exit_code=code, reason="why", origin="far", drain_s=3.0
+    )
+    launcher.hears("b", ending)
+    assert launcher.peers.end(0.0) == (code, "the project ended elsewhere (far): why", 3.0)
+
+
+def test_a_state_that_was_overtaken_changes_nothing(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.hears("b", replace(ELSEWHERE, number=3, phase=STOPPING, reason="why", origin="far"))
+    launcher.hears("c", replace(ELSEWHERE, number=2))
+    assert launcher.peers.end(0.0) is not None
+
+
+def test_a_cause_is_passed_on_with_the_place_where_it_was_known_first(launcher: Launcher) -> None:
+    launcher.hears("b", replace(ELSEWHERE, phase=DRAINING, reason="why", origin="far"))
+    end = launcher.peers.end(0.0)
+    assert end is not None
+    launcher.peers.drain(end.reason, 5.0)
+    assert (said_last(launcher).reason, said_last(launcher).origin) == ("why", "far")
+
+
+def test_a_node_that_is_gone_ends_the_project_unless_it_has_said_why(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.hears("b", None, 10.0)
+    assert launcher.peers.end(10.0) is None, "its last state may still be on its way"
+    end = launcher.peers.end(10.0 + GONE_S)
+    assert end is not None
+    assert end.exit_code == 1
+    assert end.reason.startswith("node 'b' on far is gone: it was killed, or far or the network")
+
+
+def test_a_node_that_is_gone_after_its_launcher_has_ended_is_no_failure(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.hears("b", replace(ELSEWHERE, number=2, phase=OVER, reason="why", origin="far"))
+    launcher.hears("b", None, 10.0)
+    assert launcher.peers.end(20.0) == (0, "the project ended elsewhere (far): why", 0.0)
+
+
+def test_a_node_that_was_replaced_is_gone(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.hears("b", replace(ELSEWHERE, run="third"), 10.0)
+    end = launcher.peers.end(10.0 + GONE_S)
+    assert end is not None
+    assert "node 'b' on far is gone" in end.reason
+
+
+# ------------------------------------------------------------------ draining together
+
+
+def test_it_is_drained_when_both_launchers_are_and_nothing_is_between(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.peers.drain("enough", 5.0)
+    assert not launcher.peers.settle(sent(3)), "the peer has not heard of it yet"
+    assert said_last(launcher).phase == DRAINED
+    drained = replace(ELSEWHERE, phase=DRAINED)
+    launcher.hears("b", replace(drained, number=2, books=received(2)))
+    assert not launcher.peers.settle(sent(3)), "a packet is under way"
+    launcher.hears("b", replace(drained, number=3, books=received(3)))
+    assert not launcher.peers.settle(sent(3, acknowledged=2)), "an acknowledgement is"
+    assert launcher.peers.settle(sent(3))
+
+
+def test_it_says_so_when_it_has_something_to_do_again(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.peers.drain("enough", 5.0)
+    launcher.peers.settle(sent(3))
+    launcher.peers.unsettle()
+    assert said_last(launcher).phase == DRAINING
+    number = len(launcher.said)
+    launcher.peers.unsettle()
+    assert len(launcher.said) == number, "once"
+
+
+def test_a_peer_that_has_stopped_is_not_asked(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    launcher.hears("b", replace(ELSEWHERE, number=2, phase=STOPPING))
+    assert launcher.peers.settle(sent(3))
+
+
+# ------------------------------------------------------------------ the books
+
+
+def test_each_launcher_waits_for_the_final_counters_of_its_peer(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    assert not launcher.peers.finish(sent(3), 10.0)
+    assert said_last(launcher).phase == OVER
+    assert said_last(launcher).books["a"]["outgoing"][str(HERE_TO_THERE)]["sent"] == 3
+    assert launcher.peers.books() == {}
+    launcher.hears("b", replace(ELSEWHERE, number=2, phase=OVER, books=received(3)))
+    assert launcher.peers.finish(sent(3), 10.1)
+    assert launcher.peers.books() == received(3)
+
+
+def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> None:
+    launcher.hears("b", ELSEWHERE)
+    assert not launcher.peers.finish(sent(3), 10.0)
+    assert launcher.peers.finish(sent(3), 10.0 + WAITS_S)
+    launcher.hears("b", None, 10.0)
+    assert launcher.peers.finish(sent(3), 10.0)
+
+
+def test_a_state_comes_through_as_it_was() -> None:
+    state = PeerState("r", "h", 4, RUNNING, 0, "é", "o", 1.5, received(3))
+    assert state_from(state.to_text()) == state

@@ -1,0 +1,119 @@
+"""The lists of packets that a node writes."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from neuros.engine.hook import Hook
+from neuros.engine.input_queue import Subscription
+from neuros.engine.schedule import ExecutionLog
+from neuros.engine.send_window import SendWindow
+from neuros.hooks import HookKind, HookSpec
+from neuros.node import packet_log
+from neuros.node.packet_log import PacketLog
+from neuros.project.model import Connection
+
+LEAVING = Connection("node", "out", "other", "in", 0, index=3)
+ARRIVING = Connection("other", "out", "node", "in", 0, index=4)
+
+
+@pytest.fixture
+def node() -> Any:
+    """What an engine has of its connections: one each way, and an external topic."""
+    subscriptions = {key: Subscription(key, str(key), "in", 1) for key in (ARRIVING, "topic")}
+    return SimpleNamespace(
+        send_windows={LEAVING: SendWindow(LEAVING)},
+        subscriptions=subscriptions,
+        execution_log=ExecutionLog(),
+    )
+
+
+def numbers(folder: Path, name: str) -> list[int]:
+    found = array("q")
+    found.frombytes((folder / "packets" / name).read_bytes())
+    return list(found)
+
+
+def test_what_was_noted_is_written_and_taken_away(tmp_path: Path, node: Any) -> None:
+    digests = {LEAVING: array("Q", [7]), ARRIVING: array("Q", [8])}
+    node.send_windows[LEAVING].spend(1000)
+    node.subscriptions[ARRIVING].taken.append(1)
+    node.subscriptions[ARRIVING].taken_ns.append(2000)
+    PacketLog(node, digests, tmp_path).write()
+    written = {path.name: numbers(tmp_path, path.name) for path in (tmp_path / "packets").iterdir()}
+    assert written == {
+        "3.sent_ns": [1000],
+        "3.digests": [7],
+        "4.digests": [8],
+        "4.taken": [1],
+        "4.taken_ns": [2000],
+    }
+    assert not node.send_windows[LEAVING].sent_ns
+    assert not digests[LEAVING]
+
+
+def test_what_comes_later_goes_behind_it(tmp_path: Path, node: Any) -> None:
+    log = PacketLog(node, {}, tmp_path)
+    for time_ns in (1, 2, 3):
+        node.send_windows[LEAVING].spend(time_ns)
+        log.write()
+    assert numbers(tmp_path, "3.sent_ns") == [1, 2, 3]
+
+
+def test_a_node_that_sends_nothing_has_no_files(tmp_path: Path, node: Any) -> None:
+    PacketLog(node, {}, tmp_path).write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_external_topics_nothing_is_kept(tmp_path: Path, node: Any) -> None:
+    node.subscriptions["topic"].taken.append(1)
+    node.subscriptions["topic"].taken_ns.append(5)
+    PacketLog(node, {}, tmp_path).write()
+    assert list(tmp_path.iterdir()) == []
+    assert not node.subscriptions["topic"].taken
+
+
+def test_first_executions_are_written_with_the_names_of_their_hooks(
+    tmp_path: Path, node: Any
+) -> None:
+    hook = Hook(HookSpec(HookKind.FUNCTION, test_a_file_does_not_grow_for_ever, (), ()), (), {})
+    node.execution_log.note_execution(hook, 100, 250)
+    node.execution_log.note_credit(LEAVING, 1, 300)
+    PacketLog(node, {}, tmp_path).write()
+    assert numbers(tmp_path, "executions") == [0, 100, 250]
+    assert numbers(tmp_path, "credits") == [3, 1, 300]
+    assert json.loads((tmp_path / "packets/hooks.json").read_text()) == [
+        {"name": "test_a_file_does_not_grow_for_ever", "kind": "function"}
+    ]
+    assert not node.execution_log.executions
+
+
+def test_a_file_does_not_grow_for_ever(
+    tmp_path: Path, node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packet_log, "MOST_ENTRIES", 2)
+    log = PacketLog(node, {}, tmp_path)
+    for time_ns in (1, 2, 3):
+        node.send_windows[LEAVING].spend(time_ns)
+        log.write()
+    assert numbers(tmp_path, "3.sent_ns") == [1, 2]
+    assert not node.send_windows[LEAVING].sent_ns
+
+
+def test_a_full_disk_is_noted_and_the_run_goes_on(tmp_path: Path, node: Any) -> None:
+    (tmp_path / "packets").mkdir()
+    (tmp_path / "packets/3.sent_ns").symlink_to("/dev/full")
+    log = PacketLog(node, {}, tmp_path)
+    node.send_windows[LEAVING].spend(1)
+    log.write()
+    assert log.failure is not None
+    assert "No space left on device" in log.failure
+    node.send_windows[LEAVING].spend(2)
+    log.write()
+    assert not node.send_windows[LEAVING].sent_ns

@@ -1,0 +1,39 @@
+"""An observer asks, and shows what it gets, until the run is over."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from neuros.launcher.channels import Channels
+from neuros.viewers.observer import look_on
+from neuros.viewers.visual_types import Mark, Numbers, VisualTypes
+
+
+def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
+    channels = Channels(tmp_path)
+    shown: list[tuple[str, Sequence[Mark]]] = []
+    sources = {"robot.imu": ("robot", "imu", VisualTypes("sensor_msgs/msg/Imu"))}
+    observer = threading.Thread(
+        target=look_on, args=(tmp_path, sources, lambda name, _, marks: shown.append((name, marks)))
+    )
+    observer.start()
+    asked = []
+    while not shown:
+        channels.wait(5.0)
+        for lines, message in channels.receive():
+            asked.append(message["kind"])
+            if message["kind"] == "look":
+                fields = message["wanted"]["robot"]["imu"]["fields"]
+                sample = {"fields": fields, "values": [[1e9, *([0.5] * len(fields))]]}
+                channels.send_to(lines, "phase", phase="running", is_paused=False)
+                channels.send_to(lines, "node_status", node="robot", samples={"imu": sample})
+    channels.close()
+    observer.join(5.0)
+    assert not observer.is_alive()
+    assert asked[:2] == ["watch", "look"]
+    name, (_, numbers) = shown[0]
+    assert name == "robot.imu"
+    assert isinstance(numbers, Numbers)
+    assert numbers.values["linear_acceleration.x"] == 0.5
