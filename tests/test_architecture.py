@@ -249,15 +249,15 @@ def run_python(*arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_core_imports_where_the_outside_world_does_not_exist() -> None:
-    core = [module_of(path) for path in FILES if "core" in path.relative_to(ROOT).parts]
+def test_the_engine_imports_where_the_outside_world_does_not_exist() -> None:
+    engine = [module_of(path) for path in FILES if "engine" in path.relative_to(ROOT).parts]
     run_python(
         "-c",
         "import sys\n"
         "for name in ('rclpy', 'docker', 'mujoco', 'psutil', 'numpy', 'nest', 'jsonschema'):\n"
         "    sys.modules[name] = None\n"
         "sys.path.insert(0, '.')\n"
-        f"import {', '.join(['neuros.engine', *core])}",
+        f"import {', '.join(['neuros.engine', *engine])}",
     )
 
 

@@ -9,9 +9,9 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import psutil
-from dashboard.browser import browser_page
-from dashboard.visitor import IMU, WATCHED, Visitor, address, is_full
 from launching import Running, start
+from viewers.dashboard.browser import browser_page
+from viewers.dashboard.visitor import IMU, WATCHED, Visitor, address, is_full
 
 from neuros.viewers.dashboard.server import STATIC
 

@@ -13,7 +13,7 @@ from launching import REPOSITORY, launch, start
 
 from neuros.backends.rerun import await_server
 
-WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
+WATCHED = REPOSITORY / "tests" / "viewers" / "dashboard" / "watched"
 # A stand-in for a tool with a window: it tells how it was started, and stays.
 TOOL = """\
 #!/bin/sh

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from container_bench import GONE_WITHIN_S
-from dashboard.visitor import WATCHED, Visitor, address, is_full
 from docker import DockerClient
 from launching import start
+from viewers.dashboard.visitor import WATCHED, Visitor, address, is_full
 
 from containers import connected, require_containers, wait_until
 from neuros.backends.docker.tool import IMAGE

@@ -13,7 +13,7 @@ from neuros.simulators.convert.find import Finder
 from neuros.simulators.convert.sdf import convert_sdf
 
 HERE = Path(__file__).resolve().parent
-BY_HAND = HERE.parents[1] / "examples/4_neurorobotics/whiskeye/whiskeye.xml"
+BY_HAND = HERE.parents[2] / "examples/4_neurorobotics/whiskeye/whiskeye.xml"
 SIX_DIGITS = 2e-6
 
 

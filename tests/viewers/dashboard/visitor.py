@@ -13,7 +13,7 @@ from launching import REPOSITORY, Running
 
 from benchmarks.viewer import events_of
 
-WATCHED = REPOSITORY / "tests" / "dashboard" / "watched"
+WATCHED = REPOSITORY / "tests" / "viewers" / "dashboard" / "watched"
 IMU = "world.imu -> brain.imu"
 TIMEOUT_S = 20
 
