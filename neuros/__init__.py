@@ -7,12 +7,11 @@ and look at what comes out with :class:`Run`.
 
 from typing import TYPE_CHECKING, Any
 
-from neuros.distribution import __version__
-
 if TYPE_CHECKING:
     from neuros.api.project import Project
     from neuros.api.run import Run
     from neuros.api.sweep import sweep
+    from neuros.distribution import __version__
 
 __all__ = ["Project", "Run", "__version__", "sweep"]
 
@@ -31,4 +30,8 @@ def __getattr__(name: str) -> Any:
         from neuros.api.sweep import sweep
 
         return sweep
+    if name == "__version__":
+        from neuros.distribution import __version__
+
+        return __version__
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
