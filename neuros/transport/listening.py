@@ -19,9 +19,10 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from neuros.errors import EnvironmentFault
 from neuros.transport.dds_profile import dds_environment
-from neuros.transport.lean_node import LeanNode, give_up
+from neuros.transport.lean_node import LeanNode
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.teardown import give_up
 
 _LOOK_S = 0.1
 _DEPTH = 1000

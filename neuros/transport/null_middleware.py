@@ -20,8 +20,9 @@ from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet, make_packet
-from neuros.transport.lean_node import give_up, lean_node, without_spinning
+from neuros.transport.lean_node import lean_node, without_spinning
 from neuros.transport.messages import message_class
+from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 Event = Callable[[], None]

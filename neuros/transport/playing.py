@@ -13,8 +13,9 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
-from neuros.transport.lean_node import LeanNode, give_up
+from neuros.transport.lean_node import LeanNode
 from neuros.transport.messages import message_class
+from neuros.transport.teardown import give_up
 
 _LAST_S = 5.0
 _POLL_S = 0.01

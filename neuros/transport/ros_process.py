@@ -21,7 +21,6 @@ from neuros.transport.lean_node import (
     Fail,
     LeanNode,
     PluginCallbacks,
-    give_up,
     lean_node,
     without_spinning,
 )
@@ -31,6 +30,7 @@ from neuros.transport.peer_topics import PeerVoice
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
+from neuros.transport.teardown import give_up
 from neuros.transport.values import checker
 
 _LINGER_S = 0.05

@@ -10,7 +10,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 import rclpy
@@ -19,9 +20,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.backends.domain import choose_domain
-from neuros.transport import lean_node
-from neuros.transport.lean_node import give_up
+from neuros.transport import teardown
 from neuros.transport.messages import message_class
+from neuros.transport.teardown import end_discovery, give_up
 
 String = message_class("std_msgs/msg/String")
 TOPICS = [f"topic_{place}" for place in range(5)]
@@ -41,26 +42,37 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def test_a_participant_that_is_given_up_hears_of_nobody_any_more() -> None:
-    with choose_domain(None, {}, False) as domain:
-        context, node = begin("node", domain.id)
-        own = node.create_publisher(String, "before", 1)
-        other_context, other = begin("other", domain.id)
-        other.create_subscription(String, "before", print, 1)
-        wait_until(lambda: node.count_subscribers("before") == 1)
-        lean_node._end_discovery(node)
-        witness_context, witness = begin("witness", domain.id)
-        other.create_subscription(String, "after", print, 1)
-        wait_until(lambda: witness.count_subscribers("after") == 1)
-        wait_until(lambda: own.get_subscription_count() == 1)
-        assert node.count_subscribers("after") == 0
-        for each, its in ((context, node), (other_context, other), (witness_context, witness)):
-            give_up(each, [its])
-            assert not each.ok()
+@pytest.fixture
+def begun() -> Iterator[Callable[[str], Node]]:
+    """Makes nodes, each in a context of its own, in one domain; all of them are given up."""
+    with choose_domain(None, {}, False) as domain, ExitStack() as stack:
+
+        def make(name: str) -> Node:
+            context, node = begin(name, domain.id)
+            stack.callback(give_up, context, [node])
+            return node
+
+        yield make
+
+
+@pytest.mark.parametrize(("is_ended", "heard"), [(False, 1), (True, 0)])
+def test_a_participant_without_discovery_hears_of_nobody_any_more(
+    begun: Callable[[str], Node], is_ended: bool, heard: int
+) -> None:
+    node, other = begun("node"), begun("other")
+    before, after = (node.create_publisher(String, topic, 1) for topic in ("before", "after"))
+    other.create_subscription(String, "before", print, 1)
+    wait_until(lambda: node.count_subscribers("before") == before.get_subscription_count() == 1)
+    if is_ended:
+        end_discovery(node)
+    other.create_subscription(String, "after", print, 1)
+    # DDS matches the two after it has told the listener: no later word can come.
+    wait_until(lambda: after.get_subscription_count() == 1)
+    assert node.count_subscribers("after") == heard
 
 
 def test_another_rmw_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean_node, "_RMW", "librmw_other.so")
+    monkeypatch.setattr(teardown, "_RMW", "librmw_other.so")
     with choose_domain(None, {}, False) as domain:
         context, node = begin("node", domain.id)
         give_up(context, [node])
