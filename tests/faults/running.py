@@ -211,7 +211,8 @@ def _problems(outcome: Outcome, run_folder: Path) -> list[str]:
         found.append(f"ended after {outcome.took_s:.1f} s")
     if outcome.exit_code == 1 and "victim" not in outcome.said:
         found.append("the last line does not name the node")
-    if cell.kind is Kind.RAISES and "Traceback" not in outcome.output:
+    is_silent = cell.fault == "sys_exit" and cell.place == "thread"  # Python ends just the thread
+    if cell.kind is Kind.RAISES and not is_silent and "Traceback" not in outcome.output:
         found.append("no traceback")
     found += [f"left: {each}" for each in outcome.left]
     if outcome.bag not in ("complete", "repaired"):
