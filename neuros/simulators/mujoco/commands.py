@@ -41,7 +41,7 @@ import mujoco
 from neuros.errors import ModelError
 from neuros.ports import Packet
 from neuros.project.model import Node, Port
-from neuros.simulators.mujoco.declarations import (
+from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,

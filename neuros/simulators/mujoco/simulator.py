@@ -11,8 +11,8 @@ from typing import Any
 from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
 from neuros.simulators.mujoco.commands import Controls, control
-from neuros.simulators.mujoco.declarations import did_you_mean
 from neuros.simulators.mujoco.free_run import FreeRun, StepLock
+from neuros.simulators.mujoco.lookup import did_you_mean
 from neuros.simulators.mujoco.viewer import open_viewer
 from neuros.simulators.mujoco.world import World
 
