@@ -24,7 +24,7 @@ from neuros.simulators.mujoco.sensors import (
     bind_sensors,
     read_sensors,
 )
-from neuros.simulators.mujoco.timebase import Schedule, Timebase
+from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
