@@ -16,7 +16,7 @@ from neuros.project.message_types import normalised
 from neuros.project.names import INTERNAL, MOST_CHARACTERS, Names
 from neuros.project.parameters import parameter_mistakes
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.source import Element
+from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean
 
 Side = Literal["inputs", "outputs"]

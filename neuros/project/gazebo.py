@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 from neuros.errors import Problem
 from neuros.project.parsed import ParsedProject
-from neuros.project.source import Element
+from neuros.project.scanner import Element
 
 _STAND_INS: Mapping[str, str] = {"neuros_gazebo": "neuros_mujoco"}
 _PREFIXES = ("GZ_", "IGN_", "GAZEBO_")

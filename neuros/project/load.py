@@ -12,15 +12,20 @@ from neuros.project.checks import mistakes, remarks
 from neuros.project.gazebo import container_in_place_of, is_for_gazebo
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
 from neuros.project.model import Budgets, Connection, Node, Port, Project, Value
-from neuros.project.overrides import apply_namespace, apply_override, apply_remaps
 from neuros.project.parameters import parameters_of
-from neuros.project.parsed import ParsedProject, names_of, parse_project
+from neuros.project.parsed import (
+    ParsedProject,
+    apply_namespace,
+    apply_override,
+    apply_remaps,
+    names_of,
+    parse_project,
+)
 from neuros.project.paths import PathError, Roots
 from neuros.project.plugin_checks import plugin_problems, unread_variables
 from neuros.project.qos import Qos, qos_of
 from neuros.project.resources import Access, Resources, access_of, resources_of
-from neuros.project.scanner import SourceError, display_name
-from neuros.project.source import Element
+from neuros.project.scanner import Element, SourceError, display_name
 from neuros.project.suggest import did_you_mean
 
 STANDARD_CONTAINERS = frozenset(

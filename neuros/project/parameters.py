@@ -8,7 +8,7 @@ from typing import Any
 from neuros.errors import Problem
 from neuros.project.model import Value
 from neuros.project.parsed import ParsedProject
-from neuros.project.source import Element
+from neuros.project.scanner import Element
 
 _INT64 = 1 << 63
 # ROS declares these itself, and passes over what is neither true nor false.

@@ -1,18 +1,47 @@
-"""Parsed project: the JSON of its files, node files merged in, before validation."""
+"""Parsed project: the JSON of its files, node files merged in, before validation.
+
+``--set``, ``--namespace`` and ``--remap`` replace values in it. The form of ``--set``::
+
+    nodes.NAME.KEY...=VALUE
+    connections.SRC.OUT.DST.IN.KEY=VALUE
+    budgets.KEY=VALUE                     budgets.lost_packets.SRC.OUT -> DST.IN=VALUE
+
+``VALUE`` is JSON if it parses and a text otherwise; in ``environment`` it is always a text. Without
+a value the key is removed. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
+other lists an index.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from neuros.errors import Problem
 from neuros.project.names import Names, names_from
 from neuros.project.paths import PathError, Roots
-from neuros.project.scanner import SourceError, display_name, read_file
-from neuros.project.source import Element
+from neuros.project.scanner import (
+    Element,
+    Source,
+    SourceError,
+    display_name,
+    escape,
+    parse,
+    read_file,
+)
+from neuros.project.suggest import did_you_mean
 
 ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 """The keys of a connection that name its ends."""
+_NODE_FORM = "nodes.NAME.KEY=VALUE"
+_CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
+_BUDGET_FORM = "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE"
+_REMAP_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
+_SPECIAL_NAMES = {
+    "__ns": "use --namespace",
+    "__node": "a node keeps the name that the project gives it",
+    "__name": "a node keeps the name that the project gives it",
+}
 
 
 @dataclass
@@ -101,3 +130,145 @@ def rules_of(remap: Element | None) -> dict[str, str]:
     if remap is None or not isinstance(remap.value, dict):
         return {}
     return {old: new.value for old, new in remap.value.items() if isinstance(new.value, str)}
+
+
+# ---- overrides
+
+
+def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
+    """Apply one ``--set`` to a parsed project; what is wrong with the text itself is returned."""
+    override = _Override(Source(f"--set {text}", parsed.roots.project, text))
+    target, equals, _ = text.partition("=")
+    kind, *steps = target.split(".")
+    if kind == "budgets":
+        return override.apply_to_budgets(parsed.root, steps)
+    form = {"nodes": _NODE_FORM, "connections": _CONNECTION_FORM}.get(kind)
+    if form is None:
+        hint = did_you_mean(kind, ("nodes", "connections", "budgets"))
+        return [override.problem("must begin with 'nodes.', 'connections.' or 'budgets.'", hint)]
+    names = len(ENDS) if kind == "connections" else 1
+    if not equals or len(steps) <= names or not all(steps[: names + 1]):
+        return [override.problem("is not of the form", form)]
+    parent = _node(parsed, steps[0]) if names == 1 else _connection(parsed, steps[:names])
+    if isinstance(parent, str):
+        what = f"there is no {kind.removesuffix('s')} '{'.'.join(steps[:names])}'"
+        return [] if not parsed.is_complete else [override.problem(what, parent)]
+    return override.apply(parent, steps[names:])
+
+
+def _node(parsed: ParsedProject, name: str) -> Element | str:
+    names = [node.string("name") or "" for node in parsed.nodes]
+    return parsed.nodes[names.index(name)] if name in names else did_you_mean(name, names)
+
+
+def _connection(parsed: ParsedProject, ends: list[str]) -> Element | str:
+    known = [".".join(c.string(end) or "" for end in ENDS) for c in parsed.connections]
+    wanted = ".".join(ends)
+    if wanted in known:
+        return parsed.connections[known.index(wanted)]
+    return did_you_mean(wanted, known)
+
+
+@dataclass
+class _Override:
+    source: Source
+
+    @property
+    def _value_start(self) -> int:
+        return self.source.text.index("=") + 1
+
+    def problem(self, text: str, hint: str = "") -> Problem:
+        return self.source.problem(0, "", text, hint)
+
+    def apply_to_budgets(self, root: Element, steps: list[str]) -> list[Problem]:
+        if "=" not in self.source.text or not all(steps) or not steps:
+            return [self.problem("is not of the form", _BUDGET_FORM)]
+        if len(steps) > 1:
+            steps = [steps[0], ".".join(steps[1:])]  # names of connections contain dots
+        return self.apply(root, ["budgets", *steps])
+
+    def apply(self, parent: Element, steps: list[str]) -> list[Problem]:
+        is_text = steps[0] == "environment" and len(steps) > 1
+        if is_text:
+            steps = [steps[0], ".".join(steps[1:])]  # names of variables may contain dots
+        removes = self._value_start == len(self.source.text)
+        for step in steps[:-1]:
+            key = self._key(parent, step)
+            if isinstance(key, Problem):
+                return [key]
+            if key == step and parent.member(step) is None:
+                if removes:
+                    return []
+                parent.value[step] = self._element({}, f"{parent.pointer}/{escape(step)}")
+            parent = parent.value[key]
+        key = self._key(parent, steps[-1])
+        if isinstance(key, Problem):
+            return [key]
+        if removes:
+            if isinstance(key, int) or key in parent.value:
+                del parent.value[key]
+            return []
+        element, problems = self._value(f"{parent.pointer}/{escape(str(key))}", is_text)
+        parent.value[key] = element
+        return problems
+
+    def _key(self, parent: Element, step: str) -> str | int | Problem:
+        """The key or index behind a step; a key need not exist yet."""
+        if isinstance(parent.value, dict):
+            return step
+        if not isinstance(parent.value, list):
+            return self.problem(f"'{step}' leads nowhere: there is no object around it")
+        names = [item.string("name") or "" for item in parent.value]
+        if step in names:
+            return names.index(step)
+        if step.isascii() and step.isdigit() and int(step) < len(names):
+            return int(step)
+        return self.problem(f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names))
+
+    def _value(self, pointer: str, is_text: bool) -> tuple[Element, list[Problem]]:
+        if not is_text:
+            try:
+                element, problems = parse(self.source, self._value_start, pointer)
+            except SourceError:
+                pass
+            else:
+                element.key_start = self._value_start
+                return element, problems
+        return self._element(self.source.text[self._value_start :], pointer), []
+
+    def _element(self, value: object, pointer: str) -> Element:
+        return Element(value, self.source, self._value_start, len(self.source.text), pointer)
+
+
+def apply_namespace(parsed: ParsedProject, text: str) -> None:
+    """Apply ``--namespace`` to a parsed project, in the place of the project's own."""
+    if isinstance(parsed.root.value, dict):
+        source = Source(f"--namespace {text}", parsed.roots.project, text)
+        parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
+
+
+def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
+    """Apply each ``--remap`` to a parsed project; they go before the rules of the project."""
+    problems: list[Problem] = []
+    rules: dict[str, Element] = {}
+    for text in texts:
+        source = Source(f"--remap {text}", parsed.roots.project, text)
+        old, sign, new = text.partition(":=")
+        if not (sign and old and new):
+            problems.append(source.problem(0, "/remap", "is no rule", _REMAP_FORM))
+        elif old.rpartition(":")[2] in _SPECIAL_NAMES:
+            hint = _SPECIAL_NAMES[old.rpartition(":")[2]]
+            problems.append(source.problem(0, "/remap", f"'{old}' is not remapped", hint))
+        else:
+            start = len(old) + len(sign)
+            pointer = f"/remap/{escape(old)}"
+            rule = Element(new, source, start, len(text), pointer, key_start=0)
+            rules.setdefault(old, rule)  # the first one counts
+    if rules and isinstance(parsed.root.value, dict):
+        remap = parsed.root.member("remap")
+        if remap is None:
+            source = next(iter(rules.values())).source
+            parsed.root.value["remap"] = Element(rules, source, 0, len(source.text), "/remap")
+        elif isinstance(remap.value, dict):
+            remap.value = {**rules, **{k: v for k, v in remap.value.items() if k not in rules}}
+    return problems
