@@ -9,16 +9,15 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from neuros.errors import Problem
 from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node
-from neuros.project.names import INTERNAL, MOST_CHARACTERS, Names
+from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.plugin_files import DeclaredHook, DeclaredPort, PluginFile, Remark, read_plugin
+from neuros.project.plugin_files import DeclaredHook, PluginFile, Remark, read_plugin
 from neuros.project.scanner import Element, display_name
 from neuros.project.suggest import did_you_mean
 
@@ -50,14 +49,6 @@ _KNOWN_PREFIXES = (
 )
 
 
-@dataclass
-class _Ports:
-    """The ports of one node by side and name; a side that could not be read is incomplete."""
-
-    by_side: dict[Side, dict[str, Element]] = field(default_factory=dict)
-    incomplete: set[Side] = field(default_factory=set)
-
-
 def mistakes(parsed: ParsedProject) -> list[Problem]:
     """Everything that does not fit together."""
     return [
@@ -66,14 +57,24 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
         *_duplicate_connections(parsed),
         *_connection_ends(parsed),
         *_budget_mistakes(parsed),
-        *_ros_graph_mistakes(parsed),
+        *_qos_of_connections(parsed),
+        *_rules_without_sense(parsed),
+        *_long_names(parsed),
         *_parameter_mistakes(parsed),
     ]
 
 
 def remarks(parsed: ParsedProject) -> list[Problem]:
     """What is allowed, but may be a mistake. For a project without mistakes."""
-    return sorted([*_gazebo_remarks(parsed), *_unconnected(parsed), *_ros_graph_remarks(parsed)])
+    return sorted([*_gazebo_remarks(parsed), *_unconnected(parsed), *_qos_without_effect(parsed)])
+
+
+def _all_ports(parsed: ParsedProject) -> Iterator[tuple[Element, Side, str]]:
+    """Every port with its side and the name of its node."""
+    for node in parsed.nodes:
+        for side in _SIDES:
+            for port in node.items(side):
+                yield port, side, node.string("name") or ""
 
 
 def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
@@ -97,7 +98,7 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
 
 def _duplicate_ports(parsed: ParsedProject) -> Iterator[Problem]:
     for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
+        for side in _SIDES:
             first: dict[str, Element] = {}
             for port in node.items(side):
                 name = port.string("name")
@@ -108,56 +109,60 @@ def _duplicate_ports(parsed: ParsedProject) -> Iterator[Problem]:
 
 
 def _duplicate_connections(parsed: ParsedProject) -> Iterator[Problem]:
-    first: dict[tuple[str | None, ...], Element] = {}
+    first: dict[str, Element] = {}
     for connection in parsed.connections:
-        ends = tuple(connection.string(end) for end in ENDS)
-        if None not in ends and first.setdefault(ends, connection) is not connection:
-            yield connection.problem(
-                f"the connection {_named(ends)} occurs twice", _where(first[ends])
-            )
+        name = _connection_name(connection)
+        if name is not None and first.setdefault(name, connection) is not connection:
+            yield connection.problem(f"the connection {name} occurs twice", _where(first[name]))
 
 
 def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
-    nodes = _ports_by_node(parsed)
+    nodes: dict[str, list[Element]] = {}
+    for node in parsed.nodes:
+        nodes.setdefault(node.string("name") or "", []).append(node)
     all_known = parsed.is_complete and all(node.string("name") for node in parsed.nodes)
     for connection in parsed.connections:
         found: list[Element] = []
-        sides: tuple[tuple[str, str, Side], ...] = (
+        for node_key, port_key, side in (
             ("source_node", "source_output", "outputs"),
             ("destination_node", "destination_input", "inputs"),
-        )
-        for node_key, port_key, side in sides:
-            node, port = connection.string(node_key), connection.string(port_key)
-            if node is None:
+        ):
+            name, port = connection.string(node_key), connection.string(port_key)
+            if name is None:
                 continue
-            if node not in nodes:
-                if all_known and node:
-                    hint = did_you_mean(node, nodes)
-                    yield connection.value[node_key].problem(f"there is no node '{node}'", hint)
+            if name not in nodes:
+                if all_known and name:
+                    hint = did_you_mean(name, nodes)
+                    yield connection.value[node_key].problem(f"there is no node '{name}'", hint)
                 continue
-            result = _port(nodes[node], node, port, side) if port else None
-            if isinstance(result, Element):
-                found.append(result)
-                if result.member("external_topic") is not None:
+            end = _port(nodes[name], name, port, side) if port else None
+            if isinstance(end, Element):
+                found.append(end)
+                if end.member("external_topic") is not None:
                     yield connection.value[port_key].problem(
-                        f"{side[:-1]} '{port}' of node '{node}' has an external topic, so it "
+                        f"{side[:-1]} '{port}' of node '{name}' has an external topic, so it "
                         "cannot be connected",
-                        _where(result, "external_topic"),
+                        _where(end, "external_topic"),
                     )
-            elif result is not None:
-                yield connection.value[port_key].problem(*result)
+            elif end is not None:
+                yield connection.value[port_key].problem(*end)
         yield from _different_types(connection, found)
 
 
-def _port(ports: _Ports, node: str, port: str, side: Side) -> Element | tuple[str, str] | None:
-    """The port, or what is wrong with it, or ``None`` if that cannot be known."""
-    if port in ports.by_side[side]:
-        return ports.by_side[side][port]
-    if side in ports.incomplete:
+def _port(
+    nodes: Sequence[Element], node: str, port: str, side: str
+) -> Element | tuple[str, str] | None:
+    """The port of the nodes of one name, or what is wrong with it; ``None`` if that is unknown."""
+    ports = [each for node_ in nodes for each in node_.items(side)]
+    names = [each.string("name") for each in ports]
+    if port in names:
+        return ports[names.index(port)]
+    members = [member for node_ in nodes if (member := node_.member(side))]
+    if None in names or not all(isinstance(member.value, list) for member in members):
         return None
-    other: Side = "outputs" if side == "inputs" else "inputs"
-    hint = did_you_mean(port, ports.by_side[side])
-    if port in ports.by_side[other]:
+    other = "outputs" if side == "inputs" else "inputs"
+    hint = did_you_mean(port, filter(None, names))
+    if any(each.string("name") == port for node_ in nodes for each in node_.items(other)):
         hint = f"it has an {other[:-1]} of that name"
     return f"node '{node}' has no {side[:-1]} '{port}'", hint
 
@@ -178,47 +183,12 @@ def _unconnected(parsed: ParsedProject) -> Iterator[Problem]:
         for connection in parsed.connections
         for side, node, port in (("outputs", *ENDS[:2]), ("inputs", *ENDS[2:]))
     }
-    for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
-            for port in node.items(side):
-                key = (side, node.string("name"), port.string("name"))
-                # A sensor may be read by the plugin alone, for a message of the user's own.
-                is_sensor = side == "outputs" and port.member("mujoco") is not None
-                if not (key in used or is_sensor or port.member("external_topic")):
-                    yield port.problem(
-                        f"{side[:-1]} '{key[2]}' of node '{key[1]}' is not connected"
-                    )
-
-
-def _ports_by_node(parsed: ParsedProject) -> dict[str, _Ports]:
-    nodes: dict[str, _Ports] = {}
-    for node in parsed.nodes:
-        ports = nodes.setdefault(node.string("name") or "", _Ports())
-        sides: tuple[Side, ...] = ("inputs", "outputs")
-        for side in sides:
-            named = ports.by_side.setdefault(side, {})
-            items = node.items(side)
-            for port in items:
-                named.setdefault(port.string("name") or "", port)
-            member = node.member(side)
-            is_list = member is None or isinstance(member.value, list)
-            if not is_list or any(port.string("name") is None for port in items):
-                ports.incomplete.add(side)
-    return nodes
-
-
-def _named(ends: tuple[str | None, ...]) -> str:
-    return f"{ends[0]}.{ends[1]} -> {ends[2]}.{ends[3]}"
-
-
-def _where(element: Element, key: str = "") -> str:
-    """Where the other one is, for a hint."""
-    place = element.value[key] if key else element
-    line, column = place.source.place(place.start)
-    return f"see {place.source.name}:{line}:{column}"
-
-
-# ---------------------------------------------------------------------- budgets
+    for port, side, node in _all_ports(parsed):
+        name = port.string("name")
+        # A sensor may be read by the plugin alone, for a message of the user's own.
+        is_sensor = side == "outputs" and port.member("mujoco") is not None
+        if not ((side, node, name) in used or is_sensor or port.member("external_topic")):
+            yield port.problem(f"{side[:-1]} '{name}' of node '{node}' is not connected")
 
 
 def _budget_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
@@ -243,31 +213,18 @@ def _connection_name(connection: Element) -> str | None:
     return f"{source}.{output} -> {destination}.{input_}"
 
 
+def _where(element: Element, key: str = "") -> str:
+    """Where the other one is, for a hint."""
+    place = element.value[key] if key else element
+    line, column = place.source.place(place.start)
+    return f"see {place.source.name}:{line}:{column}"
+
+
 # ---------------------------------------------------------------------- ROS graph
 
 
-def _ros_graph_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
-    """QoS where there is none to choose, rules for nothing, and names that are too long."""
-    names = names_of(parsed)
-    yield from _qos_of_connections(parsed)
-    yield from _rules_without_sense(parsed, names)
-    yield from _long_names(parsed, names)
-
-
-def _ros_graph_remarks(parsed: ParsedProject) -> Iterator[Problem]:
-    """QoS that does not do what it seems to."""
-    for port, _, _ in _all_ports(parsed):
-        qos = port.member("qos")
-        if qos is None or qos.string("durability") != "transient_local":
-            continue
-        if qos.string("reliability") == "best_effort":
-            yield qos.problem(
-                "transient_local has no effect with best_effort: who comes later gets nothing",
-                "make it reliable",
-            )
-
-
 def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
+    """QoS where there is none to choose."""
     for port, side, _ in _all_ports(parsed):
         qos = port.member("qos")
         if qos is not None and port.member("external_topic") is None:
@@ -277,9 +234,20 @@ def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
             )
 
 
-def _rules_without_sense(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
-    nodes = {node.string("name") or "": node for node in parsed.nodes}
-    remap = parsed.root.member("remap")
+def _qos_without_effect(parsed: ParsedProject) -> Iterator[Problem]:
+    for port, _, _ in _all_ports(parsed):
+        qos = port.member("qos")
+        policies = qos and (qos.string("reliability"), qos.string("durability"))
+        if qos is not None and policies == ("best_effort", "transient_local"):
+            yield qos.problem(
+                "transient_local has no effect with best_effort: who comes later gets nothing",
+                "make it reliable",
+            )
+
+
+def _rules_without_sense(parsed: ParsedProject) -> Iterator[Problem]:
+    names, remap = names_of(parsed), parsed.root.member("remap")
+    nodes = [node.string("name") or "" for node in parsed.nodes]
     for rule in rules_of(remap):
         assert remap is not None
         only, _, old = rule.rpartition(":")
@@ -294,7 +262,8 @@ def _rules_without_sense(parsed: ParsedProject, names: Names) -> Iterator[Proble
             )
 
 
-def _long_names(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
+def _long_names(parsed: ParsedProject) -> Iterator[Problem]:
+    names = names_of(parsed)
     for port, _, node in _all_ports(parsed):
         topic = port.string("external_topic")
         if topic is not None:
@@ -312,14 +281,6 @@ def _long_names(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
 
 def _too_long(topic: str) -> str:
     return f"the topic {topic} is longer than the {MOST_CHARACTERS} characters that ROS allows"
-
-
-def _all_ports(parsed: ParsedProject) -> Iterator[tuple[Element, str, str]]:
-    """Every port with its side and the name of its node."""
-    for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
-            for port in node.items(side):
-                yield port, side, node.string("name") or ""
 
 
 # ---------------------------------------------------------------------- parameters of ROS
@@ -403,12 +364,8 @@ def _gazebo_variables(parsed: ParsedProject, node: Element) -> Iterator[Problem]
 
 
 def _gazebo_ports(node: Element) -> Iterator[Problem]:
-    ports = [
-        port
-        for side in ("inputs", "outputs")
-        for port in node.items(side)
-        if port.member("gazebo_type") is not None
-    ]
+    every = [*node.items("inputs"), *node.items("outputs")]
+    ports = [port for port in every if port.member("gazebo_type") is not None]
     if not ports:
         return
     names = ", ".join(f"'{port.string('name')}'" for port in ports)
@@ -471,25 +428,24 @@ def _misfits(
                 hint = hint or f"it has {', '.join(sorted(names)) or 'none'}"
                 text = f"hook '{hook.name}': node '{node.name}' declares no {side} '{port.name}'"
                 yield Remark(port.line, port.column, text, hint)
-            elif side == "input" and connections is not None and not port.is_optional:
-                yield from _unfed(hook, port, node, connections)
+            elif (
+                side == "input"
+                and not port.is_optional
+                and not _is_fed(node, port.name, connections)
+            ):
+                text = (
+                    f"hook '{hook.name}': needs input '{port.name}', but nothing is connected to"
+                    f" {node.name}.{port.name}"
+                )
+                hint = "connect it, or declare it Optional"
+                yield Remark(port.line, port.column, text, hint)
 
 
-def _unfed(
-    hook: DeclaredHook, port: DeclaredPort, node: Node, connections: Sequence[Connection]
-) -> Iterator[Remark]:
-    assert port.name is not None
-    is_fed = node.input(port.name).external_topic is not None or any(
-        (c.destination_node, c.destination_input) == (node.name, port.name) for c in connections
-    )
-    if not is_fed:
-        yield Remark(
-            port.line,
-            port.column,
-            f"hook '{hook.name}': needs input '{port.name}', but nothing is connected to"
-            f" {node.name}.{port.name}",
-            "connect it, or declare it Optional",
-        )
+def _is_fed(node: Node, name: str, connections: Sequence[Connection] | None) -> bool:
+    """Whether something is connected to an input; so it seems where connections are unknown."""
+    if connections is None or node.input(name).external_topic is not None:
+        return True
+    return any((c.destination_node, c.destination_input) == (node.name, name) for c in connections)
 
 
 def _located(plugin: PluginFile, remarks: Iterable[Remark]) -> list[Problem]:
@@ -518,14 +474,8 @@ def unread_variables(
             continue
         candidates = {text for text in plugin.texts if _VARIABLE.fullmatch(text)}
         hint = did_you_mean(key, (candidates | {*node.environment}) - {key})
-        yield Problem(
-            f"--set {text}",
-            1,
-            1,
-            "",
-            f"nothing in the plugin of node '{node.name}' reads {key}",
-            hint,
-        )
+        complaint = f"nothing in the plugin of node '{node.name}' reads {key}"
+        yield Problem(f"--set {text}", 1, 1, "", complaint, hint)
 
 
 def _is_read_by_neuros(key: str) -> bool:

@@ -13,6 +13,7 @@ other lists an index.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,9 +34,11 @@ from neuros.project.suggest import did_you_mean
 
 ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 """The keys of a connection that name its ends."""
-_NODE_FORM = "nodes.NAME.KEY=VALUE"
-_CONNECTION_FORM = "connections.SRC.OUT.DST.IN.KEY=VALUE"
-_BUDGET_FORM = "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE"
+_FORMS = {
+    "nodes": "nodes.NAME.KEY=VALUE",
+    "connections": "connections.SRC.OUT.DST.IN.KEY=VALUE",
+    "budgets": "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE",
+}
 _REMAP_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
 _SPECIAL_NAMES = {
     "__ns": "use --namespace",
@@ -137,107 +140,78 @@ def rules_of(remap: Element | None) -> dict[str, str]:
 
 def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
     """Apply one ``--set`` to a parsed project; what is wrong with the text itself is returned."""
-    override = _Override(Source(f"--set {text}", parsed.roots.project, text))
-    target, equals, _ = text.partition("=")
+    source = Source(f"--set {text}", parsed.roots.project, text)
+    target, equals, value = text.partition("=")
     kind, *steps = target.split(".")
-    if kind == "budgets":
-        return override.apply_to_budgets(parsed.root, steps)
-    form = {"nodes": _NODE_FORM, "connections": _CONNECTION_FORM}.get(kind)
-    if form is None:
-        hint = did_you_mean(kind, ("nodes", "connections", "budgets"))
-        return [override.problem("must begin with 'nodes.', 'connections.' or 'budgets.'", hint)]
-    names = len(ENDS) if kind == "connections" else 1
-    if not equals or len(steps) <= names or not all(steps[: names + 1]):
-        return [override.problem("is not of the form", form)]
-    parent = _node(parsed, steps[0]) if names == 1 else _connection(parsed, steps[:names])
-    if isinstance(parent, str):
-        what = f"there is no {kind.removesuffix('s')} '{'.'.join(steps[:names])}'"
-        return [] if not parsed.is_complete else [override.problem(what, parent)]
-    return override.apply(parent, steps[names:])
+    if kind not in _FORMS:
+        hint = did_you_mean(kind, _FORMS)
+        text = "must begin with 'nodes.', 'connections.' or 'budgets.'"
+        return [source.problem(0, "", text, hint)]
+    ends = {"nodes": ("name",), "connections": ENDS, "budgets": ()}[kind]
+    names = len(ends)
+    needed = steps if kind == "budgets" else steps[: names + 1]
+    if not equals or len(steps) <= names or not all(needed):
+        return [source.problem(0, "", "is not of the form", _FORMS[kind])]
+    name, parent = ".".join(steps[:names]), parsed.root
+    if kind != "budgets":
+        elements = parsed.nodes if kind == "nodes" else parsed.connections
+        known = [".".join(each.string(end) or "" for end in ends) for each in elements]
+        if name not in known:
+            text, hint = f"there is no {kind[:-1]} '{name}'", did_you_mean(name, known)
+            return [source.problem(0, "", text, hint)] if parsed.is_complete else []
+        parent = elements[known.index(name)]
+    keys = [kind, *steps] if kind == "budgets" else steps[names:]
+    # Names of connections and of variables may contain dots.
+    single = 2 if kind == "budgets" else 1 if keys[0] == "environment" else len(keys)
+    keys = [*keys[:single], *([".".join(keys[single:])] if keys[single:] else [])]
+    try:
+        return _set(parent, keys, source, len(target) + 1, removes=not value)
+    except SourceError as error:
+        return [error.problem]
 
 
-def _node(parsed: ParsedProject, name: str) -> Element | str:
-    names = [node.string("name") or "" for node in parsed.nodes]
-    return parsed.nodes[names.index(name)] if name in names else did_you_mean(name, names)
+def _set(
+    parent: Element, keys: list[str], source: Source, start: int, *, removes: bool
+) -> list[Problem]:
+    """Set or remove the value at the end of ``keys``; ``start`` is its place in the source."""
+    end, is_text = len(source.text), keys[0] == "environment" and len(keys) > 1
+    for step in keys[:-1]:
+        key = _key(parent, step, source)
+        if key == step and parent.member(step) is None:
+            if removes:
+                return []
+            pointer = f"{parent.pointer}/{escape(step)}"
+            parent.value[step] = Element({}, source, start, end, pointer)
+        parent = parent.value[key]
+    key = _key(parent, keys[-1], source)
+    if removes:
+        if isinstance(key, int) or key in parent.value:
+            del parent.value[key]
+        return []
+    pointer = f"{parent.pointer}/{escape(str(key))}"
+    problems: list[Problem] = []
+    element = Element(source.text[start:], source, start, end, pointer)
+    if not is_text:
+        with contextlib.suppress(SourceError):
+            element, problems = parse(source, start, pointer)
+            element.key_start = start
+    parent.value[key] = element
+    return problems
 
 
-def _connection(parsed: ParsedProject, ends: list[str]) -> Element | str:
-    known = [".".join(c.string(end) or "" for end in ENDS) for c in parsed.connections]
-    wanted = ".".join(ends)
-    if wanted in known:
-        return parsed.connections[known.index(wanted)]
-    return did_you_mean(wanted, known)
-
-
-@dataclass
-class _Override:
-    source: Source
-
-    @property
-    def _value_start(self) -> int:
-        return self.source.text.index("=") + 1
-
-    def problem(self, text: str, hint: str = "") -> Problem:
-        return self.source.problem(0, "", text, hint)
-
-    def apply_to_budgets(self, root: Element, steps: list[str]) -> list[Problem]:
-        if "=" not in self.source.text or not all(steps) or not steps:
-            return [self.problem("is not of the form", _BUDGET_FORM)]
-        if len(steps) > 1:
-            steps = [steps[0], ".".join(steps[1:])]  # names of connections contain dots
-        return self.apply(root, ["budgets", *steps])
-
-    def apply(self, parent: Element, steps: list[str]) -> list[Problem]:
-        is_text = steps[0] == "environment" and len(steps) > 1
-        if is_text:
-            steps = [steps[0], ".".join(steps[1:])]  # names of variables may contain dots
-        removes = self._value_start == len(self.source.text)
-        for step in steps[:-1]:
-            key = self._key(parent, step)
-            if isinstance(key, Problem):
-                return [key]
-            if key == step and parent.member(step) is None:
-                if removes:
-                    return []
-                parent.value[step] = self._element({}, f"{parent.pointer}/{escape(step)}")
-            parent = parent.value[key]
-        key = self._key(parent, steps[-1])
-        if isinstance(key, Problem):
-            return [key]
-        if removes:
-            if isinstance(key, int) or key in parent.value:
-                del parent.value[key]
-            return []
-        element, problems = self._value(f"{parent.pointer}/{escape(str(key))}", is_text)
-        parent.value[key] = element
-        return problems
-
-    def _key(self, parent: Element, step: str) -> str | int | Problem:
-        """The key or index behind a step; a key need not exist yet."""
-        if isinstance(parent.value, dict):
-            return step
-        if not isinstance(parent.value, list):
-            return self.problem(f"'{step}' leads nowhere: there is no object around it")
+def _key(parent: Element, step: str, source: Source) -> str | int:
+    """The key or index behind a step; a key need not exist yet. Raises :class:`SourceError`."""
+    if isinstance(parent.value, dict):
+        return step
+    text, hint = f"'{step}' leads nowhere: there is no object around it", ""
+    if isinstance(parent.value, list):
         names = [item.string("name") or "" for item in parent.value]
         if step in names:
             return names.index(step)
         if step.isascii() and step.isdigit() and int(step) < len(names):
             return int(step)
-        return self.problem(f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names))
-
-    def _value(self, pointer: str, is_text: bool) -> tuple[Element, list[Problem]]:
-        if not is_text:
-            try:
-                element, problems = parse(self.source, self._value_start, pointer)
-            except SourceError:
-                pass
-            else:
-                element.key_start = self._value_start
-                return element, problems
-        return self._element(self.source.text[self._value_start :], pointer), []
-
-    def _element(self, value: object, pointer: str) -> Element:
-        return Element(value, self.source, self._value_start, len(self.source.text), pointer)
+        text, hint = f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names)
+    raise SourceError(source.problem(0, "", text, hint))
 
 
 def apply_namespace(parsed: ParsedProject, text: str) -> None:
