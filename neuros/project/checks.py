@@ -87,7 +87,7 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
         if other is node:
             continue
         if other.source.file == node.source.file and other.pointer == node.pointer:
-            # One node file, used twice: the places of the names are the same.
+            # One node file, used twice: both names have one place.
             yield entry.problem(f"the node name '{name}' occurs twice", _where(other_entry))
             continue
         text = f"the node name '{name}' occurs twice"

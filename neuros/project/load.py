@@ -151,7 +151,7 @@ def _if_valid(read: Callable[[], _T], default: _T) -> _T:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A valid project, and what may be a mistake in it all the same."""
+    """A valid project, and warnings of possible mistakes in it."""
 
     project: Project
     warnings: tuple[Problem, ...] = ()

@@ -79,7 +79,7 @@ class Element:
 
     @property
     def text(self) -> str:
-        """The value as it is written."""
+        """The JSON text of the value."""
         return self.source.text[self.start : self.end]
 
     @property

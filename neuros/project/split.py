@@ -42,8 +42,8 @@ def split(
 
     Args:
         folders_for: the folders of a node, as that node sees them.
-        translate: from a path on this machine to the path of the same thing for the nodes. The
-            file that a node is described in is not translated: it is for messages to the user.
+        translate: from a path on this machine to that for the nodes. The file that describes a
+            node is not translated: it is for messages to the user.
     """
     return tuple(
         NodeFile(
