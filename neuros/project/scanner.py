@@ -109,7 +109,8 @@ class Element:
         """The element at the end of a path of keys and indices."""
         element = self
         for step in path:
-            element = element.value[step]
+            value = element.value
+            element = value[int(step)] if isinstance(value, list) else value[step]
         return element
 
     def problem(self, text: str, hint: str = "") -> Problem:
@@ -273,11 +274,9 @@ class _Scanner:
 def place_of(file: Path, pointer: str) -> tuple[int, int]:
     """Line and column of a pointer in a file; (1, 1) where there is none any more."""
     try:
-        element, _ = read_file(file)
-        parts = [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]
-        for part in parts:
-            value = element.value
-            element = value[int(part)] if isinstance(value, list) else value[part]
+        root, _ = read_file(file)
+        parts = (part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:])
+        element = root.at(parts)
     except (SourceError, LookupError, ValueError, TypeError):
         return 1, 1
     return element.source.place(element.start)

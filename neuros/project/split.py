@@ -1,8 +1,4 @@
-"""One project file for the user, one ``node.json`` per node; and both back again.
-
-``merge(split(project)) == project``, where ``merge`` is told what no node knows: name, file,
-description and budgets of the project.
-"""
+"""One project file for the user, one ``node.json`` per node, and both as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from neuros.project.model import (
-    Budgets,
     Connection,
     Folders,
     Node,
@@ -22,32 +17,19 @@ from neuros.project.model import (
     parameters_of,
     parameters_to_json,
 )
-from neuros.project.names import Names, names_from, names_to_json
+from neuros.project.names import names_from, names_to_json
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
 
-_NO_BUDGETS = Budgets()
 
-
-def _unchanged(path: Path) -> Path:
-    return path
-
-
-def split(
-    project: Project,
-    folders_for: Callable[[Node], Folders],
-    translate: Callable[[Path], Path] = _unchanged,
-) -> tuple[NodeFile, ...]:
+def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[NodeFile, ...]:
     """Cut a project into one part per node, in the order of the nodes.
 
-    Args:
-        folders_for: the folders of a node, as that node sees them.
-        translate: from a path on this machine to that for the nodes. The file that describes a
-            node is not translated: it is for messages to the user.
+    ``folders_for`` gives the folders of a node, as that node sees them.
     """
     return tuple(
         NodeFile(
-            node=translated(node, translate),
+            node=node,
             connections=tuple(
                 connection
                 for connection in project.connections
@@ -58,28 +40,6 @@ def split(
             names=project.names,
         )
         for index, node in enumerate(project.nodes)
-    )
-
-
-def merge(
-    node_files: Iterable[NodeFile],
-    *,
-    name: str,
-    file: Path,
-    description: str = "",
-    budgets: Budgets = _NO_BUDGETS,
-) -> Project:
-    """Put a project together again; the order of the parts does not matter."""
-    parts = sorted(node_files, key=lambda part: part.index)
-    connections = {c.index: c for part in parts for c in part.connections}
-    return Project(
-        name=name,
-        nodes=tuple(part.node for part in parts),
-        connections=tuple(connections[index] for index in sorted(connections)),
-        file=file,
-        description=description,
-        budgets=budgets,
-        names=parts[0].names if parts else Names(),
     )
 
 
@@ -169,7 +129,10 @@ def project_to_json(project: Project) -> dict[str, Any]:
 
 
 def translated(node: Node, translate: Callable[[Path], Path]) -> Node:
-    """The node with the paths of its plugin, script and environment translated."""
+    """The node with the paths of its plugin, script and environment translated.
+
+    The file that describes the node is not translated: it is for messages to the user.
+    """
     return replace(
         node,
         plugin=translate(node.plugin),

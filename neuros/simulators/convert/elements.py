@@ -64,6 +64,7 @@ _TAGS_BY_REASON: Mapping[str, str] = {
     "the orientation is always sent": "enable_orientation",
     "MuJoCo's cameras show colours": "depth_camera",
     "MuJoCo takes a mesh as a whole": "submesh",
+    "MuJoCo's actuator has no such setting": "cmd_offset d_gain",
 }
 _REASONS = {tag: reason for reason, tags in _TAGS_BY_REASON.items() for tag in tags.split()}
 
