@@ -1,4 +1,4 @@
-"""What hangs on the links of SDF: geoms of collisions and visuals, sensors, sites and lights.
+"""Parts of SDF links in MuJoCo: geoms of collisions and visuals, sensors, sites and lights.
 
 A sensor becomes a site or camera called ``link/sensor``: a node file names that as the ``element``
 of a sensor. MuJoCo's cameras show colours only; a lidar is a rangefinder per ray.
