@@ -148,7 +148,7 @@ def _may_be_newer(error: SyntaxError, source: bytes) -> bool:
 class _Reader:
     """Reads one plugin.
 
-    A name means what it is bound to where all its bindings, wherever they are, are the same.
+    A name has a meaning where all its bindings, in all scopes, are equal.
     """
 
     def __init__(self, plugin: PluginFile, tree: ast.Module) -> None:
@@ -169,19 +169,17 @@ class _Reader:
         constants = (node.value for node in nodes if isinstance(node, ast.Constant))
         plugin.texts = frozenset(value for value in constants if isinstance(value, str))
         plugin.model_arguments = tuple(self._model_arguments())
-        attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
         plugin.sets_timestep = any(
             node.attr in ("opt", "option")
             or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
-            for node in attributes
+            for node in nodes
+            if isinstance(node, ast.Attribute)
         )
 
     def _read_statements(self) -> None:
         """What is executed in any case when the plugin is imported."""
         lines: dict[str, int] = {}  # of the last hook of each name
-        for statement in (
-            each for each, is_certain in _module_level(self._tree.body) if is_certain
-        ):
+        for statement in self._tree.body:
             if isinstance(statement, ast.ImportFrom):
                 self._check_import(statement)
             if not isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
@@ -240,18 +238,13 @@ class _Reader:
         module, _, name = self._meaning(expression).rpartition(".")
         if module == _HOOKS:
             return name
-        is_forgotten = (
-            isinstance(expression, ast.Name)
-            and expression.id in PUBLIC_NAMES
-            and expression.id not in self._origins
-            and not self._stars
-        )
-        if is_forgotten:
-            assert isinstance(expression, ast.Name)
-            import_ = f"from neuros.hooks import {expression.id}"
-            self._mistake(expression, f"'{expression.id}' is not imported", import_)
-            return expression.id
-        return ""
+        if not isinstance(expression, ast.Name) or self._stars:
+            return ""
+        if expression.id not in PUBLIC_NAMES or expression.id in self._origins:
+            return ""
+        import_ = f"from neuros.hooks import {expression.id}"
+        self._mistake(expression, f"'{expression.id}' is not imported", import_)
+        return expression.id
 
     def _may_have_hooks(self) -> bool:
         """Whether hooks may come from somewhere else."""
@@ -275,7 +268,7 @@ class _Reader:
                 yield self._value(given[0]) if given else ast.Constant(None)
 
     def _value(self, expression: ast.expr) -> ast.expr:
-        """What a name is bound to, once and for all; anything else as it is."""
+        """The value of a name that is bound once; any other expression unchanged."""
         if isinstance(expression, ast.Name):
             name = expression.id
             made = [each for each in self._nodes if getattr(each, "targets", None)]
@@ -308,54 +301,52 @@ class _Reader:
         return name if name in _ARGUMENTS else ""
 
     def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> DeclaredHook:
-        def fail(node: ast.AST, text: str, hint: str = "") -> None:
-            self._mistake(node, f"hook '{function.name}': {text}", hint)
-
+        unknown = DeclaredHook(function.name, None, None)
         if not isinstance(decorator, ast.Call):
-            fail(decorator, f"@{kind} needs parentheses")
-            return DeclaredHook(function.name, None, None)
+            self._fail(function, decorator, f"@{kind} needs parentheses")
+            return unknown
         names, given = _ARGUMENTS[kind], dict[str, ast.expr]()
         is_known = not any(isinstance(each, ast.Starred) for each in decorator.args)
-        if is_known and len(decorator.args) > len(names):
-            takes = ", ".join(names) or "no arguments"
-            fail(decorator, f"@{kind} takes {takes}, but is given {len(decorator.args)}")
-        given |= zip(names, decorator.args, strict=False) if is_known else ()
+        if is_known:
+            given |= zip(names, decorator.args, strict=False)
+            if len(decorator.args) > len(names):
+                takes = ", ".join(names) or "no arguments"
+                text = f"@{kind} takes {takes}, but is given {len(decorator.args)}"
+                self._fail(function, decorator, text)
         for keyword in decorator.keywords:
             if keyword.arg is None:
                 is_known = False
             elif keyword.arg not in names:
-                hint = did_you_mean(keyword.arg, names)
-                fail(keyword.value, f"@{kind} has no argument '{keyword.arg}'", hint)
+                text = f"@{kind} has no argument '{keyword.arg}'"
+                self._fail(function, keyword.value, text, did_you_mean(keyword.arg, names))
             else:
                 given[keyword.arg] = keyword.value
         if not is_known:
-            return DeclaredHook(function.name, None, None)
+            return unknown
         if kind == "neuros_tick":
             self._check_seconds(function, decorator, given.get("seconds"))
-        sides = [
-            self._ports(function, given.get(side), is_input=side == "inputs")
-            for side in ("inputs", "outputs")
-        ]
-        return DeclaredHook(function.name, *sides)
+        inputs = self._ports(function, given.get("inputs"), "input")
+        return DeclaredHook(
+            function.name, inputs, self._ports(function, given.get("outputs"), "output")
+        )
 
     def _check_seconds(
         self, function: _Function, decorator: ast.expr, seconds: ast.expr | None
     ) -> None:
-        who = f"hook '{function.name}'"
         if seconds is None:
-            self._mistake(decorator, f"{who}: @neuros_tick needs seconds", "seconds=0.02")
+            self._fail(function, decorator, "@neuros_tick needs seconds", "seconds=0.02")
             return
         try:
             value = ast.literal_eval(seconds)
         except (TypeError, ValueError):
             return
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self._mistake(seconds, f"{who}: seconds={value!r} is not a number")
+            self._fail(function, seconds, f"seconds={value!r} is not a number")
         elif not (math.isfinite(value) and value > 0):
-            self._mistake(seconds, f"{who}: seconds={value!r} is not a positive time")
+            self._fail(function, seconds, f"seconds={value!r} is not a positive time")
 
     def _ports(
-        self, function: _Function, written: ast.expr | None, *, is_input: bool
+        self, function: _Function, written: ast.expr | None, side: str
     ) -> tuple[DeclaredPort, ...] | None:
         if written is None or (isinstance(written, ast.Constant) and written.value is None):
             return ()
@@ -363,25 +354,19 @@ class _Reader:
             return None  # its keys are the ports
         is_list = isinstance(written, ast.List | ast.Tuple | ast.Set)
         entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
-        ports = [self._port(function, entry, is_input=is_input) for entry in entries]
-        if any(port is None for port in ports):
-            return None
+        ports = [self._port(function, entry, side) for entry in entries]
         found = tuple(port for port in ports if port)
-        if not is_list and any(port.name is None for port in found):
+        if len(found) < len(ports):
+            return None
+        if not is_list and found[0].name is None:
             return None  # it may be a list of ports
-        side, names = "input" if is_input else "output", [port.name for port in found]
-        for port in found:
-            if port.name is not None and names.index(port.name) != found.index(port):
-                self._plugin.mistakes.append(
-                    Remark(
-                        port.line,
-                        port.column,
-                        f"hook '{function.name}': {side} '{port.name}' is named twice",
-                    )
-                )
+        names = [port.name for port in found]
+        for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
+            if name is not None and names.index(name) < index:
+                self._fail(function, entry, f"{side} '{name}' is named twice")
         return found
 
-    def _port(self, function: _Function, entry: ast.expr, *, is_input: bool) -> DeclaredPort | None:
+    def _port(self, function: _Function, entry: ast.expr, side: str) -> DeclaredPort | None:
         """One port; ``None`` where even their number is not known."""
         if isinstance(entry, ast.Starred):
             return None
@@ -394,27 +379,24 @@ class _Reader:
                 break
             wrappers.append(name)
             inner = arguments[0]
-        column = entry.col_offset + 1
-        if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
-            allowed = ((), ("Optional",), ("All",), ("Optional", "All"))
-            if not is_input and "All" in wrappers:
-                text = f"output '{inner.value}' is wrapped in All, which is for inputs only"
-                self._mistake(entry, f"hook '{function.name}': {text}")
-            elif tuple(wrappers) not in allowed:
-                self._not_a_port(function, entry, is_input=is_input)
-            return DeclaredPort(
-                inner.value, entry.lineno, column, "All" in wrappers, "Optional" in wrappers
-            )
-        if isinstance(inner, ast.Constant | ast.Dict | ast.List | ast.Tuple | ast.Set):
-            self._not_a_port(function, entry, is_input=is_input)
-        return DeclaredPort(None, entry.lineno, column)
+        value = inner.value if isinstance(inner, ast.Constant) else None
+        if not isinstance(value, str):
+            if isinstance(inner, ast.Constant | ast.Dict | ast.List | ast.Tuple | ast.Set):
+                self._not_a_port(function, entry, side)
+            return DeclaredPort(None, entry.lineno, entry.col_offset + 1)
+        if side == "output" and "All" in wrappers:
+            text = f"output '{value}' is wrapped in All, which is for inputs only"
+            self._fail(function, entry, text)
+        elif wrappers not in ([], ["Optional"], ["All"], ["Optional", "All"]):
+            self._not_a_port(function, entry, side)
+        return DeclaredPort(
+            value, entry.lineno, entry.col_offset + 1, "All" in wrappers, "Optional" in wrappers
+        )
 
-    def _not_a_port(self, function: _Function, entry: ast.expr, *, is_input: bool) -> None:
+    def _not_a_port(self, function: _Function, entry: ast.expr, side: str) -> None:
         more = ", Optional(name), All(name) or Optional(All(name))"
-        allowed = f"a name{more}" if is_input else "a name or Optional(name)"
-        side = "input" if is_input else "output"
-        text = f"{ast.unparse(entry)} is not an {side}"
-        self._mistake(entry, f"hook '{function.name}': {text}", f"give {allowed}")
+        allowed = f"a name{more}" if side == "input" else "a name or Optional(name)"
+        self._fail(function, entry, f"{ast.unparse(entry)} is not an {side}", f"give {allowed}")
 
     def _check_signature(self, function: _Function, inputs: Sequence[DeclaredPort]) -> None:
         """Whether it can be called with the node and its inputs."""
@@ -436,14 +418,9 @@ class _Reader:
                 function, f"hook '{function.name}' {gets}, but takes ({', '.join(shown)})"
             )
         elif plain[1:] != names and sorted(plain[1:]) == sorted(names) and len(set(names)) > 1:
-            self._plugin.doubts.append(
-                Remark(
-                    function.lineno,
-                    function.col_offset + 1,
-                    f"hook '{function.name}' {gets}, and takes ({', '.join(shown)})",
-                    "packets come in the order of the declaration",
-                )
-            )
+            text = f"hook '{function.name}' {gets}, and takes ({', '.join(shown)})"
+            hint = "packets come in the order of the declaration"
+            self._plugin.doubts.append(_remark(function, text, hint))
 
     def _check_kind_of_function(self, function: _Function) -> None:
         who = f"hook '{function.name}'"
@@ -454,29 +431,21 @@ class _Reader:
             text = f"{who} has 'yield', and would never run"
             self._mistake(function, text, "a hook returns its packets")
 
+    def _fail(self, function: _Function, node: ast.AST, text: str, hint: str = "") -> None:
+        self._mistake(node, f"hook '{function.name}': {text}", hint)
+
     def _mistake(self, node: ast.AST, text: str, hint: str = "") -> None:
-        line, column = getattr(node, "lineno", 1), getattr(node, "col_offset", 0) + 1
-        remark = Remark(line, column, text, hint)
+        remark = _remark(node, text, hint)
         if remark not in self._plugin.mistakes:
             self._plugin.mistakes.append(remark)
 
 
+def _remark(node: ast.AST, text: str, hint: str = "") -> Remark:
+    return Remark(getattr(node, "lineno", 1), getattr(node, "col_offset", 0) + 1, text, hint)
+
+
 def _binds(assignment: ast.Assign, name: str) -> bool:
     return any(isinstance(each, ast.Name) and each.id == name for each in assignment.targets)
-
-
-def _module_level(
-    body: Sequence[ast.stmt], *, is_certain: bool = True
-) -> Iterator[tuple[ast.stmt, bool]]:
-    """Every statement outside of functions and classes, and whether it is executed in any case."""
-    for statement in body:
-        yield statement, is_certain
-        if isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
-            continue
-        for name in ("body", "orelse", "finalbody"):
-            yield from _module_level(getattr(statement, name, ()), is_certain=False)
-        for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
-            yield from _module_level(part.body, is_certain=False)
 
 
 def _own_nodes(function: _Function) -> Iterator[ast.AST]:

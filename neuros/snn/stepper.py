@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any
 
 from neuros.snn.kernel import KernelInUse, import_nest
@@ -95,9 +95,8 @@ class Stepper:
             stepper.advance_s(0.02)
             stepper.advance_to_ns(stamp_ns)
 
-    Time is counted in whole steps of NEST's resolution, as integers: after hours of steps of 20 ms
-    it is where it should be, to the nanosecond. A step that is no whole number of resolutions is an
-    error, before anything is simulated.
+    Time is counted in whole steps of NEST's resolution, as integers, without drift. A step that is
+    no whole number of resolutions is an error, before anything is simulated.
 
     **Steps and delays.** Spikes are exchanged once per shortest delay of the network
     (``min_delay``). Steps of whole delays give the spikes of one long step, bit for bit. A step
@@ -108,7 +107,7 @@ class Stepper:
 
     NEST stays prepared from step to step (``Prepare``, ``Run``, ``Run``, ...). What it refuses
     meanwhile is possible with :meth:`clear` (recorders) and after :meth:`release` (create, connect,
-    ``Simulate``); the next step prepares it again, and the spikes are the same.
+    ``Simulate``); the next step prepares it again, without a change of spikes.
 
     Args:
         strict: refuse steps that are no whole number of ``min_delay``.
@@ -119,9 +118,10 @@ class Stepper:
         self._strict = strict
         self._kernel = KernelInUse()
         self._is_prepared = self._is_closed = self._knows_delays = False
-        self._read_grid()
+        self._look_at_delays()
         # Not from zero: the network may have been simulated before.
-        self._steps = self._grid_steps(float(self._nest.biological_time))
+        time_ns = nanoseconds_of_ms(float(self._nest.biological_time))
+        self._steps = round(time_ns / self._grid.resolution_ns)
 
     @property
     def resolution_ns(self) -> int:
@@ -181,7 +181,9 @@ class Stepper:
                 f"{partial}; the spikes depend on the steps then", PartialDelayWarning, stacklevel=3
             )
         self._knows_delays = True
-        self._prepare()
+        if not self._is_prepared:
+            self._nest.Prepare()
+            self._is_prepared = True
         self._nest.Run(steps * self._grid.resolution_ns / NS_PER_MS)
         self._steps += steps
 
@@ -204,18 +206,8 @@ class Stepper:
     def __enter__(self) -> Stepper:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _prepare(self) -> None:
-        if not self._is_prepared:
-            self._nest.Prepare()
-            self._is_prepared = True
 
     def _clean_up(self) -> None:
         self._kernel.check()
@@ -226,12 +218,6 @@ class Stepper:
     def _look_at_delays(self) -> None:
         # Once, and not at every step: asking NEST takes 0.1 ms.
         if not self._knows_delays:
-            self._read_grid()
-
-    def _read_grid(self) -> None:
-        self._grid = StepGrid(
-            nanoseconds_of_ms(self._nest.resolution), nanoseconds_of_ms(self._nest.min_delay)
-        )
-
-    def _grid_steps(self, time_ms: float) -> int:
-        return round(nanoseconds_of_ms(time_ms) / self._grid.resolution_ns)
+            self._grid = StepGrid(
+                nanoseconds_of_ms(self._nest.resolution), nanoseconds_of_ms(self._nest.min_delay)
+            )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,12 @@ from neuros.project.names import Names
 from neuros.project.qos import Qos
 from neuros.project.resources import Access, Resources
 from neuros.project.split import (
-    merge,
     node_file_from_json,
     node_file_to_json,
     node_files_from_json,
     project_to_json,
     split,
+    translated,
 )
 from neuros.project.validate import schema
 
@@ -135,15 +136,16 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
 
 @settings(max_examples=100)
 @given(projects(), st.randoms())
-def test_merge_undoes_split(project: Project, random: Any) -> None:
+def test_the_parts_make_up_the_project(project: Project, random: Any) -> None:
     parts = list(split(project, folders_for))
     random.shuffle(parts)
-    merged = merge(
-        parts,
-        name=project.name,
-        file=project.file,
-        description=project.description,
-        budgets=project.budgets,
+    parts.sort(key=lambda part: part.index)
+    connections = {c.index: c for part in parts for c in part.connections}
+    merged = replace(
+        project,
+        nodes=tuple(part.node for part in parts),
+        connections=tuple(connections[index] for index in sorted(connections)),
+        names=parts[0].names if parts else Names(),
     )
     assert merged == project
 
@@ -211,11 +213,11 @@ def test_paths_are_translated_to_what_the_node_sees() -> None:
         environment={"MODEL": str(ROOT / "m.xml"), "TEXT": str(ROOT)},
         environment_paths=("MODEL",), file=ROOT / "project.json",
     )  # fmt: skip
-    (part,) = split(Project("p", (node,), (), ROOT / "project.json"), folders_for, translate)
-    assert part.node.plugin == Path("/project/p.py")
-    assert part.node.script == Path("/project/s.sh")
-    assert part.node.environment == {"MODEL": "/project/m.xml", "TEXT": str(ROOT)}
-    assert part.node.file == ROOT / "project.json"
+    seen = translated(node, translate)
+    assert seen.plugin == Path("/project/p.py")
+    assert seen.script == Path("/project/s.sh")
+    assert seen.environment == {"MODEL": "/project/m.xml", "TEXT": str(ROOT)}
+    assert seen.file == ROOT / "project.json"
 
 
 def test_a_connection_from_a_node_to_itself_is_there_once() -> None:

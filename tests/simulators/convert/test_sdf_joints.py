@@ -144,3 +144,12 @@ def test_joint_controllers_become_actuators(folder: Folder) -> None:
 def test_a_controller_of_an_unknown_joint_is_a_problem(folder: Folder) -> None:
     (problem,) = folder.problems(TWO + controller("JointController", ""))
     assert problem.endswith("there is no joint with one axis called 'joint'")
+
+
+def test_what_a_servo_of_mujoco_lacks_is_listed(folder: Folder) -> None:
+    driven = TWO + joint("revolute", "a", "b", "<xyz>0 0 1</xyz>")
+    gains = "<p_gain>1</p_gain><d_gain>2</d_gain><cmd_offset>3</cmd_offset>"
+    notes = folder.notes(driven + controller("JointController", gains))
+    assert {path.rpartition("/")[2] for path in notes} >= {"d_gain", "cmd_offset"}
+    notes = folder.notes(driven + controller("JointPositionController", gains.replace("3", "0")))
+    assert not [path for path in notes if path.endswith(("d_gain", "cmd_offset"))]
