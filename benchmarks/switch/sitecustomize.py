@@ -75,7 +75,7 @@ def without_recording() -> dict[Place, Any]:
     """The event log of the engine, and the packets that are kept."""
     from neuros.engine.engine import Engine
     from neuros.engine.event_log import LoggedEngine
-    from neuros.node.effects import NodeRecorder
+    from neuros.node.instruments import NodeRecorder
 
     events = [name for name in vars(LoggedEngine) if name in vars(Engine)]
     kept = {"__init__", "__doc__", "__module__", "stop_hooks"}

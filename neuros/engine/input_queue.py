@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from neuros.engine.metrics import Rest, State
@@ -66,11 +67,13 @@ class Subscription:
         is_acknowledged: whether the sender waits for acknowledgements.
 
     Attributes:
+        acknowledge: tells the sender a position.
         taken, taken_ns: the position of each packet that a hook has started on, and when that was,
             until the packet log takes these away.
     """
 
     __slots__ = (
+        "acknowledge",
         "acknowledged",
         "capacity",
         "consumed",
@@ -105,6 +108,7 @@ class Subscription:
         self.capacity = capacity
         self.is_lossless = is_lossless
         self.is_acknowledged = is_acknowledged
+        self.acknowledge: Callable[[int], None] = _nowhere
         self.queues: list[InputQueue] = []
         self.received = 0
         self.consumed = 0
@@ -133,7 +137,11 @@ class Subscription:
         return self.received - self.consumed - self.discarded
 
     def put(self, arrival: int, packet: Any) -> None:
-        """Deliver a packet to every taker; raises ``ProtocolError`` if a lossless one is full."""
+        """Deliver a packet to every taker; without takers, acknowledge it.
+
+        Raises:
+            ProtocolError: if the queue of a lossless connection is full.
+        """
         self.received += 1
         for queue in self.queues:
             packets = queue.packets
@@ -144,6 +152,7 @@ class Subscription:
             packets.append((arrival, self.received, packet))
         if not self.queues:
             self._settle()
+            self.acknowledge_taken()
 
     def take(self, queue: InputQueue) -> Any:
         """The oldest packet of ``queue``, whose hook starts on it now."""
@@ -165,6 +174,15 @@ class Subscription:
         self.queues.remove(queue)
         queue.packets.clear()
         self._settle()
+        self.acknowledge_taken()
+
+    def acknowledge_taken(self) -> None:
+        """Tell the sender what every taker has started on, if that has grown."""
+        if self.is_acknowledged:
+            position = self.position_if_taken()
+            if position > self.acknowledged:
+                self.acknowledged = position
+                self.acknowledge(position)
 
     def position_if_taken(self, queue: InputQueue | None = None) -> int:
         """Smallest position over all takers, if ``queue`` had started on its oldest packet."""
@@ -203,6 +221,10 @@ class Subscription:
             else:
                 self.consumed += 1
         self.settled = max(self.settled, front)
+
+
+def _nowhere(position: int) -> None:
+    """Acknowledges on a connection without acknowledgements."""
 
 
 class HookInput:

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
-from neuros.transport.copying import copy_packet, make_packet
+from neuros.transport.copying import RosPackets
 from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import decode, encode, message_class
-from neuros.transport.values import checker
+from neuros.transport.messages import decode, encode
 
 Event = Callable[[], None]
 _LEVELS = {
@@ -243,10 +242,6 @@ class Topics:
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
         """There are no other listeners."""
 
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return make_packet(type_name)
-
     def close(self) -> None:
         """Take nothing any more."""
         self.inbox = None
@@ -258,7 +253,8 @@ class Workbench:
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
         self.loop = loop
         self.topics = topics
-        self.hub = MemoryHub(loop, copy_packet)
+        self.packets = RosPackets()
+        self.hub = MemoryHub(loop, self.packets.copy)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 
@@ -293,22 +289,6 @@ class Workbench:
     ) -> Voice:
         """There are no peers. Raises ``NotImplementedError``."""
         raise NotImplementedError("a plugin under test runs in one part")
-
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
-        return decode(encode(packet))
-
-    def encode(self, packet: Any) -> bytes:
-        """A packet as ROS serialises it."""
-        return encode(packet)[1]
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation."""
-        return message_class(type_name)
-
-    def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
-        return checker(kind)
 
     def take_in(self) -> None:
         """Nothing arrives by itself."""

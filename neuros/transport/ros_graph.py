@@ -30,7 +30,6 @@ from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
 from neuros.transport.codecs import message_codec
-from neuros.transport.copying import make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
@@ -155,10 +154,6 @@ class RosGraphBridge:
     def send_external(self, port: Port, packet: Any) -> None:
         """Publish on the external topic of an output."""
         self._external.send(port, packet)
-
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return make_packet(type_name)
 
     def close(self) -> None:
         """Publish and receive nothing any more."""

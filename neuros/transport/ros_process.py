@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import rclpy
 from rclpy.node import Node as RosNode
@@ -13,8 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.transport.codecs import message_codec
-from neuros.transport.copying import copy_packet
+from neuros.transport.copying import RosPackets
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.lean_node import (
@@ -25,13 +23,11 @@ from neuros.transport.lean_node import (
     without_spinning,
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import message_class
 from neuros.transport.peer_topics import PeerVoice
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.teardown import give_up
-from neuros.transport.values import checker
 
 _LINGER_S = 0.05
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
@@ -75,11 +71,12 @@ class RosProcess:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._loop = RosLoop(self._context, on_failure)
+        self.packets = RosPackets()
         self._has_digests = digests
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
-        self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
+        self._hub = MemoryHub(self._loop, self.packets.copy) if in_memory else None
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
@@ -136,23 +133,6 @@ class RosProcess:
         """Speak for nodes of this process, and listen to nodes that another launcher starts."""
         namespace = self._files[0].names.namespace
         return PeerVoice(names, elsewhere, self._context, heard, namespace)
-
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
-        return copy_packet(packet)
-
-    def encode(self, packet: Any) -> bytes:
-        """A packet as ROS serialises it."""
-        kind: type = type(packet)
-        return message_codec(kind).encode(packet)
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation."""
-        return message_class(type_name)
-
-    def checker(self, kind: type) -> Callable[[Any], Any]:
-        """The function that checks packets of a class before they are sent."""
-        return checker(kind)
 
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
