@@ -370,7 +370,10 @@ class Engine:
             if isinstance(hook, Source):
                 result: Any = hook.take()
             else:
-                result = self._effects.call(hook, self._take(hook, start_ns))
+                arguments = []
+                for hook_input in hook.inputs:
+                    arguments.append(hook_input.take(start_ns))
+                result = self._effects.call(hook, arguments)
         finally:
             self.executing = None
             end_ns = self._clock()
@@ -386,15 +389,6 @@ class Engine:
         elif hook.spec.kind is HookKind.INITIALISE:
             self._retire(hook)
             self._lifecycle.finish_initialiser(hook)
-
-    def _take(self, hook: Hook, now_ns: int) -> list[Any]:
-        """The arguments of a hook that starts now; acknowledges the packets."""
-        touched: list[Subscription] = []
-        arguments = [hook_input.take(touched) for hook_input in hook.inputs]
-        for subscription in touched:
-            subscription.taken_ns.append(now_ns)
-            subscription.acknowledge_taken()
-        return arguments
 
     def _retire(self, hook: Hook) -> None:
         """Remove the input queues of a hook that will never run again."""

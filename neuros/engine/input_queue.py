@@ -154,19 +154,21 @@ class Subscription:
             self._settle()
             self.acknowledge_taken()
 
-    def take(self, queue: InputQueue) -> Any:
-        """The oldest packet of ``queue``, whose hook starts on it now."""
+    def take(self, queue: InputQueue, now_ns: int) -> Any:
+        """The oldest packet of ``queue``, whose hook starts on it now; it is acknowledged."""
         _, position, packet = queue.packets.popleft()
         if not queue.packets:
             queue.hook_input.on_emptied()
         queue.position = queue.passed = position
         self.taken.append(position)
+        self.taken_ns.append(now_ns)
         queue.discards_in_a_row = 0
         if len(self.queues) == 1:
             self.settled = position
             self.consumed += 1
         else:
             self._settle()
+        self.acknowledge_taken()
         return packet
 
     def remove(self, queue: InputQueue) -> None:
@@ -298,19 +300,9 @@ class HookInput:
         """Whether a start of the hook now would take from ``queue``."""
         return bool(queue.packets) and (self.is_all or self.chosen() is queue)
 
-    def take(self, touched: list[Subscription]) -> Any:
-        """The argument for the hook; appends the subscriptions that a packet was taken from."""
+    def take(self, now_ns: int) -> Any:
+        """The argument for the hook, which starts now."""
         if not self.is_all:
             queue = self.chosen()
-            if queue is None:
-                return None
-            touched.append(queue.subscription)
-            return queue.subscription.take(queue)
-        taken = []
-        for queue in self.queues:
-            if queue.packets:
-                touched.append(queue.subscription)
-                taken.append(queue.subscription.take(queue))
-            else:
-                taken.append(None)
-        return taken
+            return None if queue is None else queue.subscription.take(queue, now_ns)
+        return [q.subscription.take(q, now_ns) if q.packets else None for q in self.queues]

@@ -68,32 +68,41 @@ class NodeEffects:
         return tap
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
-        """Run a hook in the context of its node."""
+        """Run a hook in the context of its node.
+
+        Raises:
+            HookError: if it raises any exception.
+        """
         self._enter()
         if not self.has_run:
             self.has_run = True
             self._on_first_hook()
-        result = self.run(hook.spec, arguments)
+        spec = hook.spec
+        try:
+            result = spec.function(self._handle, *arguments)
+        except HookError:
+            raise
+        except BaseException as error:
+            raise _hook_error(spec, error) from error
         self._note_execution()
-        if hook.spec.kind is HookKind.INITIALISE:
+        if spec.kind is HookKind.INITIALISE:
             self._on_initialised()
         if self._time.is_watched:
             self._time.look()
         return result
 
-    def run(self, spec: HookSpec, arguments: Sequence[Any] = ()) -> Any:
-        """Run the function of a hook.
+    def finalise(self, spec: HookSpec) -> None:
+        """Run a finalise hook.
 
         Raises:
             HookError: if it raises any exception.
         """
         try:
-            return spec.function(self._handle, *arguments)
+            spec.function(self._handle)
         except HookError:
             raise
         except BaseException as error:
-            where = last_line(error, spec.where)
-            raise HookError(describe(error), hook=spec.name, where=where) from error
+            raise _hook_error(spec, error) from error
 
     def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None] | None:
         """Return what sends packets of an output, and shows them to the instruments."""
@@ -130,3 +139,7 @@ class NodeEffects:
         for observe in tap.observers:
             observe(packet, None)
         return self._copy(packet)
+
+
+def _hook_error(spec: HookSpec, error: BaseException) -> HookError:
+    return HookError(describe(error), hook=spec.name, where=last_line(error, spec.where))

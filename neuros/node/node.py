@@ -203,7 +203,7 @@ class NodeRuntime:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
                     self._tell("finalising", node=self.name, hook=spec.name)
-                    self._guard(partial(self._effects.run, spec))
+                    self._guard(partial(self._effects.finalise, spec))
         self._tell("finalising", node=self.name, hook="")
         if self._recorder is not None:
             self._recorder.close()
