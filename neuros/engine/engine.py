@@ -17,10 +17,9 @@ from typing import Any, Protocol
 
 from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
-from neuros.engine.lifecycle import Lifecycle, Pause, drives
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
 from neuros.engine.node_ports import NodePorts, Output, PacketType, Send, undeclared
-from neuros.engine.schedule import ExecutionLog, Schedule
+from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule, drives
 from neuros.engine.send_window import SendWindow
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
@@ -210,7 +209,7 @@ class Engine:
         """While paused, let each hook that starts unasked do so ``count`` times more.
 
         The others answer what they receive; where nothing drives the project (``is_driven`` is
-        false), each hook starts so many times. See :class:`~neuros.engine.lifecycle.Pause`.
+        false), each hook starts so many times. See :class:`~neuros.engine.schedule.Pause`.
         """
         self._wake()
         self._pause.grant(count, is_driven=is_driven)

@@ -1,17 +1,31 @@
-"""The middleware of a process: the ROS context, loop and transports that its nodes share."""
+"""The middleware of a process: ROS context, loop and transports of its nodes; topics of peers."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import rclpy
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node as RosNode
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSLivelinessPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
 from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
+from neuros.project.names import INTERNAL
 from neuros.transport.copying import RosPackets
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
@@ -23,13 +37,20 @@ from neuros.transport.lean_node import (
     without_spinning,
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.peer_topics import PeerVoice
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.teardown import give_up
 
 _LINGER_S = 0.05
+LEASE_S = 3.0
+"""A node elsewhere that has given no sign of life for this long is gone."""
+
+# ROS has DDS announce life after two thirds of the lease that a writer offers: here, every 0.4 s,
+# so that seven announcements in a row have to be lost before a node passes for gone.
+_OFFERED_S = 0.6
+_HEARD_S = 0.5
+
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
 # up the 5 s that they have, some of them blocked inside DDS; up to 17 take a fraction of a second.
 _CROWD = 16
@@ -173,3 +194,97 @@ def _entities(ros_node: RosNode) -> set[int]:
     return {id(entity) for group in groups for entity in group} | {
         id(waitable) for waitable in ros_node.waitables
     }
+
+
+# ---------------------------------------------------------------------- peers
+
+
+class PeerVoice:
+    """Speaks for nodes of this process, and listens to nodes elsewhere, in a thread of its own.
+
+    The nodes of a launcher publish its state (:class:`neuros.launcher.peers.PeerState`), each on a
+    topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
+    ``std_msgs/msg/String``, so that the last state also reaches who comes later. That a node goes
+    on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no
+    Python: a plugin that holds its global lock for seconds does not pass for dead.
+
+    Args:
+        names: the nodes of this process.
+        elsewhere: nodes that other launchers start.
+        heard: called from the thread with a node elsewhere and its launcher's state, or
+            ``None`` when it is gone.
+        namespace: that of the project.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        context: Context,
+        heard: Callable[[str, str | None], None],
+        namespace: str = "",
+    ) -> None:
+        self._heard = heard
+        self._ros_node = RosNode(
+            f"_{names[0]}_side",  # a hidden one: tools do not list it unless they are asked to
+            context=context,
+            namespace=namespace,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._publishers = [
+            self._ros_node.create_publisher(String, _topic(namespace, name), _qos(_OFFERED_S))
+            for name in names
+        ]
+        for name in elsewhere:
+            self._ros_node.create_subscription(
+                String,
+                _topic(namespace, name),
+                partial(self._hear, name),
+                _qos(LEASE_S),
+                event_callbacks=SubscriptionEventCallbacks(
+                    liveliness=partial(self._count, name), use_default_callbacks=False
+                ),
+            )
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._ros_node)
+        self._thread = threading.Thread(target=self._listen, name="neuros-side", daemon=True)
+        self._thread.start()
+
+    def say(self, text: str) -> None:
+        """Let it be heard elsewhere, also by who comes later. Any thread."""
+        for publisher in self._publishers:
+            publisher.publish(String(data=text))
+
+    def close(self) -> None:
+        """Let the last state arrive, then be silent."""
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
+        self._executor.shutdown(_HEARD_S)
+        self._thread.join(_HEARD_S)
+        self._ros_node.destroy_node()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):  # the process has given up ROS
+            self._executor.spin()
+
+    def _hear(self, name: str, message: String) -> None:
+        self._heard(name, message.data)
+
+    def _count(self, name: str, life: QoSLivelinessChangedInfo) -> None:
+        if life.alive_count_change < 0 or life.not_alive_count_change > 0:
+            self._heard(name, None)
+
+
+def _topic(namespace: str, name: str) -> str:
+    return f"{namespace}{INTERNAL}{name}/side"
+
+
+def _qos(lease_s: float) -> QoSProfile:
+    return QoSProfile(
+        depth=1,
+        reliability=QoSReliabilityPolicy.RELIABLE,
+        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+        liveliness=QoSLivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Duration(seconds=lease_s),
+    )
