@@ -18,15 +18,15 @@ from typing import Any, Protocol
 from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
-from neuros.engine.node_ports import NodePorts, Output, PacketType, Send, undeclared
+from neuros.engine.node_ports import Links, NodePorts, Output, PacketType, undeclared
 from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule, drives
 from neuros.engine.send_window import SendWindow
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
-from neuros.project.model import Connection, Node, Port
+from neuros.project.model import Connection, Node
 
 
-class Effects(Protocol):
+class Effects(Links, Protocol):
     """The only way out of an engine: its calls are all that the engine does to the world."""
 
     def has_taken_in(self) -> bool:
@@ -37,16 +37,6 @@ class Effects(Protocol):
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook of the plugin; raises ``HookError``."""
-
-    def sender(self, port: Port, connections: Sequence[Connection]) -> Send | None:
-        """The function that sends packets of an output on its connections to other nodes.
-
-        Of an output with an external topic, the one that publishes there; ``None`` if the packets
-        go nowhere.
-        """
-
-    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """The function that tells the sender of a connection from another node a position."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Have a delivery to the node itself handled after all events that already wait."""

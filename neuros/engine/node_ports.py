@@ -17,10 +17,17 @@ Send: TypeAlias = Callable[[Any], object]
 
 
 class Links(Protocol):
-    """The ways out of a node; see :class:`neuros.engine.engine.Effects`."""
+    """The ways out of a node: one function per output, and one per connection to the node."""
 
-    def sender(self, port: Port, connections: Sequence[Connection]) -> Send | None: ...
-    def acknowledger(self, connection: Connection) -> Callable[[int], None]: ...
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Send | None:
+        """The function that sends packets of an output on its connections to other nodes.
+
+        Of an output with an external topic, the one that publishes there; ``None`` if the packets
+        go nowhere.
+        """
+
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        """The function that tells the sender of a connection from another node a position."""
 
 
 class PacketType(NamedTuple):
