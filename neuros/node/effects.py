@@ -123,15 +123,12 @@ class NodeEffects:
         return send
 
     def post(self, event: Callable[[], None]) -> None:
-        """Queue a delivery of the node to itself."""
         self._loop.post(partial(self._guard, event))
 
     def post_loop_back(self, event: Callable[[], None]) -> None:
-        """Queue the loop-back."""
         self._loop.post_loop_back(partial(self._guard, event))
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
-        """A copy for a connection of the node to itself; it shares nothing with this packet."""
         tap = self._taps_to_itself.get(connection)
         if tap is None:
             port = self._handle.description.output(connection.source_output)

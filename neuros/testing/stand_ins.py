@@ -9,12 +9,13 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox, Transport, Voice
+from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.transport.copying import RosPackets
 from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import decode, encode
+from neuros.transport.null_middleware import WithoutPeers
 
 Event = Callable[[], None]
 _LEVELS = {
@@ -247,7 +248,7 @@ class Topics:
         self.inbox = None
 
 
-class Workbench:
+class Workbench(WithoutPeers):
     """The middleware of one node under test (:class:`neuros.ports.Middleware`)."""
 
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
@@ -268,30 +269,6 @@ class Workbench:
     def ros_node(self, file: NodeFile) -> RosNodeStandIn:
         """A stand-in."""
         return self._ros_nodes[file.node.name]
-
-    def mark_own_entities(
-        self,
-        file: NodeFile,
-        enter: Callable[[], None],
-        fail: Callable[[Any, BaseException], None],
-    ) -> None:
-        """There are none."""
-
-    def has_foreign_entities(self, file: NodeFile) -> bool:
-        """A plugin cannot create any here."""
-        return False
-
-    def join_peers(
-        self,
-        names: Sequence[str],
-        elsewhere: Sequence[str],
-        heard: Callable[[str, str | None], None],
-    ) -> Voice:
-        """There are no peers. Raises ``NotImplementedError``."""
-        raise NotImplementedError("a plugin under test runs in one part")
-
-    def take_in(self) -> None:
-        """Nothing arrives by itself."""
 
     def close(self) -> None:
         """Nothing to give up."""

@@ -78,7 +78,7 @@ class MemoryHub:
 
 
 class MemoryTransport:
-    """Carries the packets of one node to the others in its process.
+    """Carries packets to the other nodes of the process (:class:`neuros.ports.Transport`).
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
     serialised for one, which is not done here otherwise. Once it gives ``None``, none are kept any
@@ -136,7 +136,6 @@ class MemoryTransport:
         return send
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         self._bridge.send_external(port, packet)
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
@@ -155,11 +154,9 @@ class MemoryTransport:
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        """Whether all has arrived that was on its way when the last hook of the node ended."""
         return self._arrivals.arrived >= self._arrivals.first and self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose other end has not joined yet."""
         joined = self._hub.inboxes
         return [
             c

@@ -98,29 +98,8 @@ def _nowhere(_: object) -> None:
     """Carries a packet, or an acknowledgement."""
 
 
-class NullMiddleware:
-    """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
-
-    def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
-        self.loop = loop
-        self.packets = RosPackets()
-        self._context = rclpy.Context()
-        rclpy.init(
-            args=["--ros-args", "--disable-external-lib-logs"],
-            context=self._context,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._ros_node = lean_node(file, self._context)
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
-
-    def transport(self, file: NodeFile) -> _NullTransport:
-        """One that carries nothing."""
-        return _NullTransport()
-
-    def ros_node(self, file: NodeFile) -> Any:
-        """The ROS node."""
-        return self._ros_node
+class WithoutPeers:
+    """The part of a middleware that a node without peers and without callbacks does not need."""
 
     def mark_own_entities(
         self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
@@ -142,6 +121,29 @@ class NullMiddleware:
 
     def take_in(self) -> None:
         """Nothing arrives by itself."""
+
+
+class NullMiddleware(WithoutPeers):
+    """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
+
+    def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
+        self.loop = loop
+        self.packets = RosPackets()
+        self._context = rclpy.Context()
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs"],
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._ros_node = lean_node(file, self._context)
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
+
+    def transport(self, file: NodeFile) -> _NullTransport:
+        return _NullTransport()
+
+    def ros_node(self, file: NodeFile) -> Any:
+        return self._ros_node
 
     def close(self) -> None:
         """Give up ROS."""

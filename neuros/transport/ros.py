@@ -107,7 +107,7 @@ _CONFIRMED = "confirmed"
 
 
 class RosTransport:
-    """Carries the packets of one node over ROS topics."""
+    """Carries the packets of one node over ROS topics (:class:`neuros.ports.Transport`)."""
 
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
         self._node = file.node
@@ -167,7 +167,6 @@ class RosTransport:
         return send
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         if self._is_open:
             self._external.send(port, packet)
 
@@ -182,15 +181,12 @@ class RosTransport:
         return acknowledge_if_open
 
     def note_execution(self) -> None:
-        """A hook has ended."""
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        """Whether all that had reached this node when the last hook ended has been handled."""
         return self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose other end has not been found yet."""
         return [each.connection for each in self._registrations if not each.is_done]
 
     def close(self) -> None:

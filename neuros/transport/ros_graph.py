@@ -71,7 +71,6 @@ class ExternalTopics:
             _check_silence(self._ros_node, heard, self._loop)
 
     def send(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         if self._is_open:
             self._publishers[port.name].publish(packet)
 
@@ -152,11 +151,9 @@ class RosGraphBridge:
                 self._publishers[connection].publish(packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         self._external.send(port, packet)
 
     def close(self) -> None:
-        """Publish and receive nothing any more."""
         self.heard = frozenset()
         self._external.close()
 

@@ -57,7 +57,7 @@ _CROWD = 16
 
 
 class RosProcess:
-    """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
+    """The :class:`neuros.ports.Middleware` of one node, or (``in_memory``) of all of a project.
 
     ``digests``: in memory, too, where a packet is serialised only for that; where all connections
     are lossless they are kept unasked, if that is cheap. ``record``: at least those that tell which
@@ -107,11 +107,9 @@ class RosProcess:
 
     @property
     def loop(self) -> RosLoop:
-        """The event loop of the process."""
         return self._loop
 
     def transport(self, file: NodeFile) -> Transport:
-        """The transport of one node; creates its ROS node."""
         ros_node = lean_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
@@ -131,7 +129,6 @@ class RosProcess:
         return transport
 
     def ros_node(self, file: NodeFile) -> LeanNode:
-        """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
     def mark_own_entities(self, file: NodeFile, enter: Callable[[], None], fail: Fail) -> None:
@@ -141,7 +138,6 @@ class RosProcess:
         self._callbacks.append(PluginCallbacks(ros_node, self._loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
-        """Whether a plugin has created something on its ROS node that may call back."""
         own = self._own_entities.get(file.node.name, set())
         return not _entities(self.ros_node(file)) <= own
 
@@ -151,7 +147,6 @@ class RosProcess:
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
     ) -> PeerVoice:
-        """Speak for nodes of this process, and listen to nodes that another launcher starts."""
         namespace = self._files[0].names.namespace
         return PeerVoice(names, elsewhere, self._context, heard, namespace)
 
