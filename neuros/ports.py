@@ -18,6 +18,9 @@ from neuros.project.model import Connection, Node, NodeFile, Port
 Packet: TypeAlias = Any
 """One ROS message."""
 
+HookFunction: TypeAlias = "Callable[..., Any]"
+"""A hook of a plugin: gets the node and its inputs, returns packets."""
+
 
 class Logger(Protocol):
     """The log of a node: rclpy's logger, or one with these methods."""
@@ -50,24 +53,20 @@ class Transport(Protocol):
     def open(self, inbox: Inbox) -> None:
         """Create the endpoints and begin to announce this node to its neighbours."""
 
-    def note_result(self, box: Sequence[Any]) -> None:
-        """Look at what a hook has returned before it is sent.
+    def watched(self, function: HookFunction) -> HookFunction:
+        """The function to call in place of a hook, if the transport looks at what that returns."""
 
-        It is the only element of ``box``, which is all that NeuROS holds of it: so one can tell
-        whether the plugin has kept a reference.
-        """
+    def sender(self, connections: Sequence[Connection]) -> Callable[[Packet], bytes | None]:
+        """The function that sends a packet on all these connections of one output.
 
-    def send(self, connections: Sequence[Connection], packet: Packet) -> bytes | None:
-        """Send one packet on all these connections of one output.
-
-        Returns the serialised packet if that had to be made, so that it is made once.
+        It returns the serialised packet if that had to be made, so that it is made once.
         """
 
     def send_external(self, port: Port, packet: Packet) -> None:
         """Publish on the external topic of an output."""
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender that every taker has started on the packets up to ``position``."""
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        """The function that tells the sender up to which position every taker has started."""
 
     @property
     def digests(self) -> Mapping[Connection, array[int]]:
@@ -85,11 +84,30 @@ class Transport(Protocol):
     def waiting_for(self) -> Sequence[Connection]:
         """Connections whose other end has not been found yet."""
 
-    def make_packet(self, type_name: str) -> Packet:
-        """A new message with default values, for a type in ROS notation."""
-
     def close(self) -> None:
         """Give up all endpoints; further calls have no effect."""
+
+
+class Packets(Protocol):
+    """Operations on packets, for each message class worked out once."""
+
+    def message_class(self, type_name: str) -> type:
+        """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
+
+    def make(self, type_name: str) -> Packet:
+        """A new message with default values, for a type in ROS notation."""
+
+    def checker(self, kind: type) -> Callable[[Packet], Packet]:
+        """A check for packets of a class before they are sent.
+
+        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
+        """
+
+    def copy(self, packet: Packet) -> Packet:
+        """A packet that shares nothing with this one, which has been checked."""
+
+    def encode(self, packet: Packet) -> bytes:
+        """A packet as ROS serialises it."""
 
 
 class Way(str, Enum):
@@ -169,6 +187,9 @@ class Middleware(Protocol):
     @property
     def loop(self) -> EventLoop: ...
 
+    @property
+    def packets(self) -> Packets: ...
+
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
 
@@ -199,21 +220,6 @@ class Middleware(Protocol):
         """Speak for the nodes ``names`` of this process, and listen to nodes elsewhere.
 
         ``heard`` is called from any thread, with a node and its state, or ``None`` when it is gone.
-        """
-
-    def copy(self, packet: Packet) -> Packet:
-        """A packet that shares nothing with this one."""
-
-    def encode(self, packet: Packet) -> bytes:
-        """A packet as ROS serialises it."""
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
-
-    def checker(self, kind: type) -> Callable[[Packet], Packet]:
-        """A check for packets of a class before they are sent.
-
-        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
         """
 
     def take_in(self) -> None:

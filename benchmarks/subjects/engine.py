@@ -58,15 +58,21 @@ class Surroundings:
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         return hook.spec.function(self, *arguments)
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None: ...
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        return _nowhere
+
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        return _nowhere
+
     def has_taken_in(self) -> bool:
         return True
 
-    def send_external(self, port: Port, packet: Any) -> None: ...
-    def acknowledge(self, connection: Connection, position: int) -> None: ...
-
     def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet
+
+
+def _nowhere(_: object) -> None:
+    """Where all goes that the engine sends."""
 
 
 def loop_back_us(count: int) -> float:

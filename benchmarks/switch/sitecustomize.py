@@ -62,8 +62,9 @@ def without_ledger() -> dict[Place, Any]:
         (Engine, "_run"): rewritten(
             Engine._run, {**no_clock, "self.spent_ns[": "", "hook.busy_ns +=": ""}
         ),
-        (Engine, "_take"): rewritten(Engine._take, {"subscription.taken_ns.append": ""}),
-        (Subscription, "take"): rewritten(Subscription.take, {"self.taken.append": ""}),
+        (Subscription, "take"): rewritten(
+            Subscription.take, {"self.taken.append": "", "self.taken_ns.append": ""}
+        ),
         (SendWindow, "spend"): rewritten(SendWindow.spend, {"self.sent_ns.append": ""}),
         (SimulatedTime, "look"): rewritten(SimulatedTime.look, {"self._timeline.note": ""}),
         (MemoryTransport, "_note_digest"): nothing,
@@ -75,7 +76,7 @@ def without_recording() -> dict[Place, Any]:
     """The event log of the engine, and the packets that are kept."""
     from neuros.engine.engine import Engine
     from neuros.engine.event_log import LoggedEngine
-    from neuros.node.effects import NodeRecorder
+    from neuros.node.instruments import NodeRecorder
 
     events = [name for name in vars(LoggedEngine) if name in vars(Engine)]
     kept = {"__init__", "__doc__", "__module__", "stop_hooks"}

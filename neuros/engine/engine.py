@@ -17,16 +17,16 @@ from typing import Any, Protocol
 
 from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
-from neuros.engine.lifecycle import Lifecycle, Pause, drives
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
-from neuros.engine.node_ports import NodePorts, Output, PacketType, undeclared
-from neuros.engine.schedule import ExecutionLog, Schedule
+from neuros.engine.node_ports import Links, NodePorts, Output, PacketType, undeclared
+from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule, drives
+from neuros.engine.send_window import SendWindow
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
-from neuros.project.model import Connection, Node, Port
+from neuros.project.model import Connection, Node
 
 
-class Effects(Protocol):
+class Effects(Links, Protocol):
     """The only way out of an engine: its calls are all that the engine does to the world."""
 
     def has_taken_in(self) -> bool:
@@ -37,15 +37,6 @@ class Effects(Protocol):
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook of the plugin; raises ``HookError``."""
-
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Send on these connections, which lead to other nodes."""
-
-    def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on an external topic."""
-
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender of a connection from another node."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Have a delivery to the node itself handled after all events that already wait."""
@@ -91,9 +82,12 @@ class Engine:
         self._effects = effects
         self._has_taken_in = effects.has_taken_in
         self._clock = clock
-        ports = NodePorts(node, connections, packet_types or {})
+        ports = NodePorts(node, connections, packet_types or {}, effects)
         self.subscriptions, self.send_windows = ports.subscriptions, ports.send_windows
         self.outputs = ports.outputs
+        for connection, window in self.send_windows.items():
+            if connection in self.subscriptions:  # the node's to itself
+                self.subscriptions[connection].acknowledge = self._crediting(window)
         self._arrivals = 0
         self._to_itself = 0  # packets of the node for itself that are on their way
         self._schedule = Schedule()
@@ -130,9 +124,6 @@ class Engine:
         subscription = self.subscriptions[key]
         self._arrivals += 1
         subscription.put(self._arrivals, packet)
-        if not subscription.queues:
-            self._acknowledge(subscription)
-        del packet  # a hook that sends it on would share it while this holds it
         self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
@@ -208,7 +199,7 @@ class Engine:
         """While paused, let each hook that starts unasked do so ``count`` times more.
 
         The others answer what they receive; where nothing drives the project (``is_driven`` is
-        false), each hook starts so many times. See :class:`~neuros.engine.lifecycle.Pause`.
+        false), each hook starts so many times. See :class:`~neuros.engine.schedule.Pause`.
         """
         self._wake()
         self._pause.grant(count, is_driven=is_driven)
@@ -368,7 +359,10 @@ class Engine:
             if isinstance(hook, Source):
                 result: Any = hook.take()
             else:
-                result = self._effects.call(hook, self._take(hook, start_ns))
+                arguments = []
+                for hook_input in hook.inputs:
+                    arguments.append(hook_input.take(start_ns))
+                result = self._effects.call(hook, arguments)
         finally:
             self.executing = None
             end_ns = self._clock()
@@ -385,33 +379,20 @@ class Engine:
             self._retire(hook)
             self._lifecycle.finish_initialiser(hook)
 
-    def _take(self, hook: Hook, now_ns: int) -> list[Any]:
-        """The arguments of a hook that starts now; acknowledges the packets."""
-        touched: list[Subscription] = []
-        arguments = [hook_input.take(touched) for hook_input in hook.inputs]
-        for subscription in touched:
-            subscription.taken_ns.append(now_ns)
-            self._acknowledge(subscription)
-        return arguments
-
     def _retire(self, hook: Hook) -> None:
         """Remove the input queues of a hook that will never run again."""
         for hook_input in hook.inputs:
             for queue in hook_input.queues:
                 queue.subscription.remove(queue)
-                self._acknowledge(queue.subscription)
 
     def _send(self, output: Output, packet: Any, now_ns: int) -> None:
         """Send a packet now on all connections of an output, or on its external topic."""
-        if output.port.external_topic is not None:
-            self._effects.send_external(output.port, packet)
-            return
         for window in output.windows:
             window.spend(now_ns)
         for connection in output.to_itself:
             self._send_to_itself(connection, packet)
-        if output.elsewhere:
-            self._effects.send(output.elsewhere, packet)
+        if output.send is not None:
+            output.send(packet)
 
     def _send_to_itself(self, connection: Connection, packet: Any) -> None:
         own = self._effects.copy_to_itself(connection, packet)
@@ -423,18 +404,8 @@ class Engine:
 
         self._effects.post(arrive)
 
-    def _acknowledge(self, subscription: Subscription) -> None:
-        if not subscription.is_acknowledged:
-            return
-        position = subscription.position_if_taken()
-        if position <= subscription.acknowledged:
-            return
-        subscription.acknowledged = position
-        connection: Any = subscription.key  # external topics are not acknowledged
-        if connection.source_node == self.node.name:
-            self.send_windows[connection].credit(position, self._clock())
-        else:
-            self._effects.acknowledge(connection, position)
+    def _crediting(self, window: SendWindow) -> Callable[[int], None]:
+        return lambda position: window.credit(position, self._clock())
 
     def _add_source(self, names: tuple[str, ...]) -> Source:
         for name in names:

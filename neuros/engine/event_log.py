@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from neuros.engine.engine import Engine
+from neuros.engine.engine import Effects, Engine
 from neuros.engine.hook import Hook
-from neuros.hooks import HookKind
-from neuros.project.model import Connection
+from neuros.engine.node_ports import PacketType
+from neuros.hooks import HookKind, HookSpec
+from neuros.project.model import Connection, Node
 
 _KIND_BITS, _PLACE_BITS = 5, 20
 _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
@@ -63,13 +64,20 @@ class LoggedEngine(Engine):
     Its arguments are those of :class:`Engine`.
     """
 
-    def __init__(self, *arguments: Any) -> None:
-        node, connections, specs, effects, clock, types = arguments
+    def __init__(
+        self,
+        node: Node,
+        connections: Sequence[Connection],
+        specs: Sequence[HookSpec],
+        effects: Effects,
+        clock: Callable[[], int],
+        packet_types: Mapping[str, PacketType] | None = None,
+    ) -> None:
         self.event_log = array("q")
         self._note = self.event_log.append
         has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
         own_clock = self._noting(clock) if has_ticks else clock
-        super().__init__(node, connections, specs, effects, own_clock, types)
+        super().__init__(node, connections, specs, effects, own_clock, packet_types)
         self._has_taken_in = self._noting_deferral(effects.has_taken_in)
         self._starts = 0
         self._hook_entries = {

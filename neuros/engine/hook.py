@@ -174,18 +174,15 @@ class Hook:
         """
         results = self._results
         if len(results) == 1 and result is not None and not isinstance(result, _SEVERAL):
-            output = results[0][0]  # one packet, as most hooks return: the rest takes a microsecond
-            return ((output, self._checked(output, result)),)
-        if not results:
+            packets: Sequence[Any] = (result,)  # as most hooks return
+        elif not results:
             if result is not None:
                 raise self.error(f"returned {_kind(result)}, but declares no outputs")
             return ()
-        if result is None:
-            packets: Sequence[Any] = (None,) * len(results)
-        elif isinstance(result, _SEVERAL):
-            packets = result
+        elif result is None:
+            packets = (None,) * len(results)
         else:
-            packets = (result,)
+            packets = result if isinstance(result, _SEVERAL) else (result,)
         if len(packets) != len(results):
             names = ", ".join(output.port.name for output in self.outputs)
             raise self.error(
@@ -193,35 +190,33 @@ class Hook:
                 f" {_count(len(results), 'output')} ({names})"
             )
         found = []
-        for (output, is_optional), packet in zip(results, packets, strict=True):
+        for (output, is_optional), packet in zip(results, packets):  # noqa: B905, it costs time
             if packet is None:
                 if not is_optional:
                     raise self.error(
                         f"returned no packet for output '{output.port.name}': return one, or"
                         f' declare it as Optional("{output.port.name}")'
                     )
-            else:
-                found.append((output, self._checked(output, packet)))
+                continue
+            wanted = output.packet_type
+            if wanted is None:
+                found.append((output, packet))
+                continue
+            if not isinstance(packet, wanted.kind):
+                raise self.error(
+                    f"returned {_kind(packet)} for output '{output.port.name}', which carries"
+                    f' {output.port.type}: use node.make_packet("{output.port.name}")'
+                )
+            try:
+                found.append((output, wanted.check(packet)))
+            except WrongValue as error:
+                text = f"packet for output '{output.port.name}': {error}"
+                raise self.error(text) from None
         return found
 
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the address of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
-
-    def _checked(self, output: Output, packet: Any) -> Any:
-        wanted = output.packet_type
-        if wanted is None:
-            return packet
-        name = output.port.name
-        if not isinstance(packet, wanted.kind):
-            raise self.error(
-                f"returned {_kind(packet)} for output '{name}', which carries"
-                f' {output.port.type}: use node.make_packet("{name}")'
-            )
-        try:
-            return wanted.check(packet)
-        except WrongValue as error:
-            raise self.error(f"packet for output '{name}': {error}") from None
 
     def _note(self) -> None:
         if self._is_enabled and self._is_due and not self._lacking:

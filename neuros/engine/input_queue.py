@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from neuros.engine.metrics import Rest, State
@@ -66,11 +67,13 @@ class Subscription:
         is_acknowledged: whether the sender waits for acknowledgements.
 
     Attributes:
+        acknowledge: tells the sender a position.
         taken, taken_ns: the position of each packet that a hook has started on, and when that was,
             until the packet log takes these away.
     """
 
     __slots__ = (
+        "acknowledge",
         "acknowledged",
         "capacity",
         "consumed",
@@ -105,6 +108,7 @@ class Subscription:
         self.capacity = capacity
         self.is_lossless = is_lossless
         self.is_acknowledged = is_acknowledged
+        self.acknowledge: Callable[[int], None] = _nowhere
         self.queues: list[InputQueue] = []
         self.received = 0
         self.consumed = 0
@@ -133,7 +137,11 @@ class Subscription:
         return self.received - self.consumed - self.discarded
 
     def put(self, arrival: int, packet: Any) -> None:
-        """Deliver a packet to every taker; raises ``ProtocolError`` if a lossless one is full."""
+        """Deliver a packet to every taker; without takers, acknowledge it.
+
+        Raises:
+            ProtocolError: if the queue of a lossless connection is full.
+        """
         self.received += 1
         for queue in self.queues:
             packets = queue.packets
@@ -144,20 +152,23 @@ class Subscription:
             packets.append((arrival, self.received, packet))
         if not self.queues:
             self._settle()
+            self.acknowledge_taken()
 
-    def take(self, queue: InputQueue) -> Any:
-        """The oldest packet of ``queue``, whose hook starts on it now."""
+    def take(self, queue: InputQueue, now_ns: int) -> Any:
+        """The oldest packet of ``queue``, whose hook starts on it now; it is acknowledged."""
         _, position, packet = queue.packets.popleft()
         if not queue.packets:
             queue.hook_input.on_emptied()
         queue.position = queue.passed = position
         self.taken.append(position)
+        self.taken_ns.append(now_ns)
         queue.discards_in_a_row = 0
         if len(self.queues) == 1:
             self.settled = position
             self.consumed += 1
         else:
             self._settle()
+        self.acknowledge_taken()
         return packet
 
     def remove(self, queue: InputQueue) -> None:
@@ -165,6 +176,15 @@ class Subscription:
         self.queues.remove(queue)
         queue.packets.clear()
         self._settle()
+        self.acknowledge_taken()
+
+    def acknowledge_taken(self) -> None:
+        """Tell the sender what every taker has started on, if that has grown."""
+        if self.is_acknowledged:
+            position = self.position_if_taken()
+            if position > self.acknowledged:
+                self.acknowledged = position
+                self.acknowledge(position)
 
     def position_if_taken(self, queue: InputQueue | None = None) -> int:
         """Smallest position over all takers, if ``queue`` had started on its oldest packet."""
@@ -203,6 +223,10 @@ class Subscription:
             else:
                 self.consumed += 1
         self.settled = max(self.settled, front)
+
+
+def _nowhere(position: int) -> None:
+    """Acknowledges on a connection without acknowledgements."""
 
 
 class HookInput:
@@ -276,19 +300,9 @@ class HookInput:
         """Whether a start of the hook now would take from ``queue``."""
         return bool(queue.packets) and (self.is_all or self.chosen() is queue)
 
-    def take(self, touched: list[Subscription]) -> Any:
-        """The argument for the hook; appends the subscriptions that a packet was taken from."""
+    def take(self, now_ns: int) -> Any:
+        """The argument for the hook, which starts now."""
         if not self.is_all:
             queue = self.chosen()
-            if queue is None:
-                return None
-            touched.append(queue.subscription)
-            return queue.subscription.take(queue)
-        taken = []
-        for queue in self.queues:
-            if queue.packets:
-                touched.append(queue.subscription)
-                taken.append(queue.subscription.take(queue))
-            else:
-                taken.append(None)
-        return taken
+            return None if queue is None else queue.subscription.take(queue, now_ns)
+        return [q.subscription.take(q, now_ns) if q.packets else None for q in self.queues]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from neuros.engine.input_queue import HookInput, Subscription
 from neuros.engine.send_window import SendWindow
@@ -11,6 +11,23 @@ from neuros.errors import HookError
 from neuros.hooks import HookSpec, InputSpec
 from neuros.project.model import Connection, Node, Port
 from neuros.project.qos import DEPTH
+
+Send: TypeAlias = Callable[[Any], object]
+"""Sends a packet."""
+
+
+class Links(Protocol):
+    """The ways out of a node: one function per output, and one per connection to the node."""
+
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Send | None:
+        """The function that sends packets of an output on its connections to other nodes.
+
+        Of an output with an external topic, the one that publishes there; ``None`` if the packets
+        go nowhere.
+        """
+
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        """The function that tells the sender of a connection from another node a position."""
 
 
 class PacketType(NamedTuple):
@@ -28,20 +45,27 @@ class PacketType(NamedTuple):
 class Output:
     """One output of the node and the connections that it feeds.
 
-    ``packet_type`` is ``None`` if a hook may return anything for it.
+    Attributes:
+        packet_type: ``None`` if a hook may return anything for it.
+        send: sends to other nodes, or on an external topic; ``None``: there are none.
     """
 
-    __slots__ = ("elsewhere", "packet_type", "port", "to_itself", "windows")
+    __slots__ = ("packet_type", "port", "send", "to_itself", "windows")
 
     def __init__(
-        self, port: Port, windows: Sequence[SendWindow], packet_type: PacketType | None
+        self,
+        port: Port,
+        windows: Sequence[SendWindow],
+        packet_type: PacketType | None,
+        links: Links,
     ) -> None:
         self.port = port
         self.windows = tuple(windows)
         connections = [window.connection for window in windows]
         self.to_itself = tuple(c for c in connections if c.destination_node == c.source_node)
-        self.elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
         self.packet_type = packet_type
+        elsewhere = tuple(c for c in connections if c.destination_node != c.source_node)
+        self.send = links.sender(port, elsewhere)
 
 
 class NodePorts:
@@ -62,11 +86,15 @@ class NodePorts:
         node: Node,
         connections: Sequence[Connection],
         packet_types: Mapping[str, PacketType],
+        links: Links,
     ) -> None:
         self._node = node
         self.subscriptions: dict[Connection | str, Subscription] = {
             c: _subscription(c) for c in connections if c.destination_node == node.name
         }
+        for c in connections:
+            if c.destination_node == node.name != c.source_node and c.is_reliable:
+                self.subscriptions[c].acknowledge = links.acknowledger(c)
         for port in node.inputs:
             if port.external_topic is not None:
                 depth = DEPTH if port.qos is None else port.qos.depth or DEPTH
@@ -81,6 +109,7 @@ class NodePorts:
                 port,
                 [o for c, o in self.send_windows.items() if c.source_output == port.name],
                 packet_types.get(port.name),
+                links,
             )
             for port in node.outputs
         }

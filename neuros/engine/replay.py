@@ -11,10 +11,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from neuros.engine.engine import Engine
+from neuros.engine.engine import Effects, Engine
 from neuros.engine.event_log import Event, EventKind, events_of, starts_of
 from neuros.engine.hook import Hook
-from neuros.project.model import Connection
+from neuros.engine.node_ports import PacketType
+from neuros.hooks import HookSpec
+from neuros.project.model import Connection, Node
 
 _NO_START = -1
 
@@ -118,11 +120,19 @@ class Script:
 
 
 class ReplayedEngine(Engine):
-    """Starts hooks where the log has them start, and nowhere else."""
+    """Starts hooks where the log has them start, and nowhere else; its clock is the script's."""
 
-    def __init__(self, script: Script, *arguments: Any) -> None:
-        node, connections, specs, effects, _, types = arguments
-        super().__init__(node, connections, specs, effects, script.clock, types)
+    def __init__(
+        self,
+        script: Script,
+        node: Node,
+        connections: Sequence[Connection],
+        specs: Sequence[HookSpec],
+        effects: Effects,
+        clock: Callable[[], int],
+        packet_types: Mapping[str, PacketType] | None = None,
+    ) -> None:
+        super().__init__(node, connections, specs, effects, script.clock, packet_types)
         self._has_taken_in = script.may_start
         self._script = script
         self._places = {hook: place for place, hook in enumerate(self.all_hooks)}

@@ -14,7 +14,7 @@ from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import EventLoop, Logger, Transport
+from neuros.ports import EventLoop, Logger, Packets
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
@@ -39,7 +39,7 @@ class PluginServices:
 
     def __init__(
         self,
-        transport: Transport,
+        packets: Packets,
         loop: EventLoop,
         time: SimulatedTime,
         failures: Failures,
@@ -48,7 +48,7 @@ class PluginServices:
         self.engine: Engine | None = None
         self.is_ending = False
         self.waiting_threads: set[threading.Thread] = set()
-        self.make_packet = transport.make_packet
+        self.make_packet = packets.make
         self._loop = loop
         self.time = time
         self._failures = failures

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from neuros.engine.node_ports import PacketType
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
-from neuros.node.effects import NodeEffects, NodeRecorder
+from neuros.node.effects import NodeEffects
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices
+from neuros.node.instruments import Instrument, NodeRecorder
 from neuros.node.plugin import load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
@@ -85,7 +87,7 @@ class NodeRuntime:
         self._guard = self.failures.guard
         self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
         self._services = PluginServices(
-            self._transport,
+            middleware.packets,
             middleware.loop,
             self._time,
             self.failures,
@@ -93,26 +95,35 @@ class NodeRuntime:
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
-        self._kept_on_arrival: frozenset[Connection] = frozenset()
+        sampler = Sampler()
+        instruments: list[Instrument] = [self._time, sampler]
         if recorder is not None:
-            self._recorder = NodeRecorder(recorder, middleware.encode, self._time, self._logger)
-            self._kept_on_arrival = self._recorder.wanted_on_arrival(file.connections)
-        self._sampler = Sampler()
+            self._recorder = NodeRecorder(
+                recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
+            )
+            instruments.append(self._recorder)
         self._effects = NodeEffects(
             middleware,
             self._transport,
             self.handle,
             self.failures,
             self._time,
-            self._recorder,
-            self._sampler,
+            instruments,
             enter=self._enter,
             on_first_hook=lambda: tell("first_hook", node=self.name),
             on_initialised=on_initialised,
         )
         self.reports = NodeReports(
-            file, middleware, self._transport, self._time, self._effects, self._sampler, clock
+            file, middleware, self._transport, self._time, self._effects, sampler, clock
         )
+        node, tap = file.node, self._effects.tap
+        arrivals = {
+            c: tap(Way.RECEIVED, node.input(c.destination_input), c)
+            for c in file.connections
+            if c.destination_node == self.name != c.source_node
+        }
+        self._arrivals = {c: each for c, each in arrivals.items() if each.observers}
+        self._heard = {p.name: tap(Way.HEARD, p) for p in node.inputs if p.external_topic}
 
     @property
     def run_dir(self) -> Path:
@@ -148,8 +159,9 @@ class NodeRuntime:
         node = self.file.node
         self.specs = load_plugin(node.plugin, self.name)
         types = {port.name: self._packet_type(port) for port in node.outputs}
+        specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
         self.engine = self._services.engine = self._make_engine(
-            node, self.file.connections, self.specs, self._effects, self._clock, types
+            node, self.file.connections, specs, self._effects, self._clock, types
         )
         self.reports.open(self.engine, self._logger)
 
@@ -191,7 +203,7 @@ class NodeRuntime:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
                     self._tell("finalising", node=self.name, hook=spec.name)
-                    self._guard(partial(self._effects.run, spec))
+                    self._guard(partial(self._effects.finalise, spec))
         self._tell("finalising", node=self.name, hook="")
         if self._recorder is not None:
             self._recorder.close()
@@ -202,25 +214,20 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
-        if self._kept_on_arrival and connection in self._kept_on_arrival:
-            assert self._recorder is not None
-            self._recorder.keep(Way.RECEIVED, str(connection), packet)
+        if self._arrivals and (tap := self._arrivals.get(connection)) is not None:
+            for observe in tap.observers:
+                observe(packet, None)
         engine = self.engine
         assert engine is not None
-        # What a hook sends on of a packet (its stamp, say) is shared while that is held.
-        arrived = [packet]
-        del packet
         try:
-            engine.on_packet(connection, arrived.pop())
+            engine.on_packet(connection, packet)
         except NeurosError as error:
             self.failures.report(error)
 
     def on_external_packet(self, port: Port, packet: Any) -> None:
         """A packet has arrived on an external topic."""
-        if self._recorder is not None:
-            self._recorder.keep(Way.HEARD, port.name, packet)
-        if self._sampler.requests:
-            self._sampler.note(str(port.external_topic), packet)
+        for observe in self._heard[port.name].observers:
+            observe(packet, None)
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
@@ -243,8 +250,12 @@ class NodeRuntime:
     # ------------------------------------------------------------------ inside
 
     def _packet_type(self, port: Port) -> PacketType:
-        kind = self._middleware.message_class(port.type)
-        return PacketType(kind, self._middleware.checker(kind))
+        packets = self._middleware.packets
+        kind = packets.message_class(port.type)
+        return PacketType(kind, packets.checker(kind))
+
+    def _watched(self, spec: HookSpec) -> HookSpec:
+        return replace(spec, function=self._transport.watched(spec.function))
 
     @property
     def _loaded(self) -> Engine:

@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from neuros.engine.engine import Engine
-from neuros.engine.explain import explain
-from neuros.engine.snapshot import snapshot, steadily
+from neuros.engine.snapshot import explain, snapshot, steadily
 from neuros.node.effects import NodeEffects
 from neuros.node.packet_log import PacketLog
 from neuros.node.sampling import Sampler

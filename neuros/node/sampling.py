@@ -2,8 +2,8 @@
 
 Each observer asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
-Without a question a node looks at an empty table for each packet; with one, at so many packets per
-question at most, however fast it sends.
+Without a question it costs nothing; with one, a node looks at so many packets at most, however
+fast it sends.
 
 Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small,
 and made without any library: every k-th pixel of every k-th row.
@@ -18,6 +18,9 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
+
+from neuros.node.instruments import Observe, Tap
+from neuros.ports import Way
 
 MOST_VALUES = 20
 """Packets per question of which chosen fields are read."""
@@ -83,6 +86,14 @@ class Sampler:
     def __init__(self) -> None:
         self.requests: dict[str, list[_Request]] = {}
         self._asked: dict[int, dict[str, _Request]] = {}
+        self._taps: list[tuple[str, Tap, Observe]] = []
+
+    def attach(self, tap: Tap) -> None:
+        """Look at the packets there while they are asked for."""
+        if tap.way is not Way.RECEIVED:
+            port = tap.port.external_topic if tap.way is Way.HEARD else tap.port.name
+            name = str(port)
+            self._taps.append((name, tap, lambda packet, _: self.note(name, packet)))
 
     def note(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""
@@ -112,6 +123,10 @@ class Sampler:
                 if not request.is_met:
                     waiting.setdefault(port, []).append(request)
         self.requests = waiting
+        for name, tap, observe in self._taps:
+            tap.remove(observe)
+            if name in waiting:
+                tap.add(observe)
         return answers
 
 

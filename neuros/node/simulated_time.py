@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from neuros.node.instruments import Tap
+from neuros.ports import Way
 from neuros.project.model import Node
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -24,7 +26,6 @@ class SimulatedTime:
     Attributes:
         is_watched: whether the node owns time, so that :meth:`look` is wanted after each hook.
         expected_end_s: when the plugin says that it will end the project, ``None``: not known.
-        clock_outputs: the outputs whose packets :meth:`hear` wants.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class SimulatedTime:
         on_over: Callable[[float], None],
     ) -> None:
         self.is_watched = node.owns_time
-        self.clock_outputs = {port.name for port in node.outputs if port.type == CLOCK_TYPE}
+        self._is_owned = False
         self.expected_end_s: float | None = None
         self._duration_s = duration_s if node.owns_time else None
         self._clock = clock
@@ -51,10 +52,16 @@ class SimulatedTime:
     def own(self, read_s: Callable[[], float]) -> None:
         """Take it from a simulator, rather than from a clock that the node publishes."""
         self._read_s = read_s
-        self.clock_outputs.clear()
+        self._is_owned = True
 
-    def hear(self, packet: Any) -> None:
-        """A clock was published."""
+    def attach(self, tap: Tap) -> None:
+        """Take the time of clocks that are published there."""
+        if tap.way is Way.SENT and tap.port.type == CLOCK_TYPE:
+            tap.add(self._hear)
+
+    def _hear(self, packet: Any, _: bytes | None) -> None:
+        if self._is_owned:
+            return
         seconds = packet.clock.sec + packet.clock.nanosec * 1e-9
         self._read_s = lambda: seconds
         if self.is_watched:

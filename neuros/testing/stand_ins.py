@@ -9,13 +9,13 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox, Transport, Voice
+from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile, Port, Value
-from neuros.transport.copying import copy_packet, make_packet
+from neuros.transport.copying import RosPackets
 from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import decode, encode, message_class
-from neuros.transport.values import checker
+from neuros.transport.messages import decode, encode
+from neuros.transport.null_middleware import WithoutPeers
 
 Event = Callable[[], None]
 _LEVELS = {
@@ -243,22 +243,19 @@ class Topics:
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
         """There are no other listeners."""
 
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return make_packet(type_name)
-
     def close(self) -> None:
         """Take nothing any more."""
         self.inbox = None
 
 
-class Workbench:
+class Workbench(WithoutPeers):
     """The middleware of one node under test (:class:`neuros.ports.Middleware`)."""
 
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
         self.loop = loop
         self.topics = topics
-        self.hub = MemoryHub(loop, copy_packet)
+        self.packets = RosPackets()
+        self.hub = MemoryHub(loop, self.packets.copy)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 
@@ -272,46 +269,6 @@ class Workbench:
     def ros_node(self, file: NodeFile) -> RosNodeStandIn:
         """A stand-in."""
         return self._ros_nodes[file.node.name]
-
-    def mark_own_entities(
-        self,
-        file: NodeFile,
-        enter: Callable[[], None],
-        fail: Callable[[Any, BaseException], None],
-    ) -> None:
-        """There are none."""
-
-    def has_foreign_entities(self, file: NodeFile) -> bool:
-        """A plugin cannot create any here."""
-        return False
-
-    def join_peers(
-        self,
-        names: Sequence[str],
-        elsewhere: Sequence[str],
-        heard: Callable[[str, str | None], None],
-    ) -> Voice:
-        """There are no peers. Raises ``NotImplementedError``."""
-        raise NotImplementedError("a plugin under test runs in one part")
-
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
-        return decode(encode(packet))
-
-    def encode(self, packet: Any) -> bytes:
-        """A packet as ROS serialises it."""
-        return encode(packet)[1]
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation."""
-        return message_class(type_name)
-
-    def checker(self, kind: type) -> Callable[[Any], Any]:
-        """What checks packets of a class before they are sent."""
-        return checker(kind)
-
-    def take_in(self) -> None:
-        """Nothing arrives by itself."""
 
     def close(self) -> None:
         """Nothing to give up."""

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from neuros.ports import Transport
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.testing.wiring import numbered, wire
+from neuros.transport.copying import make_packet
 
 NUMBER, SERIES = "std_msgs/msg/Int32", "std_msgs/msg/Float64MultiArray"
 TOPIC = "/transport_checks/said"
@@ -118,14 +119,13 @@ class TransportBench:
 
     def send(self, value: int, *connections: Connection) -> None:
         """Send a number on connections of one output."""
-        transport = self.network.transport(connections[0].source_node)
-        packet = transport.make_packet(NUMBER)
+        packet = make_packet(NUMBER)
         packet.data = value
-        transport.send(connections, packet)
+        self.network.transport(connections[0].source_node).sender(connections)(packet)
 
     def acknowledge(self, connection: Connection, position: int) -> None:
         """Acknowledge as the receiver."""
-        self.network.transport(connection.destination_node).acknowledge(connection, position)
+        self.network.transport(connection.destination_node).acknowledger(connection)(position)
 
 
 def _file(name: str, connections: Sequence[Connection]) -> NodeFile:
@@ -266,9 +266,9 @@ class TransportChecks:
             seen: list[list[float]] = []
             bench.inboxes["b"].on_arrival = bench.inboxes["c"].on_arrival = spoil
             transport = bench.network.transport("a")
-            packet = transport.make_packet(SERIES)
+            packet = make_packet(SERIES)
             packet.data = [1.0, 2.0]
-            transport.send(bench.connections, packet)
+            transport.sender(bench.connections)(packet)
             packet.data[1] = -2.0
             bench.wait(lambda: len(seen) == 2)
             assert seen == [[1.0, 2.0], [1.0, 2.0]]
@@ -279,9 +279,9 @@ class TransportChecks:
         with TransportBench(self.network, wire("a.series -> b.series", 0)) as bench:
             bench.meet()
             transport = bench.network.transport("a")
-            packet = transport.make_packet(SERIES)
+            packet = make_packet(SERIES)
             packet.data = [float(i) for i in range(1 << 17)]  # 1 MiB
-            transport.send(bench.connections, packet)
+            transport.sender(bench.connections)(packet)
             b = bench.inboxes["b"]
             bench.wait(lambda: bool(b.packets))
             assert b.packets[bench.connections[0]] == [packet]
@@ -332,7 +332,7 @@ class TransportChecks:
             if heard is None:
                 return
             transport = bench.network.transport("a")
-            packet = transport.make_packet(NUMBER)
+            packet = make_packet(NUMBER)
             packet.data = 5
 
             def is_heard() -> bool:

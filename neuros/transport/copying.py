@@ -1,4 +1,6 @@
-"""Copies of ROS messages, equal to what a receiver of their bytes gets; the message factory.
+"""Operations on packets: new ones, copies of them, their check and their bytes.
+
+A copy is equal to what a receiver of the packet's bytes gets.
 
 The plain way is to serialise and to deserialise. For a small message that takes long (an ``Imu``
 30 µs), mostly for looking up Python classes from C. A message that has been checked
@@ -16,10 +18,32 @@ from typing import Any, TypeAlias
 
 import numpy
 
+from neuros.transport.codecs import message_codec
 from neuros.transport.messages import message_class
 from neuros.transport.schema import Field, Shape, Sort, schema
+from neuros.transport.values import checker
 
 Copy: TypeAlias = Callable[[Any], Any]
+
+
+class RosPackets:
+    """What NeuROS does with ROS messages (:class:`neuros.ports.Packets`)."""
+
+    def message_class(self, type_name: str) -> type:
+        return message_class(type_name)
+
+    def make(self, type_name: str) -> Any:
+        return make_packet(type_name)
+
+    def checker(self, kind: type) -> Copy:
+        return checker(kind)
+
+    def copy(self, packet: Any) -> Any:
+        return copy_packet(packet)
+
+    def encode(self, packet: Any) -> bytes:
+        kind: type = type(packet)
+        return message_codec(kind).encode(packet)
 
 
 def copy_packet(packet: Any) -> Any:

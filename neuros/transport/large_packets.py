@@ -225,12 +225,6 @@ class LargeCodecs:
         self._outputs[name].add_receiver(count_readers)
         return self._outputs[name]
 
-    def settle(self, connection: Connection, position: int) -> None:
-        """A receiver is about to acknowledge a position."""
-        decoder = self.inputs.get(connection)
-        if decoder is not None:
-            decoder.settle(position)
-
     def close(self) -> None:
         """Remove what this node has in shared memory, and give up what it has mapped."""
         for output in self._outputs.values():

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from neuros.ports import EventLoop, Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.ownership import is_unshared_inside, unheld
+from neuros.transport.ownership import Given
 
 
 class GraphBridge(Protocol):
@@ -26,7 +26,6 @@ class GraphBridge(Protocol):
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...
     def show(self, connections: Sequence[Connection], packet: Any) -> None: ...
-    def make_packet(self, type_name: str) -> Any: ...
     def close(self) -> None: ...
 
 
@@ -38,7 +37,6 @@ class MemoryHub:
         copy: what it returns must share nothing with its argument.
 
     Attributes:
-        received: where the digests of what is received go, by connection.
         arrivals: what is on its way to each node.
     """
 
@@ -51,9 +49,15 @@ class MemoryHub:
         self.post = loop.post
         self.copy = copy
         self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
-        self.received: dict[Connection, array[int]] = {}
         self.inboxes: dict[str, Inbox] = {}
+        self._links: dict[Connection, MemoryLink] = {}
         self._waiting: list[Connection] = []
+
+    def link(self, connection: Connection) -> MemoryLink:
+        """The link of a connection, one for both of its ends."""
+        if connection not in self._links:
+            self._links[connection] = MemoryLink(self, connection)
+        return self._links[connection]
 
     def join(self, name: str, inbox: Inbox, connections: Sequence[Connection]) -> None:
         """Add a node, and tell the senders that waited for it."""
@@ -74,14 +78,11 @@ class MemoryHub:
 
 
 class MemoryTransport:
-    """Carries the packets of one node to the others in its process.
+    """Carries packets to the other nodes of the process (:class:`neuros.ports.Transport`).
 
     ``digest`` makes a number of a packet; ``None``: no digests are kept, for a packet has to be
     serialised for one, which is not done here otherwise. Once it gives ``None``, none are kept any
     more. ``digests_of`` tells of which connections they are kept.
-
-    Attributes:
-        make_packet: a new message with default values, for a type in ROS notation.
     """
 
     def __init__(
@@ -99,19 +100,15 @@ class MemoryTransport:
         self._hub = hub
         self._bridge = bridge
         self._is_open = False
-        self._given_up: list[Any] = []
+        self._given = Given()
+        self.watched = self._given.watched
         self._digest = digest
-        elsewhere = [c for c in file.connections if c.source_node != c.destination_node]
-        digested = [c for c in elsewhere if digest is not None and digests_of(c)]
-        self.digests = {c: array("Q") for c in digested}
-        self.make_packet = bridge.make_packet
-        hub.received |= {c: d for c, d in self.digests.items() if c.source_node != self._name}
-        self._channels = {
-            c: _Channel(hub, c) for c in file.connections if c.source_node == self._name
-        }
-        self._ways_back = {
-            c: _WayBack(hub, c) for c in elsewhere if c.destination_node == self._name
-        }
+        self.digests: dict[Connection, array[int]] = {}
+        for c in file.connections:
+            if c.source_node != c.destination_node and digest is not None and digests_of(c):
+                link = hub.link(c)
+                digests = link.sent if c.source_node == self._name else link.received
+                self.digests[c] = digests
 
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
@@ -119,35 +116,37 @@ class MemoryTransport:
         self._bridge.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
-    def note_result(self, box: Sequence[Any]) -> None:
-        """Remember which packets of a hook's result the plugin does not hold any more."""
-        self._given_up = unheld(box)
+    def sender(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        """Return what gives each receiver a copy, but the last one the packet if it is unshared."""
+        links = [self._hub.link(c) for c in connections]
+        digested = [link for link in links if link.connection in self.digests]
+        others, last = links[:-1], links[-1]
+        copy, take, bridge = self._hub.copy, self._given.take, self._bridge
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        """Give each receiver a copy, but the last one the packet itself if it is unshared.
+        def send(packet: Any) -> None:
+            if not self._is_open:
+                return
+            digest = self._note_digest(digested, packet) if digested else None
+            for link in others:
+                link.send(copy(packet), digest)
+            last.send(packet if take(packet) else copy(packet), digest)
+            if bridge.heard:
+                bridge.show(connections, packet)
 
-        It returns nothing, since nothing is serialised.
-        """
-        if not self._is_open:
-            return
-        if self._digest is not None and self.digests:
-            self._note_digest([c for c in connections if c in self.digests], packet)
-        last = connections[-1]
-        for connection in connections[:-1]:
-            self._channels[connection].send(self._hub.copy(packet))
-        own = packet if self._is_unshared(packet) else self._hub.copy(packet)
-        self._channels[last].send(own)
-        if self._bridge.heard:
-            self._bridge.show(connections, packet)
+        return send
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         self._bridge.send_external(port, packet)
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Tell the sender which position every taker has reached."""
-        if self._is_open:
-            self._ways_back[connection].send(position)
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        """Return what tells the sender which position every taker has reached."""
+        acknowledge = self._hub.link(connection).acknowledge
+
+        def acknowledge_if_open(position: int) -> None:
+            if self._is_open:
+                acknowledge(position)
+
+        return acknowledge_if_open
 
     def note_execution(self) -> None:
         """A hook has ended: what is on its way here comes before the next one."""
@@ -155,11 +154,9 @@ class MemoryTransport:
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        """Whether all has arrived that was on its way when the last hook of the node ended."""
         return self._arrivals.arrived >= self._arrivals.first and self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose other end has not joined yet."""
         joined = self._hub.inboxes
         return [
             c
@@ -170,37 +167,27 @@ class MemoryTransport:
     def close(self) -> None:
         """Send and receive nothing any more."""
         self._is_open = False
-        self._given_up = []
+        self._given.clear()
         self._hub.leave(self._name)
         self._bridge.close()
 
-    def _note_digest(self, connections: Sequence[Connection], packet: Any) -> None:
-        if not connections or self._digest is None:
-            return
+    def _note_digest(self, links: Sequence[MemoryLink], packet: Any) -> int | None:
+        if self._digest is None:
+            return None
         digest = self._digest(packet)
         if digest is None:
             self._forget_digests()
-            return
-        for connection in connections:
-            self.digests[connection].append(digest)
-            self._channels[connection].announce(digest)
+            return None
+        for link in links:
+            link.sent.append(digest)
+        return digest
 
     def _forget_digests(self) -> None:
         """Keep none of what this node sends; half of them would be of no use."""
         self._digest = None
-        for connection, channel in self._channels.items():
-            if connection in self.digests:
-                channel.forget_digests()
-                del self.digests[connection][:]
-                del self._hub.received[connection][:]
-
-    def _is_unshared(self, packet: Any) -> bool:
-        """Whether the hook gave the packet up, and no part of it is held anywhere."""
-        for place, given_up in enumerate(self._given_up):
-            if given_up is packet:
-                del self._given_up[place]  # it is the receiver's from now on
-                return is_unshared_inside(packet)
-        return False
+        for connection in self.digests:
+            if connection.source_node == self._name:
+                self._hub.link(connection).forget_digests()
 
 
 class _Arrivals:
@@ -227,64 +214,69 @@ class _Nobody:
     def on_registered(self, connection: Connection) -> None: ...
 
 
-class _Channel:
-    """Packets on their way on one connection: the last K + N packets, as a DDS reader keeps them.
+class MemoryLink:
+    """One connection: packets on their way, and the acknowledgements on theirs.
 
-    A sender without acknowledgements (BEST_EFFORT) may be faster than its receiver for ever; what
-    no longer fits is lost in transport, and the loop's queue stays short.
+    Of the packets, those are the last K + N, as a DDS reader keeps them. A sender without
+    acknowledgements (BEST_EFFORT) may be faster than its receiver for ever; what no longer fits is
+    lost in transport, and the loop's queue stays short.
+
+    Attributes:
+        sent, received: the digests of packets.
     """
 
-    __slots__ = ("_arrivals", "_connection", "_digests", "_hub", "_packets", "_window")
+    __slots__ = (
+        "_arrivals",
+        "_arrivals_back",
+        "_hub",
+        "_packets",
+        "_positions",
+        "_window",
+        "connection",
+        "received",
+        "sent",
+    )
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
         self._hub = hub
-        self._connection = connection
+        self.connection = connection
         self._window = connection.window
-        self._packets: deque[Any] = deque(maxlen=self._window)
+        self._packets: deque[tuple[Any, int | None]] = deque(maxlen=self._window)
+        self._positions: deque[int] = deque()
         self._arrivals = hub.arrivals[connection.destination_node]
-        self._digests: deque[int] = deque(maxlen=connection.window)
+        self._arrivals_back = hub.arrivals[connection.source_node]
+        self.sent, self.received = array("Q"), array("Q")
 
-    def announce(self, digest: int) -> None:
-        """The digest of the packet that is sent next."""
-        self._digests.append(digest)
-
-    def forget_digests(self) -> None:
-        """None are kept of the packets under way."""
-        self._digests.clear()
-
-    def send(self, packet: Any) -> None:
+    def send(self, packet: Any, digest: int | None) -> None:
+        """Put a packet on its way, with its digest if that is kept."""
         if len(self._packets) < self._window:  # else an event is on its way for one that is lost
             self._arrivals.sent += 1
-            self._hub.post(self._deliver)
-        self._packets.append(packet)
+            self._hub.post(self._receive)
+        self._packets.append((packet, digest))
 
-    def _deliver(self) -> None:
-        if self._digests:
-            self._hub.received[self._connection].append(self._digests.popleft())
-        self._arrivals.arrived += 1
-        connection = self._connection
-        inbox = self._hub.inboxes[connection.destination_node]
-        inbox.on_packet(connection, self._packets.popleft())
-
-
-class _WayBack:
-    """The acknowledgements that are on their way on one connection."""
-
-    __slots__ = ("_arrivals", "_connection", "_hub", "_positions")
-
-    def __init__(self, hub: MemoryHub, connection: Connection) -> None:
-        self._hub = hub
-        self._connection = connection
-        self._positions: deque[int] = deque()
-        self._arrivals = hub.arrivals[connection.source_node]
-
-    def send(self, position: int) -> None:
-        self._arrivals.sent += 1
+    def acknowledge(self, position: int) -> None:
+        """Put the acknowledgement of a position on its way back."""
+        self._arrivals_back.sent += 1
         self._positions.append(position)
-        self._hub.post(self._deliver)
+        self._hub.post(self._receive_position)
 
-    def _deliver(self) -> None:
+    def forget_digests(self) -> None:
+        """Keep none of the packets so far, nor of those on their way."""
+        del self.sent[:]
+        del self.received[:]
+        for place, (packet, _) in enumerate(self._packets):
+            self._packets[place] = (packet, None)
+
+    def _receive(self) -> None:
+        packet, digest = self._packets.popleft()
+        if digest is not None:
+            self.received.append(digest)
         self._arrivals.arrived += 1
-        connection = self._connection
+        connection = self.connection
+        self._hub.inboxes[connection.destination_node].on_packet(connection, packet)
+
+    def _receive_position(self) -> None:
+        self._arrivals_back.arrived += 1
+        connection = self.connection
         inbox = self._hub.inboxes[connection.source_node]
         inbox.on_acknowledgement(connection, self._positions.popleft())

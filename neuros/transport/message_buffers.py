@@ -25,11 +25,13 @@ class MessageBuffers:
     """
 
     def __init__(self, kind: type) -> None:
-        found = [
-            leaf
-            for leaf in schema(kind).leaves
+        self._layout = schema(kind)
+        self._leaves = [
+            place
+            for place, leaf in enumerate(self._layout.leaves)
             if leaf.field.shape is Shape.BUFFER and leaf.field.bound is None
         ]
+        found = [self._layout.leaves[place] for place in self._leaves]
         self._paths = [leaf.path for leaf in found]
         self.fields = tuple(".".join(slot[1:] for slot in path) for path in self._paths)
         self.typecodes = tuple(leaf.field.type.code for leaf in found)
@@ -72,16 +74,10 @@ class MessageBuffers:
 
     def leave_out(self, packet: Any) -> Any:
         """A message like this one with empty buffers, which shares all else with it."""
-        twin = _shallow(packet, self._kind)
-        for path, typecode in zip(self._paths, self.typecodes, strict=True):
-            holder = twin
-            for slot in path[:-1]:
-                inner = getattr(holder, slot)
-                inner = _shallow(inner, type(inner))
-                setattr(holder, slot, inner)
-                holder = inner
-            setattr(holder, path[-1], array(typecode))
-        return twin
+        values = list(self._layout.values(packet))
+        for place, typecode in zip(self._leaves, self.typecodes, strict=True):
+            values[place] = array(typecode)
+        return self._layout.make(values)
 
     def put_back(self, packet: Any, buffers: Sequence[StoredBuffer]) -> None:
         """Give a message these buffers; they are copied when one of them is asked for."""
@@ -102,13 +98,6 @@ def _follow(message: Any, path: Sequence[str]) -> Any:
     for slot in path:
         message = getattr(message, slot)
     return message
-
-
-def _shallow(message: Any, kind: Any) -> Any:
-    twin: Any = object.__new__(kind)
-    for slot in kind.__slots__:
-        setattr(twin, slot, getattr(message, slot))
-    return twin
 
 
 def _make_lazy(message: Any, slots: tuple[str, ...]) -> None:

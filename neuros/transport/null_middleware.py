@@ -16,14 +16,11 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from neuros.ports import Inbox, Voice
+from neuros.ports import HookFunction, Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.codecs import message_codec
-from neuros.transport.copying import copy_packet, make_packet
+from neuros.transport.copying import RosPackets
 from neuros.transport.lean_node import lean_node, without_spinning
-from neuros.transport.messages import message_class
 from neuros.transport.teardown import give_up
-from neuros.transport.values import checker
 
 Event = Callable[[], None]
 
@@ -76,48 +73,33 @@ class _NullTransport:
     digests: Mapping[Connection, array[int]] = {}
 
     def open(self, inbox: Inbox) -> None: ...
-    def note_result(self, box: Sequence[Any]) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...
-    def acknowledge(self, connection: Connection, position: int) -> None: ...
     def close(self) -> None: ...
 
     def note_execution(self) -> None: ...
 
+    def watched(self, function: HookFunction) -> HookFunction:
+        return function
+
     def has_taken_in(self) -> bool:
         return True
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        return None
+    def sender(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        return _nowhere
+
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        return _nowhere
 
     def waiting_for(self) -> Sequence[Connection]:
         return ()
 
-    def make_packet(self, type_name: str) -> Any:
-        return make_packet(type_name)
+
+def _nowhere(_: object) -> None:
+    """Carries a packet, or an acknowledgement."""
 
 
-class NullMiddleware:
-    """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
-
-    def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
-        self.loop = loop
-        self._context = rclpy.Context()
-        rclpy.init(
-            args=["--ros-args", "--disable-external-lib-logs"],
-            context=self._context,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._ros_node = lean_node(file, self._context)
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
-
-    def transport(self, file: NodeFile) -> _NullTransport:
-        """One that carries nothing."""
-        return _NullTransport()
-
-    def ros_node(self, file: NodeFile) -> Any:
-        """The ROS node."""
-        return self._ros_node
+class WithoutPeers:
+    """The part of a middleware that a node without peers and without callbacks does not need."""
 
     def mark_own_entities(
         self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
@@ -137,25 +119,31 @@ class NullMiddleware:
         """There are no peers. Raises ``NotImplementedError``."""
         raise NotImplementedError("a node without neighbours runs in one part")
 
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
-        return copy_packet(packet)
-
-    def encode(self, packet: Any) -> bytes:
-        """A packet as ROS serialises it."""
-        kind: type = type(packet)
-        return message_codec(kind).encode(packet)
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation."""
-        return message_class(type_name)
-
-    def checker(self, kind: type) -> Callable[[Any], Any]:
-        """The function that checks packets of a class before they are sent."""
-        return checker(kind)
-
     def take_in(self) -> None:
         """Nothing arrives by itself."""
+
+
+class NullMiddleware(WithoutPeers):
+    """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""
+
+    def __init__(self, file: NodeFile, loop: HeldLoop) -> None:
+        self.loop = loop
+        self.packets = RosPackets()
+        self._context = rclpy.Context()
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs"],
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._ros_node = lean_node(file, self._context)
+        self._no_spinning = contextlib.ExitStack()
+        self._no_spinning.enter_context(without_spinning())
+
+    def transport(self, file: NodeFile) -> _NullTransport:
+        return _NullTransport()
+
+    def ros_node(self, file: NodeFile) -> Any:
+        return self._ros_node
 
     def close(self) -> None:
         """Give up ROS."""

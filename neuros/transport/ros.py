@@ -19,12 +19,11 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String, UInt64
 
-from neuros.ports import Inbox
+from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.codecs import Decoder, Encoder, message_codec
-from neuros.transport.copying import make_packet
 from neuros.transport.digests import Digest, digest_for, make_digests
-from neuros.transport.large_packets import LargeCodecs, is_parcel
+from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel
 from neuros.transport.messages import decode_position, encode_position, message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos
 from neuros.transport.ros_loop import RosLoop
@@ -33,16 +32,60 @@ _ANNOUNCE_S = 0.02
 
 
 @dataclass
-class _Way:
-    """The way out of one connection: ``publish`` sends the bytes that ``codec`` makes.
+class SendingLink:
+    """One connection at its sender.
 
-    ``count_readers`` returns the number of all subscriptions to the topic.
+    Attributes:
+        publish: publishes what the codec makes.
+        count_readers: returns the number of all subscriptions to the data topic.
+        digests: of the packets sent.
     """
 
     publish: Callable[[bytes], None]
     codec: Encoder
     digest: Digest
     count_readers: Callable[[], int]
+    digests: array[int]
+
+
+class ReceivingLink:
+    """One connection at its receiver.
+
+    Args:
+        deliver: gets each packet.
+        digests: of the packets received.
+    """
+
+    def __init__(
+        self,
+        codec: Decoder,
+        digest: Digest,
+        deliver: Callable[[Any], None],
+        digests: array[int],
+    ) -> None:
+        self._decode = codec.decode
+        self._settle = codec.settle if isinstance(codec, LargeInput) else None
+        self._digest = digest
+        self._deliver = deliver
+        self._note = digests.append
+        self.publish_position: Callable[[bytes], None] = _nowhere
+
+    def receive(self, data: bytes) -> None:
+        """Deliver the packet that was published, unless it was lost on its way."""
+        packet = self._decode(data)
+        if packet is not None:
+            self._note(self._digest(packet, data))
+            self._deliver(packet)
+
+    def acknowledge(self, position: int) -> None:
+        """Publish the position that every taker has reached."""
+        if self._settle is not None:
+            self._settle(position)
+        self.publish_position(encode_position(position))
+
+
+def _nowhere(data: bytes) -> None:
+    """Acknowledges on a connection without acknowledgements."""
 
 
 _LATCHED = QoSProfile(
@@ -64,15 +107,15 @@ _CONFIRMED = "confirmed"
 
 
 class RosTransport:
-    """Carries the packets of one node over ROS topics."""
+    """Carries the packets of one node over ROS topics (:class:`neuros.ports.Transport`)."""
 
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
         self._node = file.node
         self._connections = file.connections
         self._ros_node = ros_node
         self._loop = loop
-        self._ways: dict[Connection, _Way] = {}
-        self._acknowledgements: dict[Connection, Callable[[bytes], None]] = {}
+        self._sending: dict[Connection, SendingLink] = {}
+        self._receiving: dict[Connection, ReceivingLink] = {}
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self._registrations: list[Registration] = []
@@ -94,57 +137,57 @@ class RosTransport:
             self._loop.expect_arrivals()
             self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
 
-    def note_result(self, box: Sequence[Any]) -> None:
-        """Nothing to do: what is sent leaves as bytes."""
+    def watched(self, function: HookFunction) -> HookFunction:
+        """The function itself: what is sent leaves as bytes."""
+        return function
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> bytes | None:
-        """Publish a packet on the data topics of these connections, serialised once.
+    def sender(self, connections: Sequence[Connection]) -> Callable[[Any], bytes | None]:
+        """Return what publishes a packet on these data topics, serialised once.
 
-        Returns it where it was serialised as a whole message.
+        It returns the bytes where it was serialised as a whole message.
         """
-        if not self._is_open:
-            return None
-        whole = None
-        encoded: dict[Encoder, tuple[bytes, int]] = {}
-        for connection in connections:
-            way = self._ways[connection]
-            found = encoded.get(way.codec)
-            if found is None:
-                data = way.codec.encode(packet)
-                found = encoded[way.codec] = (data, way.digest(packet, data))
-                if not is_parcel(data):
-                    whole = data
-            way.publish(found[0])
-            self.digests[connection].append(found[1])
-        return whole
+        links = [self._sending[connection] for connection in connections]
+
+        def send(packet: Any) -> bytes | None:
+            if not self._is_open:
+                return None
+            whole = None
+            encoded: dict[Encoder, tuple[bytes, int]] = {}
+            for link in links:
+                found = encoded.get(link.codec)
+                if found is None:
+                    data = link.codec.encode(packet)
+                    found = encoded[link.codec] = (data, link.digest(packet, data))
+                    if not is_parcel(data):
+                        whole = data
+                link.publish(found[0])
+                link.digests.append(found[1])
+            return whole
+
+        return send
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         if self._is_open:
             self._external.send(port, packet)
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        """Publish the position that every taker has reached."""
-        if self._is_open:
-            if self._large.inputs:
-                self._large.settle(connection, position)
-            self._acknowledgements[connection](encode_position(position))
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        """Return what publishes the position that every taker has reached."""
+        acknowledge = self._receiving[connection].acknowledge
+
+        def acknowledge_if_open(position: int) -> None:
+            if self._is_open:
+                acknowledge(position)
+
+        return acknowledge_if_open
 
     def note_execution(self) -> None:
-        """A hook has ended."""
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        """Whether all that had reached this node when the last hook ended has been handled."""
         return self._loop.has_taken_in
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose other end has not been found yet."""
         return [each.connection for each in self._registrations if not each.is_done]
-
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return make_packet(type_name)
 
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
@@ -157,11 +200,12 @@ class RosTransport:
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
-        self._ways[connection] = _Way(
+        self._sending[connection] = SendingLink(
             data.handle.publish_raw,
             message_codec(kind),
             digest_for(kind),
             data.get_subscription_count,
+            self.digests[connection],
         )
         subscriptions = []
         if connection.is_reliable:
@@ -189,23 +233,24 @@ class RosTransport:
 
     def _open_receiver(self, connection: Connection, inbox: Inbox) -> None:
         kind = message_class(self._node.input(connection.destination_input).type)
+        link = self._receiving[connection] = ReceivingLink(
+            self._large.decoder(connection),
+            digest_for(kind),
+            partial(inbox.on_packet, connection),
+            self.digests[connection],
+        )
         publishers = []
         if connection.is_reliable:
             acknowledge = self._ros_node.create_publisher(
                 UInt64, f"{connection.topic}/ack", _LATCHED
             )
-            self._acknowledgements[connection] = acknowledge.handle.publish_raw
+            link.publish_position = acknowledge.handle.publish_raw
             publishers.append(acknowledge)
         data = self._subscribe(
             kind,
             f"{connection.topic}/data",
             data_qos(connection),
-            _decoding(
-                self._large.decoder(connection),
-                partial(inbox.on_packet, connection),
-                digest_for(kind),
-                self.digests[connection],
-            ),
+            link.receive,
             is_raw=True,
         )
         self._registrations.append(
@@ -222,8 +267,8 @@ class RosTransport:
 
     def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
         """The receiver of a connection is there, and lets us know ``note`` of itself."""
-        way = self._ways[connection]
-        way.codec = self._large.encoder(connection, note, way.count_readers) or way.codec
+        link = self._sending[connection]
+        link.codec = self._large.encoder(connection, note, link.count_readers) or link.codec
         inbox.on_registered(connection)
 
     def _subscribe(
@@ -247,21 +292,6 @@ class RosTransport:
         pending = [each for each in self._registrations if not each.advance()]
         if not pending:
             self._ros_node.destroy_timer(self._timer)
-
-
-def _decoding(
-    codec: Decoder, deliver: Callable[[Any], None], digest: Digest, digests: array[int]
-) -> Callable[[bytes], None]:
-    """A receiver of bytes that delivers the packet, unless that was lost on its way."""
-    decode = codec.decode
-
-    def receive(data: bytes) -> None:
-        packet = decode(data)
-        if packet is not None:
-            digests.append(digest(packet, data))
-            deliver(packet)
-
-    return receive
 
 
 class Registration:

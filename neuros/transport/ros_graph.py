@@ -30,7 +30,6 @@ from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
 from neuros.transport.codecs import message_codec
-from neuros.transport.copying import make_packet
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
@@ -72,7 +71,6 @@ class ExternalTopics:
             _check_silence(self._ros_node, heard, self._loop)
 
     def send(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         if self._is_open:
             self._publishers[port.name].publish(packet)
 
@@ -153,15 +151,9 @@ class RosGraphBridge:
                 self._publishers[connection].publish(packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Publish on the external topic of an output."""
         self._external.send(port, packet)
 
-    def make_packet(self, type_name: str) -> Any:
-        """A new message with default values."""
-        return make_packet(type_name)
-
     def close(self) -> None:
-        """Publish and receive nothing any more."""
         self.heard = frozenset()
         self._external.close()
 

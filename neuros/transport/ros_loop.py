@@ -57,7 +57,7 @@ class _Waker:
 
 
 class RosLoop:
-    """Runs events of ROS, engines and timers, one at a time, oldest first.
+    """Runs events of ROS, engines and timers, oldest first (:class:`neuros.ports.EventLoop`).
 
     ``on_failure`` gets the errors of events, in the loop's thread.
 
@@ -92,7 +92,6 @@ class RosLoop:
         self._executor.add_node(node)
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
-        """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
         self._timers.append((next_due_ns, on_due))
 
     def every(self, node: RosNode, seconds: float, event: Event) -> Timer:
@@ -119,11 +118,9 @@ class RosLoop:
 
     @property
     def has_waiting_events(self) -> bool:
-        """Whether events of engines wait."""
         return bool(self._events)
 
     def post(self, event: Event) -> None:
-        """Handle ``event`` after all that already wait."""
         self._events.append((event, False))
         if not self._has_posted_turn:
             self._post_turn()
@@ -135,7 +132,6 @@ class RosLoop:
             self._post_turn()
 
     def post_from_thread(self, event: Event) -> None:
-        """Like :meth:`post`, from any thread."""
         self._executor.create_task(self.guard, event)
 
     def guard(self, event: Event) -> None:

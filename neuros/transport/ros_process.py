@@ -1,20 +1,32 @@
-"""The middleware of a process: the ROS context, loop and transports that its nodes share."""
+"""The middleware of a process: ROS context, loop and transports of its nodes; topics of peers."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
 
 import rclpy
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node as RosNode
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSLivelinessPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
 from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.transport.codecs import message_codec
-from neuros.transport.copying import copy_packet
+from neuros.project.names import INTERNAL
+from neuros.transport.copying import RosPackets
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.lean_node import (
@@ -25,22 +37,27 @@ from neuros.transport.lean_node import (
     without_spinning,
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import message_class
-from neuros.transport.peer_topics import PeerVoice
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.teardown import give_up
-from neuros.transport.values import checker
 
 _LINGER_S = 0.05
+LEASE_S = 3.0
+"""A node elsewhere that has given no sign of life for this long is gone."""
+
+# ROS has DDS announce life after two thirds of the lease that a writer offers: here, every 0.4 s,
+# so that seven announcements in a row have to be lost before a node passes for gone.
+_OFFERED_S = 0.6
+_HEARD_S = 0.5
+
 # Each endpoint that is destroyed is announced to every other process. 64 that end at once would use
 # up the 5 s that they have, some of them blocked inside DDS; up to 17 take a fraction of a second.
 _CROWD = 16
 
 
 class RosProcess:
-    """The middleware of a process with one node, or (``in_memory``) with all nodes of a project.
+    """The :class:`neuros.ports.Middleware` of one node, or (``in_memory``) of all of a project.
 
     ``digests``: in memory, too, where a packet is serialised only for that; where all connections
     are lossless they are kept unasked, if that is cheap. ``record``: at least those that tell which
@@ -75,11 +92,12 @@ class RosProcess:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._loop = RosLoop(self._context, on_failure)
+        self.packets = RosPackets()
         self._has_digests = digests
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
-        self._hub = MemoryHub(self._loop, copy_packet) if in_memory else None
+        self._hub = MemoryHub(self._loop, self.packets.copy) if in_memory else None
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
@@ -89,11 +107,9 @@ class RosProcess:
 
     @property
     def loop(self) -> RosLoop:
-        """The event loop of the process."""
         return self._loop
 
     def transport(self, file: NodeFile) -> Transport:
-        """The transport of one node; creates its ROS node."""
         ros_node = lean_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
         self._loop.add_node(ros_node)
@@ -113,7 +129,6 @@ class RosProcess:
         return transport
 
     def ros_node(self, file: NodeFile) -> LeanNode:
-        """The ROS node of a node that has a transport."""
         return self._ros_nodes[file.node.name]
 
     def mark_own_entities(self, file: NodeFile, enter: Callable[[], None], fail: Fail) -> None:
@@ -123,7 +138,6 @@ class RosProcess:
         self._callbacks.append(PluginCallbacks(ros_node, self._loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
-        """Whether a plugin has created something on its ROS node that may call back."""
         own = self._own_entities.get(file.node.name, set())
         return not _entities(self.ros_node(file)) <= own
 
@@ -133,26 +147,8 @@ class RosProcess:
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
     ) -> PeerVoice:
-        """Speak for nodes of this process, and listen to nodes that another launcher starts."""
         namespace = self._files[0].names.namespace
         return PeerVoice(names, elsewhere, self._context, heard, namespace)
-
-    def copy(self, packet: Any) -> Any:
-        """A packet that shares nothing with this one."""
-        return copy_packet(packet)
-
-    def encode(self, packet: Any) -> bytes:
-        """A packet as ROS serialises it."""
-        kind: type = type(packet)
-        return message_codec(kind).encode(packet)
-
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation."""
-        return message_class(type_name)
-
-    def checker(self, kind: type) -> Callable[[Any], Any]:
-        """The function that checks packets of a class before they are sent."""
-        return checker(kind)
 
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
@@ -193,3 +189,97 @@ def _entities(ros_node: RosNode) -> set[int]:
     return {id(entity) for group in groups for entity in group} | {
         id(waitable) for waitable in ros_node.waitables
     }
+
+
+# ---------------------------------------------------------------------- peers
+
+
+class PeerVoice:
+    """Speaks for nodes of this process, and listens to nodes elsewhere, in a thread of its own.
+
+    The nodes of a launcher publish its state (:class:`neuros.launcher.peers.PeerState`), each on a
+    topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
+    ``std_msgs/msg/String``, so that the last state also reaches who comes later. That a node goes
+    on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no
+    Python: a plugin that holds its global lock for seconds does not pass for dead.
+
+    Args:
+        names: the nodes of this process.
+        elsewhere: nodes that other launchers start.
+        heard: called from the thread with a node elsewhere and its launcher's state, or
+            ``None`` when it is gone.
+        namespace: that of the project.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        context: Context,
+        heard: Callable[[str, str | None], None],
+        namespace: str = "",
+    ) -> None:
+        self._heard = heard
+        self._ros_node = RosNode(
+            f"_{names[0]}_side",  # a hidden one: tools do not list it unless they are asked to
+            context=context,
+            namespace=namespace,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._publishers = [
+            self._ros_node.create_publisher(String, _topic(namespace, name), _qos(_OFFERED_S))
+            for name in names
+        ]
+        for name in elsewhere:
+            self._ros_node.create_subscription(
+                String,
+                _topic(namespace, name),
+                partial(self._hear, name),
+                _qos(LEASE_S),
+                event_callbacks=SubscriptionEventCallbacks(
+                    liveliness=partial(self._count, name), use_default_callbacks=False
+                ),
+            )
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._ros_node)
+        self._thread = threading.Thread(target=self._listen, name="neuros-side", daemon=True)
+        self._thread.start()
+
+    def say(self, text: str) -> None:
+        """Let it be heard elsewhere, also by who comes later. Any thread."""
+        for publisher in self._publishers:
+            publisher.publish(String(data=text))
+
+    def close(self) -> None:
+        """Let the last state arrive, then be silent."""
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
+        self._executor.shutdown(_HEARD_S)
+        self._thread.join(_HEARD_S)
+        self._ros_node.destroy_node()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):  # the process has given up ROS
+            self._executor.spin()
+
+    def _hear(self, name: str, message: String) -> None:
+        self._heard(name, message.data)
+
+    def _count(self, name: str, life: QoSLivelinessChangedInfo) -> None:
+        if life.alive_count_change < 0 or life.not_alive_count_change > 0:
+            self._heard(name, None)
+
+
+def _topic(namespace: str, name: str) -> str:
+    return f"{namespace}{INTERNAL}{name}/side"
+
+
+def _qos(lease_s: float) -> QoSProfile:
+    return QoSProfile(
+        depth=1,
+        reliability=QoSReliabilityPolicy.RELIABLE,
+        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+        liveliness=QoSLivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Duration(seconds=lease_s),
+    )

@@ -1,8 +1,7 @@
 """The schema of a message class: its fields, their types and bounds, found out once.
 
-ROS describes the fields of a class that it generates in its ``SLOT_TYPES``. All
-modules that handle messages (values, cdr, copying, message_buffers, ownership) use this one
-reading of them.
+ROS describes the fields of a class that it generates in its ``SLOT_TYPES``. All that handles
+messages uses this one reading of them: the check of values, codecs, copies, buffers, previews.
 It uses the slots of a message, not its properties: these convert what they are given, and may copy.
 """
 
@@ -10,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -131,37 +130,51 @@ class Schema:
     """The fields of a message class, those of single messages within it laid out beside its own.
 
     Attributes:
+        name: as ``.msg`` files have it, ``geometry_msgs/Point``.
         fields: its own, in the order of the definition.
         kinds: the class, and those of the messages within it, each behind the one that holds it.
         places: the slots that lead to each of these.
         switches: slots that hold no field (whether setters check): whose of these, name and value.
         leaves: all fields that hold no single message, in the order of the definition.
+        encoded: the same, with ``None`` for each message without fields, which takes a byte.
+        values: gets the values of all leaves of a message, as a tuple.
         fill: puts into new messages of ``kinds`` what belongs there: those behind the first one,
             the values of ``switches``, and those of all leaves.
     """
 
     def __init__(self, kind: Any) -> None:
         default, names = kind(), kind.get_fields_and_field_types()
+        self.name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
         self.fields = tuple(map(_field, names, kind.SLOT_TYPES))
         slots = {field.slot for field in self.fields}
         self.kinds: list[Any] = [kind]
         self.places: list[Path] = [()]
         self.switches = [(0, s, getattr(default, s)) for s in kind.__slots__ if s not in slots]
-        self.leaves: list[Leaf] = []
+        self.encoded: list[Leaf | None] = [] if self.fields else [None]
         for field in self.fields:
             if field.is_message:
                 self._add(field.slot, schema(field.type.message))
             else:
-                self.leaves.append(Leaf((field.slot,), 0, field))
+                self.encoded.append(Leaf((field.slot,), 0, field))
+        self.leaves = [leaf for leaf in self.encoded if leaf is not None]
+        self.values = getter([leaf.path for leaf in self.leaves])
         self.fill = self._filler()
+        self._fixed = [value for *_, value in self.switches]
+
+    def make(self, values: Iterable[Any]) -> Any:
+        """A message of the class with these values of its leaves."""
+        made = list(map(object.__new__, self.kinds))
+        self.fill(made, [*made[1:], *self._fixed, *values])
+        return made[0]
 
     def _add(self, slot: str, inner: Schema) -> None:
         place = len(self.kinds)
         self.kinds += inner.kinds
         self.places += [(slot, *path) for path in inner.places]
         self.switches += [(place + owner, name, value) for owner, name, value in inner.switches]
-        self.leaves += [
-            Leaf((slot, *leaf.path), place + leaf.owner, leaf.field) for leaf in inner.leaves
+        self.encoded += [
+            leaf and Leaf((slot, *leaf.path), place + leaf.owner, leaf.field)
+            for leaf in inner.encoded
         ]
 
     def _filler(self) -> Callable[[list[Any], list[Any]], Any]:

@@ -277,12 +277,11 @@ def _is_character(value: str) -> bool:
 def _convert_message(kind: Any) -> Convert:
     layout = schema(kind)
     fields = tuple((field.slot, _convert_field(field)) for field in layout.fields)
-    name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
     def convert(message: Any) -> Any:
         if type(message) is not kind:
             if not isinstance(message, kind):
-                raise _Mismatch(_describe(message), name)
+                raise _Mismatch(_describe(message), layout.name)
             message = _of_very_class(message, kind)
         for slot, convert_field in fields:
             value = getattr(message, slot, _NOTHING)

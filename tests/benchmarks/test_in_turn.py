@@ -12,7 +12,7 @@ from benchmarks import in_turn
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
 from neuros.engine.send_window import SendWindow
-from neuros.node.effects import NodeRecorder
+from neuros.node.instruments import NodeRecorder
 from neuros.project.model import Connection
 
 

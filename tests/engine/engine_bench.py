@@ -212,20 +212,25 @@ class Bench:
         self.log.append(("end", hook.name))
         return result
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        for connection in connections:
-            self.sent.append((str(connection), packet))
-            self.log.append(("send", str(connection)))
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        def send(packet: Any) -> None:
+            if port.external_topic is not None:
+                self.external.append((port.name, packet))
+            for connection in connections:
+                self.sent.append((str(connection), packet))
+                self.log.append(("send", str(connection)))
+
+        return send
 
     def has_taken_in(self) -> bool:
         return self.is_taken_in
 
-    def send_external(self, port: Port, packet: Any) -> None:
-        self.external.append((port.name, packet))
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        def acknowledge(position: int) -> None:
+            self.acknowledged.append((str(connection), position))
+            self.log.append(("acknowledge", str(connection), position))
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        self.acknowledged.append((str(connection), position))
-        self.log.append(("acknowledge", str(connection), position))
+        return acknowledge
 
     def post(self, event: Callable[[], None]) -> None:
         self.posted.append(("own packet", event))

@@ -18,7 +18,7 @@ from engine_bench import Clock, node_for
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.hooks import HookSpec
-from neuros.project.model import Connection
+from neuros.project.model import Connection, Port
 
 Event = Callable[[], None]
 
@@ -46,14 +46,21 @@ class NetworkNode:
         self.clock.now_ns += self.network.delay_ns()
         return hook.spec.function(self, *arguments)
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        assert port.external_topic is None
+        return functools.partial(self._send, connections)
+
+    def _send(self, connections: Sequence[Connection], packet: Any) -> None:
         for c in connections:
             self.network.sequences[c].append(packet)
             receiver = self.network.nodes[c.destination_node]
             arrive = functools.partial(receiver.engine.on_packet, c, packet)
             self.network.deliver(self, receiver, ("data", c), arrive)
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        return functools.partial(self._acknowledge, connection)
+
+    def _acknowledge(self, connection: Connection, position: int) -> None:
         sender = self.network.nodes[connection.source_node]
         self.network.deliver(
             self,
@@ -64,9 +71,6 @@ class NetworkNode:
 
     def has_taken_in(self) -> bool:
         return True
-
-    def send_external(self, port: Any, packet: Any) -> None:
-        raise AssertionError("there are no external ports here")
 
     def post(self, event: Event) -> None:
         self.events.append(event)

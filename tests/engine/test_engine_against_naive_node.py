@@ -14,7 +14,7 @@ from naive_node import NaiveNode
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.hooks import All, HookSpec, Optional
-from neuros.project.model import Connection
+from neuros.project.model import Connection, Port
 
 INPUTS, OUTPUTS, OTHERS = ("x", "y"), ("o", "p"), ("a", "b")
 PERIODS_S = (0.1, 0.25)
@@ -33,17 +33,15 @@ class Written:
         packets = self._produce(hook.spec, hook.executions + 1)
         return packets if hook.spec.outputs else None
 
-    def send(self, connections: Sequence[Connection], packet: Any) -> None:
-        self.log += [("send", str(c), packet) for c in connections]
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        assert port.external_topic is None
+        return lambda packet: self.log.extend(("send", str(c), packet) for c in connections)
 
     def has_taken_in(self) -> bool:
         return True
 
-    def send_external(self, port: Any, packet: Any) -> None:
-        raise AssertionError("there are no external ports here")
-
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        self.log.append(("acknowledge", str(connection), position))
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        return lambda position: self.log.append(("acknowledge", str(connection), position))
 
     def post(self, each: Callable[[], None]) -> None:
         self.events.append(("own packet", each))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from engine_bench import Bench, function, initialise, tick, wire
 
-from neuros.engine.explain import explain
+from neuros.engine.snapshot import explain
 from neuros.hooks import All, Optional
 
 IN, OUT = "robot.imu -> node.imu", "node.o -> visualiser.o"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from engine_bench import SECOND, Bench, function, initialise, tick, wire
 
-from neuros.engine.explain import explain
 from neuros.engine.metrics import PAUSED
-from neuros.engine.snapshot import snapshot
+from neuros.engine.snapshot import explain, snapshot
 from neuros.hooks import Optional
 
 IN, OUT = "a.o -> node.x", "node.o -> b.x"

@@ -10,7 +10,7 @@ from engine_network import Network
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.engine.explain import explain
+from neuros.engine.snapshot import explain
 from neuros.hooks import All, HookKind, HookSpec, Optional
 from neuros.project.model import Connection
 

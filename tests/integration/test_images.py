@@ -19,6 +19,7 @@ from neuros.project.model import NodeFile
 from neuros.testing.transports import SERIES, TransportBench
 from neuros.testing.wiring import wire
 from neuros.transport import large_packets
+from neuros.transport.copying import make_packet
 
 PROJECT = Path(__file__).parent / "large_packets"
 SHARED_MEMORY = Path("/dev/shm")
@@ -110,10 +111,10 @@ def exchange(bench: TransportBench, first: int, count: int) -> None:
     (connection,) = bench.connections
     transport, inbox = bench.network.transport("a"), bench.inboxes["b"]
     for number in range(first, first + count):
-        packet = transport.make_packet(SERIES)
+        packet = make_packet(SERIES)
         packet.data = array("d", [float(number)] * (1 << 15))
         before = len(inbox.packets.get(connection, ()))
-        transport.send([connection], packet)
+        transport.sender([connection])(packet)
         bench.wait(lambda before=before: len(inbox.packets.get(connection, ())) > before)  # type: ignore[misc]
         bench.acknowledge(connection, before + 1)
         assert inbox.packets[connection][-1] == packet

@@ -20,7 +20,7 @@ def harness(tmp_path: Path) -> Callable[[str], PluginHarness]:
     def make(text: str) -> PluginHarness:
         path = tmp_path / "plugin.py"
         path.write_text("from neuros.hooks import *\n" + textwrap.dedent(text))
-        return PluginHarness(path, inputs={"x": INT}, outputs={"y": POINT, "z": POINT})
+        return PluginHarness(path, inputs={"x": INT, "w": POINT}, outputs={"y": POINT, "z": POINT})
 
     return make
 
@@ -113,3 +113,21 @@ def test_one_packet_for_two_outputs_reaches_each_receiver_by_itself(harness):
     bench.send("x", Int32())
     bench.run()
     assert bench.received("y")[0] is not bench.received("z")[0]
+
+
+@pytest.mark.parametrize("kept", ["None", "node.set_user_data(x)"])
+def test_a_packet_that_a_hook_returns_as_it_came_is_copied(harness, kept):
+    bench = harness(f"""
+        @neuros_function(inputs="w", outputs="y")
+        def step(node, x):
+            (node.run_dir / "came").write_text(str(id(x)))
+            {kept}
+            return x
+    """)
+    sent = PointStamped()
+    sent.point.x = 3.0
+    bench.send("w", sent)
+    bench.run()
+    (received,) = bench.received("y")
+    assert received == sent
+    assert str(id(received)) != (bench.run_dir / "came").read_text()

@@ -13,8 +13,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Int32, String
 
-from neuros.transport.cdr import cdr
-from neuros.transport.codecs import message_codec
+from neuros.transport.codecs import cdr, message_codec
 from neuros.transport.messages import message_class
 
 TYPES = (

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64MultiArray, Header, String
 
 from neuros.transport.copying import copy_packet
 from neuros.transport.messages import message_class
-from neuros.transport.ownership import is_unshared_inside, unheld
+from neuros.transport.ownership import unheld, unshared_check
 
 
 def image() -> Image:
@@ -55,7 +55,7 @@ def handed_over(box: list[Any]) -> list[Any]:
     packets = result if isinstance(result, tuple | list) else [result]
     return [
         packet
-        if any(packet is each for each in given_up) and is_unshared_inside(packet)
+        if any(packet is each for each in given_up) and unshared_check(type(packet))(packet)
         else copy_packet(packet)
         for packet in packets
     ]
@@ -107,17 +107,17 @@ def test_what_nobody_keeps_is_handed_over_itself(make: Any, wrap: Any) -> None:
     box = [wrap(make())]
     found = unheld(box)
     assert len(found) == 1
-    assert is_unshared_inside(found[0])
+    assert unshared_check(type(found[0]))(found[0])
 
 
 def test_a_packet_that_was_kept_for_a_while_is_unshared_again_once_it_is_let_go() -> None:
     packet = image()
     view = memoryview(packet.data)
-    assert not is_unshared_inside(packet)
+    assert not unshared_check(type(packet))(packet)
     view.release()
     del view
     gc.collect()
-    assert is_unshared_inside(packet)
+    assert unshared_check(type(packet))(packet)
 
 
 def test_a_packet_for_two_outputs_is_not_given_up() -> None:
@@ -139,17 +139,17 @@ def test_an_array_that_shows_the_memory_of_another_is_not_handed_over() -> None:
     packet = Imu()
     packet._orientation_covariance = numbers[:9]  # the setter of some releases copies
     del numbers  # the view holds it: who else does cannot be told
-    assert not is_unshared_inside(packet)
+    assert not unshared_check(type(packet))(packet)
 
 
 def test_an_array_that_cannot_be_written_to_is_not_handed_over() -> None:
     packet = Imu()
     packet.orientation_covariance.flags.writeable = False
-    assert not is_unshared_inside(packet)
+    assert not unshared_check(type(packet))(packet)
 
 
 def test_a_class_of_the_users_own_is_not_handed_over() -> None:
     class Labelled(String):  # type: ignore[misc]
         pass
 
-    assert not is_unshared_inside(Labelled())
+    assert not unshared_check(Labelled)(Labelled())

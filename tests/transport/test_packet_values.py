@@ -25,7 +25,7 @@ from neuros.errors import WrongValue
 from neuros.transport.codecs import message_codec
 from neuros.transport.copying import copy_packet
 from neuros.transport.digests import digest_for, digest_of
-from neuros.transport.ownership import is_unshared_inside
+from neuros.transport.ownership import unshared_check
 from neuros.transport.values import checker
 
 KINDS = message_classes()
@@ -291,4 +291,4 @@ class TestMessages:
         for number in (1.0, 1):
             packet = Imu()
             packet.angular_velocity.x = number
-            assert is_unshared_inside(checked(packet))
+            assert unshared_check(type(packet))(checked(packet))

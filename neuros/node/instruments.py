@@ -1,0 +1,98 @@
+"""Instruments of a node: what looks at its packets as they pass, bound only where it is used.
+
+A :class:`Tap` is one place where packets pass: an output, an input, a connection. The clock, the
+sampler and the packet recorder are told of each tap once, when it is made, and attach themselves
+where they want something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias
+
+from neuros.ports import Logger, PacketRecorder, Way
+from neuros.project.model import Connection, Port
+
+Observe: TypeAlias = Callable[[Any, "bytes | None"], object]
+"""Looks at a packet, which is given serialised, too, where that was made anyway."""
+
+
+class Tap:
+    """A place where packets pass a node.
+
+    Attributes:
+        port: the output or input.
+        name: as recordings name the place: the port, or the connection where ``way`` is of one.
+        observers: they are called with each packet, in this order.
+    """
+
+    __slots__ = ("name", "observers", "port", "way")
+
+    def __init__(self, way: Way, port: Port, connection: Connection | None = None) -> None:
+        self.way = way
+        self.port = port
+        self.name = port.name if connection is None else str(connection)
+        self.observers: tuple[Observe, ...] = ()
+
+    def add(self, observe: Observe) -> None:
+        """Have one more called."""
+        self.observers = (*self.observers, observe)
+
+    def remove(self, observe: Observe) -> None:
+        """Have one called no more."""
+        self.observers = tuple(each for each in self.observers if each is not observe)
+
+
+class Instrument(Protocol):
+    """Watches packets of a node."""
+
+    def attach(self, tap: Tap) -> None:
+        """Add what looks at the packets of a tap, at once or for as long as it is asked for."""
+
+
+class NodeRecorder:
+    """Gives packets of one node, serialised, to its packet recorder, until that fails.
+
+    Args:
+        encode: serialises a packet.
+        sim_time_s: the simulated time of the node, ``None`` where it owns none.
+    """
+
+    def __init__(
+        self,
+        recorder: PacketRecorder,
+        encode: Callable[[Any], bytes],
+        sim_time_s: Callable[[], float | None],
+        logger: Logger,
+    ) -> None:
+        self._recorder: PacketRecorder | None = recorder
+        self._encode = encode
+        self._sim_time_s = sim_time_s
+        self._logger = logger
+
+    def attach(self, tap: Tap) -> None:
+        """Keep the packets there, if they are recorded."""
+        if self._recorder is None:
+            return
+        stream = self._recorder.stream(tap.way, tap.name)
+        if stream is not None:
+            number = stream
+            tap.add(lambda packet, data: self.keep(number, packet, data))
+
+    def keep(self, stream: int, packet: Any, data: bytes | None) -> None:
+        """Record a packet; ``data`` is the packet, if serialised already."""
+        if self._recorder is None:
+            return
+        try:
+            self._recorder.keep(stream, data or self._encode(packet), self._sim_time_s())
+        except OSError as error:
+            self.close()
+            self._logger.error(
+                f"its packets are not recorded from now on: {error.strerror}; the run goes on"
+            )
+
+    def close(self) -> None:
+        """Record nothing any more."""
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None

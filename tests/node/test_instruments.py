@@ -1,0 +1,108 @@
+"""Instruments are bound where they are used, and nowhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Int32
+
+from neuros.node.instruments import NodeRecorder, Tap
+from neuros.node.sampling import Sampler
+from neuros.node.simulated_time import CLOCK_TYPE, SimulatedTime
+from neuros.ports import Way
+from neuros.project.model import Connection, Node, Port
+from neuros.testing.stand_ins import RecordingLogger
+
+NUMBER, CLOCK = Port("number", "std_msgs/msg/Int32"), Port("clock", CLOCK_TYPE)
+CONNECTION = Connection("a", "number", "b", "in", 0)
+
+
+class Kept:
+    """Records the packets of the output ``number``, until it fails."""
+
+    def __init__(self) -> None:
+        self.packets: list[tuple[int, bytes, float | None]] = []
+        self.is_full = self.is_closed = False
+
+    def stream(self, way: Way, name: str) -> int | None:
+        return 7 if (way, name) == (Way.SENT, "number") else None
+
+    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+        if self.is_full:
+            raise OSError(28, "No space left on device")
+        self.packets.append((stream, data, sim_time_s))
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def show(tap: Tap, packet: Any, data: bytes | None = None) -> None:
+    for observe in tap.observers:
+        observe(packet, data)
+
+
+@pytest.mark.parametrize("way", [Way.SENT, Way.TO_ITSELF])
+def test_the_sampler_is_on_a_tap_only_while_it_is_asked(way: Way) -> None:
+    sampler, tap = Sampler(), Tap(way, NUMBER)
+    sampler.attach(tap)
+    assert not tap.observers
+    sampler.ask({"other": {"all": True}})
+    assert not tap.observers
+    sampler.ask({"number": {"all": True}})
+    show(tap, Int32(data=5))
+    assert sampler.ask({})["number"]["all"] == {"data": 5}
+    assert not tap.observers
+
+
+def test_the_sampler_knows_an_external_input_by_its_topic() -> None:
+    sampler, tap = Sampler(), Tap(Way.HEARD, Port("scan", NUMBER.type, "/laser"))
+    sampler.attach(tap)
+    sampler.ask({"/laser": {"all": True}})
+    show(tap, Int32(data=6))
+    assert sampler.ask({})["/laser"]["all"] == {"data": 6}
+
+
+def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> None:
+    kept, records = Kept(), []
+    recorder = NodeRecorder(
+        kept, lambda packet: b"made", lambda: 1.5, RecordingLogger("a", records)
+    )
+    taps = [Tap(Way.SENT, NUMBER), Tap(Way.SENT, CLOCK), Tap(Way.RECEIVED, NUMBER, CONNECTION)]
+    for tap in taps:
+        recorder.attach(tap)
+    assert [len(tap.observers) for tap in taps] == [1, 0, 0]
+    show(taps[0], Int32(), b"published")
+    show(taps[0], Int32())
+    assert kept.packets == [(7, b"published", 1.5), (7, b"made", 1.5)]
+
+
+def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
+    kept, records = Kept(), []
+    recorder = NodeRecorder(kept, lambda packet: b"", lambda: None, RecordingLogger("a", records))
+    tap = Tap(Way.SENT, NUMBER)
+    recorder.attach(tap)
+    kept.is_full = True
+    show(tap, Int32())
+    show(tap, Int32())
+    assert kept.is_closed
+    (record,) = records
+    assert "No space left on device; the run goes on" in record.text
+
+
+def test_the_clock_is_taken_from_outputs_of_its_type_unless_a_simulator_owns_the_time() -> None:
+    node = Node("a", "neuros_python", Path("plugin.py"), outputs=(NUMBER, CLOCK))
+    time = SimulatedTime(node, None, lambda: 0, lambda _: None)
+    taps = {port: Tap(Way.SENT, port) for port in node.outputs}
+    for tap in taps.values():
+        time.attach(tap)
+    assert not taps[NUMBER].observers
+    packet = Clock()
+    packet.clock.sec = 3
+    show(taps[CLOCK], packet)
+    assert time.now_s == 3.0
+    time.own(lambda: 8.0)
+    show(taps[CLOCK], packet)
+    assert time.now_s == 8.0
