@@ -13,7 +13,7 @@
 import os
 import warnings
 
-from neuros.recording.bag.bag_reader import Bag, RecordedTopic, open_bag
+from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
 
 
 def open(run: str | os.PathLike[str]) -> Bag:

@@ -100,7 +100,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
     "visualise": {"matplotlib", "numpy"},
     "visualise.feed": set(),
-    "recording.bag": {"rosbags", "numpy", "pandas"},
+    "recording.bag_reader": {"rosbags", "numpy", "pandas"},
     "viewers.dashboard": {"starlette", "uvicorn"},
     "viewers.rerun_feed": {"rerun", "numpy"},
     "cli.convert": {"tabulate"},

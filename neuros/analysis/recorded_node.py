@@ -14,8 +14,8 @@ from neuros.errors import UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
-from neuros.recording.bag.bag_reader import Bag, open_bag
-from neuros.recording.plan import RecordingPlan, load_plan
+from neuros.recording.bag_reader import Bag, open_bag
+from neuros.recording.recording_plan import RecordingPlan, load_plan
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 

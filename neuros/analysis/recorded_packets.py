@@ -12,9 +12,9 @@ from xxhash import xxh3_64_intdigest
 
 from neuros.analysis.packets import Numbers
 from neuros.errors import NeurosError
-from neuros.recording.bag.bag_reader import Bag, RecordedTopic, open_bag
-from neuros.recording.plan import PLAN_NAME
-from neuros.recording.stored import stored_messages
+from neuros.recording.bag_files import stored_messages
+from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
+from neuros.recording.recording_plan import PLAN_NAME
 
 _LARGE_BYTES = 64 * 1024
 """The buffers of larger messages travel beside them, and nodes digest them apart."""

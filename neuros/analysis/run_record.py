@@ -13,7 +13,7 @@ from neuros.engine.time_budget import time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
-from neuros.recording.load_table import load_table
+from neuros.recording.system_load import load_table
 
 FORMAT = 2
 """Of ``run.json``; grows when a reader of the old one could no longer read the new one."""

@@ -105,7 +105,7 @@ def _is_looked_at(listening: socket.socket) -> bool:
 
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
     from neuros.api.observation import owner_of_processes
-    from neuros.recording.load import LAUNCHER, LoadMeter, LoadNow
+    from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadNow
     from neuros.viewers.dashboard.server import Sources
 
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])

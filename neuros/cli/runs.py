@@ -319,7 +319,7 @@ def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def _info(options: argparse.Namespace) -> int:
     from tabulate import tabulate
 
-    from neuros.recording.bag.bag_reader import open_bag
+    from neuros.recording.bag_reader import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]

@@ -13,7 +13,9 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader, ReaderError
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.plan import (
+from neuros.recording.bag_files import is_whole, stored_messages
+from neuros.recording.recorder import Recorder, has_spools
+from neuros.recording.recording_plan import (
     BAG_NAME,
     LISTENER,
     PLAN_NAME,
@@ -21,9 +23,7 @@ from neuros.recording.plan import (
     Topic,
     load_plan,
 )
-from neuros.recording.recorder import Recorder, has_spools
 from neuros.recording.spool import SpoolReader, listened_topics
-from neuros.recording.stored import is_whole, stored_messages
 
 DAMAGED_NAME = "bag.damaged"
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neuros.ports import Way
-from neuros.recording.plan import LISTENER, RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
 
 FILE_BYTES = 8 << 20
 NO_TIME = -1

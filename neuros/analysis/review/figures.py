@@ -14,7 +14,7 @@ from neuros.analysis.review.run import Run
 from neuros.engine.time_budget import TimeBudget
 from neuros.project.graph import guarantee, port_names
 from neuros.project.layout import Place, lay_out
-from neuros.recording.load_table import FILE_NAME
+from neuros.recording.system_load import FILE_NAME
 
 # Okabe and Ito, Color Universal Design (2008).
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#E69F00", "#009E73", "#CC79A7"

@@ -20,7 +20,7 @@ from neuros.analysis.run_record import FORMAT, connection_of
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection
-from neuros.recording.load_table import FILE_NAME
+from neuros.recording.system_load import FILE_NAME
 
 
 @dataclass(frozen=True)
