@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from neuros.analysis.review.figures import colour, new_figure, plain
-from neuros.analysis.review.run import Run
-from neuros.analysis.run_record import consumed_percent
+from neuros.analysis.review.charts import colour, new_figure, plain
+from neuros.analysis.run_record import PastRun, consumed_percent
 
-_Cells = Callable[[Run], float | None]
+_Cells = Callable[[PastRun], float | None]
 
 
-def labels_of(runs: Sequence[Run]) -> list[str]:
+def labels_of(runs: Sequence[PastRun]) -> list[str]:
     """A short name for each run that tells it from the others."""
     names = [run.folder.resolve().name for run in runs]
     if len({*names}) < len(names):
@@ -24,7 +23,7 @@ def labels_of(runs: Sequence[Run]) -> list[str]:
     return names
 
 
-def comparison_rows(runs: Sequence[Run]) -> tuple[list[str], list[list[str]]]:
+def comparison_rows(runs: Sequence[PastRun]) -> tuple[list[str], list[list[str]]]:
     """A header, and rows: what, its value in each run, and of two runs the ratio B / A."""
     rows = []
     for name, digits, cell in _figures(runs):
@@ -50,7 +49,7 @@ def _ratio(values: Sequence[float | None]) -> list[str]:
     return ["-" if a is None or b is None or not a else f"{b / a:.2f}"]
 
 
-def _figures(runs: Sequence[Run]) -> list[tuple[str, int, _Cells]]:
+def _figures(runs: Sequence[PastRun]) -> list[tuple[str, int, _Cells]]:
     """Name, digits after the point, and where the value is."""
     figures: list[tuple[str, int, _Cells]] = [
         ("real-time factor", 2, _of("real_time_factor")),
@@ -73,7 +72,7 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, int, _Cells]]:
     return figures
 
 
-def _all(runs: Sequence[Run], what: str) -> list[str]:
+def _all(runs: Sequence[PastRun], what: str) -> list[str]:
     return list(dict.fromkeys(name for run in runs for name in getattr(run, what)))
 
 
@@ -82,7 +81,7 @@ def _of(key: str) -> _Cells:
 
 
 def _in_connection(name: str, *keys: str) -> _Cells:
-    def cell(run: Run) -> float | None:
+    def cell(run: PastRun) -> float | None:
         found: Any = run.connections.get(name)
         for key in keys:
             found = None if found is None else found.get(key)
@@ -96,7 +95,7 @@ def _consumed(name: str) -> _Cells:
 
 
 def _executing(name: str) -> _Cells:
-    def cell(run: Run) -> float | None:
+    def cell(run: PastRun) -> float | None:
         spent = run.time_budgets.get(name)
         return 100 * spent.shares["executing"] if spent and spent.total_s else None
 
@@ -104,7 +103,7 @@ def _executing(name: str) -> _Cells:
 
 
 def _processor(name: str) -> _Cells:
-    def cell(run: Run) -> float | None:
+    def cell(run: PastRun) -> float | None:
         load: Mapping[str, Any] = run.record.get("system_load") or {}
         figures = load.get("processes", {}).get(name)
         return None if figures is None else float(figures["cpu_percent_mean"])
@@ -112,7 +111,7 @@ def _processor(name: str) -> _Cells:
     return cell
 
 
-def comparison_figure(runs: Sequence[Run]) -> Any | None:
+def comparison_figure(runs: Sequence[PastRun]) -> Any | None:
     """Real-time factor, consumed packets, latency, executing share; ``None`` if no run has any."""
     panels = [
         (name, [(label, cell) for label, cell in cells])

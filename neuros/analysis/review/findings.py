@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.analysis.review.run import Run
+from neuros.analysis.run_record import PastRun
 from neuros.engine.time_budget import TimeBudget
 from neuros.project.model import Connection
 
@@ -271,7 +271,7 @@ class Findings:
     trial: str | None = None
 
 
-def findings_of(run: Run) -> Findings:
+def findings_of(run: PastRun) -> Findings:
     """Say what limits a run."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
@@ -357,7 +357,7 @@ def _reason(step: Step, spent: TimeBudget) -> str:
     )
 
 
-def _caveats(run: Run, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
+def _caveats(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
     cores = (run.record.get("machine") or {}).get("cores")
     machine = (run.record.get("system_load") or {}).get("machine")
     shares = [sum(sum(s.executing.values()) for s in budgets.values()) / running_s / (cores or 1)]
@@ -385,7 +385,7 @@ def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
     return f"{text}. Packets may then be lost there."
 
 
-def _trial(gain: Gain, run: Run) -> str:
+def _trial(gain: Gain, run: PastRun) -> str:
     settings = []
     for name in gain.connections:
         c = run.ends[name]
@@ -394,7 +394,7 @@ def _trial(gain: Gain, run: Run) -> str:
     return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
 
 
-def _in_process(run: Run, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
+def _in_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
     """One thread runs all hooks: none overlap, so that no node holds up another."""
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in budgets.items()), key=lambda x: x[1][1]
