@@ -64,7 +64,7 @@ def start_dashboard(
     environment: Mapping[str, str],
 ) -> int:
     """Start the process for a run that has a control socket; returns its id."""
-    from neuros.viewers.dashboard.plan import plan as shown_plan
+    from neuros.viewers.project_view import project_view
 
     return dashboard.start(
         [sys.executable, "-m", "neuros.cli", "dashboard", str(run_folder)],
@@ -72,7 +72,7 @@ def start_dashboard(
         environment,
         {
             "run": run_id,
-            "plan": shown_plan(plan.project, plan.names),
+            "plan": project_view(plan.project, plan.names),
             "names": plan.names,
             "logs": {name: str(path) for name, path in logs.items()},
             "is_one_process": plan.backend == "in-process",

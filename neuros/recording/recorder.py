@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault
 from neuros.recording.bag_files import BagWriter, Definitions, Stored
@@ -205,20 +206,18 @@ class Recorder:
         for source in self._sources:
             source.reader.remove_up_to(safe_ns)
 
-    def _numbers(self, topics: Any) -> tuple[int, ...]:
+    def _numbers(self, topics: Iterable[Topic]) -> tuple[int, ...]:
         numbers = (self.number_of(topic) for topic in topics)
         return tuple(number for number in numbers if number is not None)
 
 
+@dataclass
 class _SpoolSource:
-    """A spool, and the topics of its streams."""
+    """A spool, and the numbers of the topics of each of its streams."""
 
-    def __init__(
-        self, reader: SpoolReader, topics: list[tuple[int, ...]], *, owns_time: bool
-    ) -> None:
-        self.reader = reader
-        self.topics = topics
-        self.owns_time = owns_time
+    reader: SpoolReader
+    topics: list[tuple[int, ...]]
+    owns_time: bool
 
 
 def has_spools(run: Path, nodes: Collection[str]) -> bool:
