@@ -19,7 +19,7 @@ import os
 import sqlite3
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from struct import Struct, pack
@@ -45,36 +45,30 @@ _LAST_NS = (1 << 63) - 1
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # as rmw has it for "no deadline"
 
 
-class Definitions:
-    """The definitions of message types: those that come with ROS, and what is installed here."""
+def _define(type_name: str, store: Typestore) -> None:
+    """Add an installed type to the store, and all types of its fields.
 
-    def __init__(self) -> None:
-        self.store: Typestore = get_typestore(Stores.ROS2_JAZZY)
-
-    def add(self, type_name: str) -> None:
-        """See to it that the store has a type, and all types of its fields.
-
-        Raises:
-            EnvironmentFault: if no definition of one of them is found.
-        """
-        if type_name in self.store.fielddefs:
-            return
-        path = _definition_file(type_name)
-        if path is None:
+    Raises:
+        EnvironmentFault: if no definition of one of them is found.
+    """
+    if type_name in store.fielddefs:
+        return
+    path = _definition_file(type_name)
+    if path is None:
+        raise EnvironmentFault(
+            f"message type {type_name} cannot be recorded: its definition"
+            f" (share/{type_name}.msg) is not installed here"
+        )
+    types = get_types_from_msg(path.read_text("utf-8"), type_name)
+    for used in _types_of_fields(types[type_name][1]):
+        if used.endswith("/msg/wstring"):
             raise EnvironmentFault(
-                f"message type {type_name} cannot be recorded: its definition"
-                f" (share/{type_name}.msg) is not installed here"
+                f"message type {type_name} cannot be recorded: it has a wstring, which the"
+                " library that writes bags does not know; use string, which is UTF-8"
             )
-        types = get_types_from_msg(path.read_text("utf-8"), type_name)
-        for used in _types_of_fields(types[type_name][1]):
-            if used.endswith("/msg/wstring"):
-                raise EnvironmentFault(
-                    f"message type {type_name} cannot be recorded: it has a wstring, which the"
-                    " library that writes bags does not know; use string, which is UTF-8"
-                )
-            if used != type_name:
-                self.add(used)
-        self.store.register(types)
+        if used != type_name:
+            _define(used, store)
+    store.register(types)
 
 
 def _definition_file(type_name: str) -> Path | None:
@@ -124,14 +118,19 @@ class BagWriter:
         self.counts: dict[int, int] = {}
         self._folder, self._storage, self._custom = path, storage, dict(custom)
         self._file = _McapFile(path) if storage == "mcap" else _SqliteFile(path)
+        self._types = get_typestore(Stores.ROS2_JAZZY)
         self._topics: list[dict[str, Any]] = []
         self._first_ns, self._last_ns = _LAST_NS, 0
 
-    def add_topic(self, topic: Topic, definitions: Definitions) -> int:
-        """The number of a new topic, for :meth:`put`. Raises ``EnvironmentFault``."""
-        definitions.add(topic.type)
-        definition, _ = definitions.store.generate_msgdef(topic.type, ros_version=2)
-        digest = definitions.store.hash_rihs01(topic.type)
+    def add_topic(self, topic: Topic) -> int:
+        """The number of a new topic, for :meth:`put`.
+
+        Raises:
+            EnvironmentFault: if the definition of its type is not installed.
+        """
+        _define(topic.type, self._types)
+        definition, _ = self._types.generate_msgdef(topic.type, ros_version=2)
+        digest = self._types.hash_rihs01(topic.type)
         number = len(self._topics) + 1
         self._file.add_topic(number, topic, definition, digest)
         self.counts[number] = 0
@@ -413,9 +412,9 @@ class _SqliteFile:
         self._insert("messages", None, topic, log_ns, data)
 
     def checkpoint(self, metadata: str) -> None:
-        self._connection.execute("DELETE FROM metadata")
+        self._execute("DELETE FROM metadata")
         self._insert("metadata", None, 9, metadata)
-        self._connection.commit()
+        self._execute("COMMIT")
         self.pending_bytes = 0
 
     def shut(self) -> None:
@@ -423,7 +422,13 @@ class _SqliteFile:
 
     def _insert(self, table: str, *values: Any) -> None:
         places = ", ".join("?" * len(values))
-        self._connection.execute(f"INSERT INTO {table} VALUES({places})", values)
+        self._execute(f"INSERT INTO {table} VALUES({places})", values)
+
+    def _execute(self, statement: str, values: Sequence[Any] = ()) -> None:
+        try:
+            self._connection.execute(statement, values)
+        except sqlite3.Error as error:  # the disk is full, say
+            raise OSError(errno.EIO, str(error)) from error
 
 
 class Stored(NamedTuple):

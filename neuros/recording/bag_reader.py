@@ -224,15 +224,7 @@ class Bag:
 
 
 def open_bag(run: str | os.PathLike[str]) -> Bag:
-    """Open what a run has recorded; one that was cut off is completed first.
-
-    Args:
-        run: the run folder, or a rosbag2 folder.
-
-    Raises:
-        UsageError: if there is none, or this version of NeuROS cannot read it.
-        EnvironmentFault: if it is damaged.
-    """
+    """Open the bag of a run, as :func:`neuros.bag.open`, but without a warning."""
     folder = Path(run)
     if (folder / "metadata.yaml").is_file() and not (folder / PLAN_NAME).is_file():
         if not (folder.parent / PLAN_NAME).is_file():

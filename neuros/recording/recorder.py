@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_files import BagWriter, Definitions, Stored
+from neuros.recording.bag_files import BagWriter, Stored
 from neuros.recording.recording_plan import BAG_NAME, LISTENER, RecordingPlan, Topic
 from neuros.recording.spool import (
     NO_TIME,
@@ -61,7 +61,6 @@ class Recorder:
         self._complain = complain
         self._is_new = is_new
         self._clock = clock
-        self._definitions = Definitions()
         self.bag = BagWriter(run / BAG_NAME, plan.storage, plan.custom)
         self.topics: dict[Topic, int | None] = {}
         for topic in plan.topics:
@@ -90,7 +89,7 @@ class Recorder:
         """The number of a topic in the bag, ``None`` if it cannot be recorded."""
         if topic not in self.topics:
             try:
-                self.topics[topic] = self.bag.add_topic(topic, self._definitions)
+                self.topics[topic] = self.bag.add_topic(topic)
             except EnvironmentFault as error:
                 self.topics[topic] = None
                 self._complain(f"{topic.name} is not recorded: {error}")

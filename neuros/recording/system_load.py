@@ -279,7 +279,7 @@ def _load_of(process: psutil.Process, cpu_s: float | None = None) -> GroupLoad |
             memory_bytes, threads = process.memory_info().rss, process.num_threads()
     except psutil.Error:
         return None
-    # One that is about to end, or that nobody has waited for yet, has given its memory back.
+    # A process that is about to end, or has not been waited for, has given its memory back.
     return GroupLoad(cpu_s, memory_bytes, threads) if memory_bytes else None
 
 

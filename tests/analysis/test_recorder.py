@@ -231,6 +231,18 @@ def test_a_full_disk_leaves_the_bag_of_the_last_checkpoint(
         assert [at for _, at, _ in reader.messages()] == [10]
 
 
+def test_a_full_disk_leaves_the_sqlite_bag_of_the_last_checkpoint(tmp_path: Path) -> None:
+    recorder = Recorder(plan(storage="sqlite3"), tmp_path, fail)
+    recorder.bag.put(1, 10, 10, number(1))
+    recorder.bag.checkpoint()
+    recorder.bag._file._connection.execute("PRAGMA max_page_count=1")  # as many as there are
+    with pytest.raises(OSError, match="disk is full"):
+        recorder.bag.put(1, 20, 20, bytes(50_000))
+    recorder.abandon()
+    with Reader(tmp_path / "bag") as reader:
+        assert [at for _, at, _ in reader.messages()] == [10]
+
+
 # ---------------------------------------------------------------------- what was cut off
 
 
