@@ -53,10 +53,11 @@ class Series:
     def _shorten(self) -> None:
         if self._duration_s is not None:
             start_s = max(self.times) - self._duration_s
-            kept = [place for place, time_s in enumerate(self.times) if time_s >= start_s]
+            kept = [
+                pair for pair in zip(self.times, self.values, strict=True) if pair[0] >= start_s
+            ]
             if len(kept) < _MOST_POINTS * 3 // 4:
-                self.times = [self.times[place] for place in kept]
-                self.values = [self.values[place] for place in kept]
+                self.times, self.values = (list(each) for each in zip(*kept, strict=True))
                 return
         del self.times[1::2], self.values[1::2]
 
@@ -102,7 +103,7 @@ class Panel:
     def draw(self, axes: Sequence[Any], end_s: float) -> None:
         """Draw everything anew, up to a time that all parts of the figure share."""
         self._draw(axes, end_s)
-        axes[0].set_title(self.caption or "", loc="left", fontsize="small")
+        axes[0].set_title(self.caption, loc="left", fontsize="small")
 
     def _draw(self, axes: Sequence[Any], end_s: float) -> None:
         raise NotImplementedError
@@ -392,9 +393,9 @@ class Messages:
         self._data = bytearray()
         self.is_over = False
 
-    def wait(self, timeout_s: float) -> None:
-        """Until something can be read."""
-        select.select([self._descriptor], [], [], timeout_s)
+    def wait(self, timeout_s: float) -> bool:
+        """Whether something can be read, now or before the time is over."""
+        return bool(select.select([self._descriptor], [], [], timeout_s)[0])
 
     def read(self) -> Iterator[tuple[Any, ...]]:
         """All that is complete after one read; the other end is NeuROS in a node's process."""
@@ -492,8 +493,7 @@ def main() -> None:
     drawing: Drawing | None = None
     pause_s = _HEED_S
     while not messages.is_over:
-        messages.wait(pause_s)
-        if select.select([0], [], [], 0.0)[0]:
+        if messages.wait(pause_s):
             for message in messages.read():
                 if message[0] == "figure":
                     drawing = Drawing(*message[1:])
