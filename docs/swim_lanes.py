@@ -15,8 +15,8 @@ import tempfile
 from pathlib import Path
 
 import neuros
-from neuros.analysis.review.charts import timeline_figure
-from neuros.analysis.review.page import png
+from neuros.analysis.charts import timeline_figure
+from neuros.analysis.page import png
 from neuros.analysis.run_record import open_for_review
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -163,8 +163,8 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _report(options: argparse.Namespace) -> int:
-    from neuros.analysis.review.findings import findings_of
-    from neuros.analysis.review.page import report_page
+    from neuros.analysis.findings import findings_of
+    from neuros.analysis.page import report_page
     from neuros.analysis.run_record import open_for_review
 
     run = open_for_review(options.run)
@@ -186,7 +186,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.analysis.review.page import figures_of
+    from neuros.analysis.page import figures_of
 
     try:
         return figures_of(run)
@@ -195,7 +195,7 @@ def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from neuros.analysis.review.comparison import comparison_rows, comparison_table, labels_of
+    from neuros.analysis.comparison import comparison_rows, comparison_table, labels_of
 
     runs, refused = _readable(options.runs)
     header, rows = comparison_rows(runs)
@@ -227,9 +227,9 @@ def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[UsageError]]
 
 
 def _comparison(runs: list[PastRun], header: list[str], rows: list[list[str]]) -> bytes:
-    from neuros.analysis.review.comparison import comparison_figure, labels_of
-    from neuros.analysis.review.findings import findings_of
-    from neuros.analysis.review.page import bottleneck_part, figure_part, page, png, table_part
+    from neuros.analysis.comparison import comparison_figure, labels_of
+    from neuros.analysis.findings import findings_of
+    from neuros.analysis.page import bottleneck_part, figure_part, page, png, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from launching import BACKENDS, EXAMPLES, launch
 
-from neuros.analysis.review.charts import time_budget_figure
+from neuros.analysis.charts import time_budget_figure
 from neuros.analysis.run_record import open_for_review
 from neuros.cli.main import main
 

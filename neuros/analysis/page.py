@@ -11,7 +11,7 @@ from html import escape
 from string import Template
 from typing import Any
 
-from neuros.analysis.review.charts import (
+from neuros.analysis.charts import (
     counts_figure,
     graph_figure,
     latency_figure,
@@ -21,7 +21,7 @@ from neuros.analysis.review.charts import (
     time_figure,
     timeline_figure,
 )
-from neuros.analysis.review.findings import Findings
+from neuros.analysis.findings import Findings
 from neuros.analysis.run_record import PastRun
 
 _PAGE = Template("""\

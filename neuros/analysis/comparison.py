@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from neuros.analysis.review.charts import add_legend, colour, new_figure, plain
+from neuros.analysis.charts import add_legend, colour, new_figure, plain
 from neuros.analysis.run_record import PastRun, consumed_percent
 
 _Figures = dict[tuple[str, int], float | None]
