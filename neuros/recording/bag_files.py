@@ -231,9 +231,11 @@ class _McapFile:
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         self._safe_bytes = 0  # without the summary, that of the last checkpoint
         self._summary = b""
-        header = _record(_HEADER, _text("ros2"), _text(f"neuros-{__version__}"))
-        self._pending = bytearray(_MAGIC + header)
-        self._chunk = bytearray()
+        self._size = 0  # with all that is pending
+        self._pending: list[bytes] = []
+        self._add(_MAGIC, _record(_HEADER, _text("ros2"), _text(f"neuros-{__version__}")))
+        self._chunk: list[bytes] = []
+        self._chunk_size = 0
         self._schemas: dict[str, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._counts: dict[int, int] = {}
@@ -244,14 +246,14 @@ class _McapFile:
 
     @property
     def pending_bytes(self) -> int:
-        return len(self._pending) + len(self._chunk)
+        return self._size - self._safe_bytes + self._chunk_size
 
     def add_topic(self, number: int, topic: Topic, definition: str, digest: str) -> None:
         if topic.type not in self._schemas:
             head = pack("<H", len(self._schemas) + 1)
             texts = _text(topic.type), _text("ros2msg"), _text(definition)
             self._schemas[topic.type] = _record(_SCHEMA, head, *texts)
-            self._chunk += self._schemas[topic.type]
+            self._add_to_chunk(self._schemas[topic.type])
         self._channels[number] = _record(
             _CHANNEL,
             pack("<HH", number, [*self._schemas].index(topic.type) + 1),
@@ -259,19 +261,17 @@ class _McapFile:
             _text("cdr"),
             _text(_text("offered_qos_profiles") + _text(_yaml(_qos_profiles(topic)))),
         )
-        self._chunk += self._channels[number]
+        self._add_to_chunk(self._channels[number])
         self._counts[number] = 0
 
     def put(self, topic: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        chunk = self._chunk
-        self._places[topic].extend((log_ns, len(chunk)))
+        self._places[topic].extend((log_ns, self._chunk_size))
         number = self._counts[topic] = self._counts[topic] + 1
         size = _MESSAGE_HEAD.size + len(data)
-        chunk += _MESSAGE_RECORD.pack(
-            _MESSAGE, size, topic, number & 0xFFFFFFFF, log_ns, publish_ns
-        )
-        chunk += data
-        if len(chunk) > _CHUNK_BYTES:
+        number &= 0xFFFFFFFF
+        head = _MESSAGE_RECORD.pack(_MESSAGE, size, topic, number, log_ns, publish_ns)
+        self._add_to_chunk(head, data)
+        if self._chunk_size > _CHUNK_BYTES:
             self._close_chunk()
 
     def checkpoint(self, metadata: str) -> None:
@@ -280,21 +280,26 @@ class _McapFile:
             self._close_chunk()
         summary = self._new_summary(metadata)
         try:
-            self._write(self._pending + summary)
+            self._write(b"".join((*self._pending, summary)))
         except OSError:
             self._write(self._summary)  # there was room for it before
             raise
         self._summary = summary
-        self._safe_bytes += len(self._pending)
-        self._pending = bytearray()
+        self._safe_bytes = self._size
+        self._pending.clear()
 
     def shut(self) -> None:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
-    def _size(self) -> int:
-        return self._safe_bytes + len(self._pending)
+    def _add(self, *parts: bytes) -> None:
+        self._pending += parts
+        self._size += sum(map(len, parts))
+
+    def _add_to_chunk(self, *parts: bytes) -> None:
+        self._chunk += parts
+        self._chunk_size += sum(map(len, parts))
 
     def _close_chunk(self) -> None:
         times = [ns for places in self._places.values() for ns in places[::2]]
@@ -302,26 +307,27 @@ class _McapFile:
         if times:
             self._first_ns = min(self._first_ns, first_ns)
             self._last_ns = max(self._last_ns, last_ns)
-        start, size = self._size(), len(self._chunk)
-        head = _CHUNK_HEAD.pack(first_ns, last_ns, size, 0)
-        self._pending += _record(_CHUNK, head, _text(""), pack("<Q", size), self._chunk)
-        length = self._size() - start
+        start, size = self._size, self._chunk_size
+        head = _CHUNK_HEAD.pack(first_ns, last_ns, size, 0) + _text("") + pack("<Q", size)
+        self._add(_RECORD_HEAD.pack(_CHUNK, len(head) + size), head, *self._chunk)
+        length = self._size - start
         offsets = b""
         for channel, places in self._places.items():
-            offsets += pack("<HQ", channel, self._size())
+            offsets += pack("<HQ", channel, self._size)
             index = pack(f"<HI{len(places)}Q", channel, 8 * len(places), *places)
-            self._pending += _record(_MESSAGE_INDEX, index)
+            self._add(_record(_MESSAGE_INDEX, index))
         self._chunk_indexes.append(
             _record(
                 _CHUNK_INDEX,
                 pack("<QQQQ", first_ns, last_ns, start, length),
                 _text(offsets),
-                pack("<Q", self._size() - start - length),
+                pack("<Q", self._size - start - length),
                 _text(""),
                 pack("<QQ", size, size),
             )
         )
-        self._chunk = bytearray()
+        self._chunk.clear()
+        self._chunk_size = 0
         self._places.clear()
 
     def _new_summary(self, metadata: str) -> bytes:
@@ -330,12 +336,12 @@ class _McapFile:
         pairs = _text(_text("serialized_metadata") + _text(metadata))
         metadata_record = _record(_METADATA, name, pairs)
         before = metadata_record + _record(_DATA_END, pack("<I", 0))
-        place = pack("<QQ", self._size(), len(metadata_record))
+        place = pack("<QQ", self._size, len(metadata_record))
         counts = b"".join(pack("<HQ", *each) for each in self._counts.items())
         number = sum(self._counts.values())
         sizes = len(self._schemas), len(self._channels), 0, 1, len(self._chunk_indexes)
         statistics = pack("<QHIIIIQQ", number, *sizes, self._first_ns, self._last_ns)
-        start = self._size() + len(before)
+        start = self._size + len(before)
         summary, offsets = b"", b""
         for kind, records in (
             (_SCHEMA, self._schemas.values()),
@@ -352,7 +358,7 @@ class _McapFile:
         footer = _record(_FOOTER, pack("<QQI", start, start + len(summary), 0))
         return before + summary + offsets + footer + _MAGIC
 
-    def _write(self, data: bytes | bytearray) -> None:
+    def _write(self, data: bytes) -> None:
         at = self._safe_bytes
         left = memoryview(data)
         while left:
@@ -361,7 +367,7 @@ class _McapFile:
         os.ftruncate(self._descriptor, at)
 
 
-def _record(kind: int, *parts: bytes | bytearray) -> bytes:
+def _record(kind: int, *parts: bytes) -> bytes:
     content = b"".join(parts)
     return _RECORD_HEAD.pack(kind, len(content)) + content
 
