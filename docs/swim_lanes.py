@@ -15,9 +15,9 @@ import tempfile
 from pathlib import Path
 
 import neuros
-from neuros.analysis.review.page import png
-from neuros.analysis.review.run import open_for_review
-from neuros.analysis.review.timeline import timeline_figure
+from neuros.analysis.charts import timeline_figure
+from neuros.analysis.page import png
+from neuros.analysis.run_record import open_for_review
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"

@@ -13,11 +13,11 @@
 import os
 import warnings
 
-from neuros.recording.bag.bag_reader import Bag, RecordedTopic, open_bag
+from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
 
 
 def open(run: str | os.PathLike[str]) -> Bag:
-    """Open what a run has recorded; one that was cut off is completed first.
+    """Open the bag of a run; one that was cut off is completed first.
 
     Warns where packets are missing that were there when the run ended.
 

@@ -76,7 +76,7 @@ def read(folder: Path, entry: Entry) -> Reading:
     """What a run has left behind. Raises ``OSError`` or ``UsageError`` where that is not all."""
     past = open_run(folder)
     name = next(iter(CONNECTIONS))
-    sent_ns = after_the_start(read_packets(folder, past.connection(name)).sent_ns)
+    sent_ns = after_the_start(read_packets(folder, past.ends[name]).sent_ns)
     figures: dict[str, float | None] = {
         "speed_percent": speed_percent(sent_ns, CABIN_PERIOD_S),
         "wall_s": past.record["wall_s"],

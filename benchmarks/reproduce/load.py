@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from statistics import fmean
 
-from neuros.recording.load_table import FILE_NAME
+from neuros.recording.system_load import FILE_NAME
 
 LAUNCHER = "launcher"
 _CPU, _MEMORY = ".cpu_percent", ".memory_bytes"

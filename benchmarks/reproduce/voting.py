@@ -56,7 +56,7 @@ def run(name: str, folder: Path, wall_s: float, backend: str) -> None:
 def read(folder: Path, entry: Entry) -> Reading:
     """What a run has left behind. Raises ``OSError`` or ``UsageError`` where that is not all."""
     past = open_run(folder)
-    asked_ns = [int(ns) for ns in read_packets(folder, past.connection(_ASKED)).sent_ns]
+    asked_ns = [int(ns) for ns in read_packets(folder, past.ends[_ASKED]).sent_ns]
     figures = interval_figures(intervals_of(asked_ns, THINK_S))
     remarks = {"backend": past.record["backend"]}
     return Reading(entry.title, entry.name, {**figures, **_in_seconds(figures)}, remarks, None)

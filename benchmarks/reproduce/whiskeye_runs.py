@@ -94,7 +94,7 @@ def read(folder: Path, entry: Entry) -> Reading:
     estimates, truths = _headings(folder / "visualiser" / "head_direction.csv")
     comparison = heading.compare(estimates, truths)
     error_deg = np.degrees(comparison.error_rad)
-    sent_ns = after_the_start(read_packets(folder, past.connection(IMU)).sent_ns)
+    sent_ns = after_the_start(read_packets(folder, past.ends[IMU]).sent_ns)
     ticks = record["nodes"]["robot"]["hooks"].get(TIMED_HOOK, {}).get("ticks")
     figures: dict[str, float | None] = {
         "speed_percent": speed_percent(sent_ns, IMU_PERIOD_S),

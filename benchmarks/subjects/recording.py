@@ -14,8 +14,8 @@ from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, 
 from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
 from benchmarks.subjects.whiskeye import WHISKEYE
 from neuros.backends.recording import RecorderProcess
-from neuros.recording.plan import RecordingPlan, Stream, Topic
 from neuros.recording.recorder import Recorder
+from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
 from neuros.recording.spool import SpoolWriter
 
 RECORD = ("-r",)

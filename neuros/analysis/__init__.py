@@ -1,1 +1,1 @@
-"""Analysis of runs: `run.json`, differences, budgets, and the review of a past run."""
+"""Analysis of runs: `run.json`, differences, budgets, reports and comparisons."""

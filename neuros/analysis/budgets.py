@@ -85,14 +85,14 @@ def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) 
 def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator[str]:
     if limit_ms is None:
         return
-    for node, books in record["nodes"].items():
-        if _has_ticks(books) and not _is_known(books):
+    for node, metrics in record["nodes"].items():
+        if _has_ticks(metrics) and not _is_known(metrics):
             yield (
                 f"how far ticks of {node} were off their period is not known, allowed are"
                 f" {limit_ms:g} ms"
             )
             continue
-        for hook, figures in (books.get("hooks") or {}).items():
+        for hook, figures in (metrics.get("hooks") or {}).items():
             ticks = figures.get("ticks")
             if ticks and ticks["largest_error_ms"] > limit_ms:
                 yield (

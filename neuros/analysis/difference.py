@@ -1,25 +1,97 @@
-"""Comparison of the packets of two runs, up to the first difference."""
+"""Comparison of the packets of two runs, from lists of their nodes and from their bags."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from neuros.analysis.packets import Numbers, Packets, read_packets
 from neuros.analysis.run_record import PastRun
+from neuros.errors import NeurosError
 from neuros.project.model import Connection
+from neuros.recording.bag_files import stored_messages
+from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
+from neuros.recording.recording_plan import PLAN_NAME
+
+_LARGE_BYTES = 64 * 1024
+"""The buffers of larger messages travel beside them, and nodes digest them apart."""
 
 
-class Recordings(Protocol):
-    """Bags of runs (:class:`neuros.analysis.recorded_packets.RecordedPackets`)."""
+class RecordedPackets:
+    """Bags of runs.
 
-    def message(self, run: Path, connection: str, number: int) -> Any: ...
-    def digests(self, run: Path, connection: str) -> Numbers | None: ...
-    def are_as_of_nodes(self, run: Path, connection: str) -> bool: ...
+    Attributes:
+        remarks: why a bag could not be read, a sentence each.
+    """
+
+    def __init__(self) -> None:
+        self.remarks: list[str] = []
+        self._bags: dict[Path, Bag | None] = {}
+        self._digests: dict[Path, Mapping[str, tuple[Numbers, bool]]] = {}
+
+    def message(self, run: Path, connection: str, number: int) -> Any:
+        """A packet of a connection by its number, from 1; ``None`` if it was not recorded."""
+        topic = self._topic(run, connection)
+        return topic.message(number - 1) if topic and number <= topic.count else None
+
+    def digests(self, run: Path, connection: str) -> Numbers | None:
+        """A digest of each packet that was sent; ``None`` if the connection was not recorded."""
+        found = self._digests_of(run, connection)
+        return None if found is None else found[0]
+
+    def are_as_of_nodes(self, run: Path, connection: str) -> bool:
+        """Whether nodes digest them alike: small messages, which travel whole."""
+        found = self._digests_of(run, connection)
+        return found is not None and found[1]
+
+    def _digests_of(self, run: Path, connection: str) -> tuple[Numbers, bool] | None:
+        topic = self._topic(run, connection)
+        if topic is None:
+            return None
+        if run not in self._digests:
+            self._digests[run] = _digests(self._bags[run])
+        nothing = np.array([], np.uint64), True
+        return self._digests[run].get(topic.name, nothing)
+
+    def _topic(self, run: Path, connection: str) -> RecordedTopic | None:
+        if run not in self._bags:
+            self._bags[run] = self._open(run)
+        bag = self._bags[run]
+        topics = () if bag is None else bag.topics.values()
+        return next((topic for topic in topics if topic.connection == connection), None)
+
+    def _open(self, run: Path) -> Bag | None:
+        if not (run / PLAN_NAME).exists():
+            return None
+        try:
+            return open_bag(run)
+        except NeurosError as error:
+            self.remarks.append(str(error))
+            return None
+
+
+def _digests(bag: Bag | None) -> dict[str, tuple[Numbers, bool]]:
+    """By topic, digests in the order in which packets were sent, and whether all are small."""
+    times: dict[str, array[int]] = {}
+    digests: dict[str, array[int]] = {}
+    large: set[str] = set()
+    for topic, log_ns, _, data in stored_messages(bag.folder) if bag else ():
+        times.setdefault(topic, array("q")).append(log_ns)
+        padded = data + bytes(-len(data) % 4)
+        digests.setdefault(topic, array("Q")).append(xxh3_64_intdigest(padded))
+        if len(data) >= _LARGE_BYTES:
+            large.add(topic)
+    found = {}
+    for topic, at_ns in times.items():
+        order = np.argsort(np.frombuffer(at_ns, np.int64), kind="stable")
+        found[topic] = np.frombuffer(digests[topic], np.uint64)[order], topic not in large
+    return found
 
 
 @dataclass(frozen=True)
@@ -49,7 +121,7 @@ class _Difference:
     packet: tuple[str, int] | None = None
 
 
-def compare(a: PastRun, b: PastRun, recorded: Recordings) -> Verdict:
+def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
     """Compare what was sent on every connection, and what hooks took on those that lose nothing.
 
     Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
@@ -79,7 +151,7 @@ def compare(a: PastRun, b: PastRun, recorded: Recordings) -> Verdict:
 def _compare_connection(
     name: str,
     runs: tuple[PastRun, PastRun],
-    recorded: Recordings,
+    recorded: RecordedPackets,
     found: list[_Difference],
     remarks: list[str],
 ) -> int:
@@ -119,25 +191,26 @@ def _compare_connection(
 
 
 def _packets(
-    name: str, runs: tuple[PastRun, PastRun], recorded: Recordings
+    name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
 ) -> tuple[Packets, Packets]:
     """The lists of both runs, with digests from their bags where nodes have kept none.
 
     If one run has digests of its nodes and the other only a bag, both are taken from bags, where
     both have one; a bag stands beside digests of nodes only where both digest packets alike.
     """
-    packets = [read_packets(run.folder, run.connection(name)) for run in runs]
+    packets = [read_packets(run.folder, run.ends[name]) for run in runs]
     lacks = [
         _lacks_digests(run.connections[name]["sent"], listed)
         for run, listed in zip(runs, packets, strict=True)
     ]
     if not any(lacks):
         return packets[0], packets[1]
-    connection = runs[0].connection(name)
+    connection = runs[0].ends[name]
     bags = [recorded.digests(run.folder, name) for run in runs]
     if bags[0] is not None and bags[1] is not None:
-        return _recorded(packets[0], bags[0], connection), _recorded(
-            packets[1], bags[1], connection
+        return (
+            _recorded(packets[0], bags[0], connection),
+            _recorded(packets[1], bags[1], connection),
         )
     for place, run in enumerate(runs):
         bag = bags[place]
@@ -171,7 +244,7 @@ def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
 
 
-def _field(folders: tuple[Path, Path], name: str, number: int, recorded: Recordings) -> str:
+def _field(folders: tuple[Path, Path], name: str, number: int, recorded: RecordedPackets) -> str:
     """In which field a packet differs, as far as it was recorded."""
     messages = [recorded.message(folder, name, number) for folder in folders]
     if None in messages:

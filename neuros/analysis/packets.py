@@ -1,4 +1,4 @@
-"""Packet lists of a run: times, digests and latencies, as its nodes have written them.
+"""Lists that nodes of a run have written: times, digests and latencies of packets, executions.
 
 Reads what :mod:`neuros.node.packet_log` writes. Both ends' times are of the monotonic clock
 of one machine, which all its processes share; the two ends of a connection on different machines
@@ -7,6 +7,8 @@ leave their lists in different run folders, and no latency is worked out for the
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,17 +63,14 @@ class Packets:
         Where packets may be lost on their way, those that arrived are found by their digests among
         those that were sent; ``None`` if that is not possible.
         """
-        places = self.taken - 1
+        places, sent_ns = self.taken - 1, self.sent_ns
         if may_lose:
             which = self._which_arrived()
             if which is None:
                 return None
-            is_known = places < len(which)
-            places, taken_ns = which[places[is_known]], self.taken_ns[is_known]
-        else:
-            is_known = places < len(self.sent_ns)
-            places, taken_ns = places[is_known], self.taken_ns[is_known]
-        found: Numbers = taken_ns - self.sent_ns[places]
+            sent_ns = sent_ns[which]
+        is_known = places < len(sent_ns)
+        found: Numbers = self.taken_ns[is_known] - sent_ns[places[is_known]]
         return found
 
     def _which_arrived(self) -> Numbers | None:
@@ -110,11 +109,11 @@ def packet_figures(packets: Packets, *, may_lose: bool) -> dict[str, Any]:
 
     ``latency_ms`` is ``None`` where it cannot be told, ``digests`` where none were kept.
     """
+    return {"latency_ms": _latency_ms(packets, may_lose), "digests": _digests(packets)}
+
+
+def _latency_ms(packets: Packets, may_lose: bool) -> dict[str, float] | None:
     latencies_ns = packets.latencies_ns(may_lose=may_lose)
-    return {"latency_ms": _latency_ms(latencies_ns), "digests": _digests(packets)}
-
-
-def _latency_ms(latencies_ns: Numbers | None) -> dict[str, float] | None:
     if latencies_ns is None or not len(latencies_ns):
         return None
     percentiles = np.percentile(latencies_ns, PERCENTILES) / 1e6
@@ -137,9 +136,57 @@ def _digests(packets: Packets) -> dict[str, Any] | None:
     }
 
 
-def _numbers(file: Path, kind: Any) -> Numbers:
+def may_have_lost(figures: Mapping[str, Any]) -> bool:
+    """Whether packets of a connection, from ``run.json``, may have been lost on their way."""
+    is_best_effort = figures.get("discard_limit") is None
+    return is_best_effort and figures.get("sent") != figures.get("received")
+
+
+@dataclass(frozen=True)
+class Trace:
+    """First executions of a node's hooks; times of the monotonic clock, in nanoseconds.
+
+    Attributes:
+        hooks: name and kind of each hook that ran.
+        which: of each execution, its hook's place in ``hooks``, (executions,).
+        starts_ns, ends_ns: from when to when, (executions,).
+        credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
+    """
+
+    hooks: tuple[tuple[str, str], ...]
+    which: Numbers
+    starts_ns: Numbers
+    ends_ns: Numbers
+    credits: Numbers
+
+    @property
+    def is_running(self) -> Numbers:
+        """Which executions were not of initialise hooks, (executions,)."""
+        initialisers = [i for i, (_, kind) in enumerate(self.hooks) if kind == "initialise"]
+        found: Numbers = ~np.isin(self.which, initialisers)
+        return found
+
+
+def read_trace(folder: Path) -> Trace:
+    """Read the lists of a node; empty where there are none."""
+    executions = _numbers(folder / "executions", np.int64, 3)
+    try:
+        hooks = json.loads((folder / "hooks.json").read_text("utf-8"))
+        names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
+    except (OSError, ValueError, TypeError, KeyError):
+        names = []
+    # A node that was killed may have listed a hook's execution, and not its name.
+    count = int(executions[:, 0].max()) + 1 if len(executions) else 0
+    names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
+    which, starts_ns, ends_ns = executions.T
+    return Trace(tuple(names), which, starts_ns, ends_ns, _numbers(folder / "credits", np.int64, 3))
+
+
+def _numbers(file: Path, kind: Any, columns: int = 1) -> Numbers:
+    """All complete rows; one number in each makes an array of one dimension."""
     try:
         data = file.read_bytes()
     except OSError:  # the node has sent, or received, nothing
         data = b""
-    return np.frombuffer(data[: len(data) // 8 * 8], dtype=kind)
+    found = np.frombuffer(data[: len(data) // (8 * columns) * 8 * columns], dtype=kind)
+    return found if columns == 1 else found.reshape(-1, columns)

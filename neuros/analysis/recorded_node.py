@@ -14,8 +14,8 @@ from neuros.errors import UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
-from neuros.recording.bag.bag_reader import Bag, open_bag
-from neuros.recording.plan import RecordingPlan, load_plan
+from neuros.recording.bag_reader import Bag, open_bag
+from neuros.recording.recording_plan import RecordingPlan, load_plan
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 
@@ -64,7 +64,7 @@ class RecordedNode:
         self.event_log: array[int] = array("q")
         data = _event_log_of(run.folder, self._name).read_bytes()
         self.event_log.frombytes(data[: len(data) // 8 * 8])
-        self._arrivals: dict[Connection | str, _Arrivals] = {}
+        self._arrivals: dict[Connection | str, Sequence[bytes | None]] = {}
         self._check_inputs()
 
     def arrived(self, key: Connection | str, number: int) -> bytes | None:
@@ -74,10 +74,10 @@ class RecordedNode:
         Raises:
             UsageError: if it cannot be told which one that was.
         """
-        arrivals = self._arrivals.get(key)
-        if arrivals is None:
-            arrivals = self._arrivals[key] = self._find_arrivals(key)
-        return arrivals.packet(number)
+        if key not in self._arrivals:
+            self._arrivals[key] = self._heard(key) if isinstance(key, str) else self._received(key)
+        arrivals = self._arrivals[key]
+        return arrivals[number - 1] if number <= len(arrivals) else None
 
     def sent(self) -> dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]]:
         """Packets sent: by way and port or connection, the topics with name, type and packets.
@@ -130,23 +130,22 @@ class RecordedNode:
                 f" {_RECORD}"
             )
 
-    def _find_arrivals(self, key: Connection | str) -> _Arrivals:
-        if isinstance(key, str):
-            return self._heard(key)
-        packets = self._packets(f"{key.topic}/data")
-        if key.is_reliable or self._keeps(Way.RECEIVED, str(key)):
-            return _Arrivals(packets)
-        digests = read_packets(self._run.folder, key)
+    def _received(self, connection: Connection) -> Sequence[bytes | None]:
+        packets = [packet.data for packet in self._packets(f"{connection.topic}/data")]
+        if connection.is_reliable or self._keeps(Way.RECEIVED, str(connection)):
+            return packets
+        digests = read_packets(self._run.folder, connection)
         places = {digest: place for place, digest in enumerate(digests.sent.tolist())}
         received = digests.received.tolist()
         if not received or any(digest not in places for digest in received):
             raise UsageError(
-                f"replay: {key} may lose packets, and {self._run.folder} does not tell which of"
-                f" them arrived: {_RECORD}"
+                f"replay: {connection} may lose packets, and {self._run.folder} does not tell which"
+                f" of them arrived: {_RECORD}"
             )
-        return _Arrivals(packets, [places[digest] for digest in received])
+        arrived = (places[digest] for digest in received)
+        return [packets[place] if place < len(packets) else None for place in arrived]
 
-    def _heard(self, name: str) -> _Arrivals:
+    def _heard(self, name: str) -> Sequence[bytes]:
         """Only the first node that listens to an external topic records what arrives."""
         topic = self._topic(name)
         if not self._keeps(Way.HEARD, name):
@@ -154,7 +153,7 @@ class RecordedNode:
                 f"replay: another node has recorded {topic}, and it cannot be told which of its"
                 f" packets have reached '{self._name}'"
             )
-        return _Arrivals(self._packets(topic))
+        return [packet.data for packet in self._packets(topic)]
 
     def _topic(self, name: str) -> str:
         """The external topic of an input."""
@@ -164,24 +163,6 @@ class RecordedNode:
     def _keeps(self, way: Way, name: str) -> bool:
         streams = self.plan.streams.get(self._name, ())
         return any((stream.way, stream.name) == (way.value, name) for stream in streams)
-
-
-class _Arrivals:
-    """Arrivals of one input; ``places``: which of the packets, if not all."""
-
-    def __init__(self, packets: Sequence[Any], places: Sequence[int] | None = None) -> None:
-        self._packets, self._places = packets, places
-
-    def packet(self, number: int) -> bytes | None:
-        place = number - 1
-        if self._places is not None:
-            if place >= len(self._places):
-                return None
-            place = self._places[place]
-        if place >= len(self._packets):
-            return None
-        data: bytes = self._packets[place].data
-        return data
 
 
 def _event_log_of(run_folder: Path, name: str) -> Path:

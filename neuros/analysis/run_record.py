@@ -1,24 +1,31 @@
-"""Record of a run (``run.json``): made from the last reports of its nodes, and read again."""
+"""Record of a run (``run.json``): made from the last reports of its nodes, and read again.
+
+:func:`open_run` refuses what it cannot rely on. :func:`open_for_review` takes what there is, of a
+run that was cut off or of an older version, too, and says what is missing.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from neuros.engine.time_budget import time_budget_of
+from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
-from neuros.recording.load_table import load_table
+
+if TYPE_CHECKING:
+    from neuros.analysis.packets import Numbers, Packets, Trace
 
 FORMAT = 2
 """Of ``run.json``; grows when a reader of the old one could no longer read the new one."""
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
+_STATES = ("executing", "waiting", "blocked", "idle")
 
 
 class Ended(Protocol):
@@ -52,7 +59,7 @@ def run_record(
 ) -> dict[str, Any]:
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
-    sim_s, all_ran_s = max(sim_times, default=None), ended.running_s
+    sim_s, running_s = max(sim_times, default=None), ended.running_s
     all_metrics = {**ended.elsewhere, **{n: r["metrics"] or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -62,15 +69,15 @@ def run_record(
         "reason": ended.reason,
         "wall_s": wall_s,
         "sim_s": sim_s,
-        "running_s": all_ran_s,
+        "running_s": running_s,
         "paused_s": ended.paused_s,
         "real_time_factor": ended.real_time_factor,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, all_metrics, all_ran_s, run_folder, _cut_off(ended))
-            for c in _connections(files)
+            _connection(c, all_metrics, running_s, run_folder, _cut_off(ended))
+            for c in sorted({c for file in files for c in file.connections}, key=lambda c: c.index)
         ],
         "nodes": {
             name: {
@@ -88,34 +95,27 @@ def run_table(record: Mapping[str, Any]) -> str:
     """The record as text: connections, nodes, and times."""
     from tabulate import tabulate
 
-    connections = tabulate(
-        [[c["connection"], *(c[key] for key in _COUNTS)] for c in record["connections"]],
-        headers=["connection", *_COUNTS],
-        missingval="?",
-        disable_numparse=True,
-        colalign=("left", *("right" for _ in _COUNTS)) if record["connections"] else None,
-    )
-    nodes = tabulate(
-        [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()],
-        headers=["node", "executing", "waiting", "blocked", "idle", "remark"],
-        missingval="?",
-        disable_numparse=True,
-        colalign=("left", "right", "right", "right", "right", "left"),
-    )
-    parts = [connections] if record["connections"] else []
-    load = [load_table(record["system_load"])] if "system_load" in record else []
-    return "\n\n".join([*parts, nodes, *load, _times(record)])
+    from neuros.recording.system_load import load_table
+
+    connections = [[c["connection"], *(c[key] for key in _COUNTS)] for c in record["connections"]]
+    nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
+    parts = [
+        tabulate(rows, header, missingval="?", disable_numparse=True, colalign=("left", *right))
+        for header, rows, right in (
+            (("connection", *_COUNTS), connections, ["right"] * len(_COUNTS)),
+            (("node", *_STATES, "remark"), nodes, ["right"] * len(_STATES)),
+        )
+        if rows
+    ]
+    if "system_load" in record:
+        parts.append(load_table(record["system_load"]))
+    return "\n\n".join([*parts, _times(record)])
 
 
 def consumed_percent(connection: Mapping[str, Any]) -> float | None:
     """The share of the packets sent on a connection that were consumed, in per cent."""
     sent, consumed = connection.get("sent"), connection.get("consumed")
     return 100 * consumed / sent if sent and consumed is not None else None
-
-
-def _connections(files: Sequence[NodeFile]) -> list[Connection]:
-    every = {connection for file in files for connection in file.connections}
-    return sorted(every, key=lambda connection: connection.index)
 
 
 def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[float]]:
@@ -135,7 +135,7 @@ def _connection(
     run_folder: Path,
     cut_off: Collection[str],
 ) -> dict[str, Any]:
-    from neuros.analysis.packets import packet_figures, read_packets
+    from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
 
     key = str(connection)
     outgoing = all_metrics.get(connection.source_node, {}).get("outgoing", {}).get(key, {})
@@ -144,7 +144,7 @@ def _connection(
     sent, received = outgoing.get("sent"), incoming.get("received")
     # Counts that a node has last reported before it was killed are older than those of the other.
     is_known = not {connection.source_node, connection.destination_node} & set(cut_off)
-    return {
+    figures = {
         "connection": key,
         "index": connection.index,
         "discard_limit": connection.discard_limit,
@@ -153,11 +153,9 @@ def _connection(
         "rate_hz": sent / running_s if sent is not None and running_s else None,
         "lost": sent - received if is_known and None not in (sent, received) else None,
         **{field: incoming.get(field) for field in fields},
-        **packet_figures(
-            read_packets(run_folder, connection),
-            may_lose=not connection.is_reliable and sent != received,
-        ),
     }
+    packets = read_packets(run_folder, connection)
+    return figures | packet_figures(packets, may_lose=may_have_lost(figures))
 
 
 def _cut_off(ended: Ended) -> list[str]:
@@ -192,10 +190,10 @@ def _results(node_folder: Path) -> dict[str, Any]:
 def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
     spent = time_budget_of(node, running_s)
     if spent is None:
-        return ["?", "?", "?", "?", "never reported"]
+        return [*("?" for _ in _STATES), "never reported"]
     remark = "" if node["report"] == "final" else node["report"]
     if not spent.total_s:
-        return ["-", "-", "-", "-", remark]
+        return [*("-" for _ in _STATES), remark]
     return [*(f"{share:.0%}" for share in spent.shares.values()), remark]
 
 
@@ -214,24 +212,86 @@ def _times(record: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class PastRun:
-    """The folder of a run and its ``run.json``."""
+    """The folder of a run and its ``run.json``.
+
+    Attributes:
+        record: ``run.json``, or as much of it as the project and the packet lists give.
+        missing: a sentence for each thing that could not be told.
+    """
 
     folder: Path
     record: Mapping[str, Any]
+    missing: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name for headings."""
+        return f"{self.record.get('project', '?')} ({self.folder.name})"
+
+    @property
+    def running_s(self) -> float | None:
+        """Wall time in which all nodes ran."""
+        found: float | None = self.record.get("running_s")
+        return found
+
+    @property
+    def is_in_process(self) -> bool:
+        """Whether all nodes took turns in one thread."""
+        return bool(self.record.get("backend") == "in-process")
+
+    @property
+    def time_owner(self) -> str | None:
+        """The node that owns simulated time."""
+        return next((n for n in self.nodes if self.nodes[n].get("sim_time") is not None), None)
+
+    @cached_property
+    def nodes(self) -> dict[str, Mapping[str, Any]]:
+        """The figures of each node; without ``accounting`` where it never reported."""
+        return {name: dict(node) for name, node in self.record.get("nodes", {}).items()}
 
     @cached_property
     def connections(self) -> dict[str, Mapping[str, Any]]:
         """The figures of each connection, by ``a.out -> b.in``, in their order."""
-        return {each["connection"]: each for each in self.record["connections"]}
+        return {each["connection"]: each for each in self.record.get("connections", ())}
 
-    def connection(self, name: str) -> Connection:
-        """A connection as the project has it."""
-        return connection_of(name, self.connections[name])
+    @cached_property
+    def ends(self) -> dict[str, Connection]:
+        """The connections as the project has them, by name."""
+        return {name: _connection_of(figures) for name, figures in self.connections.items()}
+
+    @cached_property
+    def time_budgets(self) -> dict[str, TimeBudget]:
+        """Time budget of each node that has reported."""
+        found = {name: time_budget_of(node, self.running_s) for name, node in self.nodes.items()}
+        return {name: spent for name, spent in found.items() if spent is not None}
+
+    @cached_property
+    def packets(self) -> dict[str, Packets]:
+        """The packet lists of every connection."""
+        from neuros.analysis.packets import read_packets
+
+        return {name: read_packets(self.folder, end) for name, end in self.ends.items()}
+
+    def latencies_ns(self, connection: str) -> Numbers | None:
+        """Nanoseconds from the sending of a packet to each start of a hook on it, if known."""
+        from neuros.analysis.packets import may_have_lost
+
+        may_lose = may_have_lost(self.connections[connection])
+        return self.packets[connection].latencies_ns(may_lose=may_lose)
+
+    @cached_property
+    def traces(self) -> dict[str, Trace]:
+        """The first executions of every node that has listed them."""
+        from neuros.analysis.packets import FOLDER, read_trace
+
+        found = {name: read_trace(self.folder / name / FOLDER) for name in self.nodes}
+        return {name: trace for name, trace in found.items() if len(trace.starts_ns)}
 
 
-def connection_of(name: str, figures: Mapping[str, Any]) -> Connection:
+def _connection_of(figures: Mapping[str, Any]) -> Connection:
     """A connection as the project has it, from what ``run.json`` has of it."""
-    (source, output), (destination, input_) = (end.split(".") for end in name.split(" -> "))
+    ends = figures["connection"].split(" -> ")
+    (source, output), (destination, input_) = (end.split(".") for end in ends)
     limit, queue_size = figures.get("discard_limit"), figures.get("queue_size", 1)
     return Connection(source, output, destination, input_, limit, queue_size, figures["index"])
 
@@ -244,18 +304,14 @@ def open_run(folder: Path) -> PastRun:
     """
     file = folder / "run.json"
     try:
-        record = json.loads(file.read_text("utf-8"))
+        record = _json_object(file)
     except FileNotFoundError as error:
         if any(folder.glob("*/node.json")):
             why = "its run goes on, or its launcher was killed"
         else:
             why = "it is no folder that a run has left behind"
         raise UsageError(f"{folder} has no run.json: {why}") from error
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
-    found = record.get("format", 1) if isinstance(record, dict) else None
+    found = record.get("format", 1)
     if found != FORMAT:
         raise UsageError(
             f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
@@ -263,7 +319,110 @@ def open_run(folder: Path) -> PastRun:
         )
     run = PastRun(folder, record)
     try:
-        _ = [run.connection(name) for name in run.connections]
-    except (KeyError, TypeError, ValueError) as error:
+        _ = record["connections"], run.ends
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UsageError(f"{file} is broken (its connections cannot be read: {error!r})") from error
     return run
+
+
+def open_for_review(folder: Path) -> PastRun:
+    """Read what there is in a run folder.
+
+    Raises:
+        UsageError: if no run has left it behind, the run goes on, or a newer version wrote it.
+    """
+    try:
+        record, missing = _read_record(folder)
+        run = PastRun(folder, record)
+        missing += _missing_lists(run)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise UsageError(f"{folder / 'run.json'} is broken: it does not describe a run") from error
+    return replace(run, missing=tuple(missing))
+
+
+def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    file = folder / "run.json"
+    try:
+        record = _json_object(file)
+    except FileNotFoundError:
+        return _from_project(folder)
+    found = record.get("format", 1)
+    if not isinstance(found, int) or found > FORMAT:
+        raise UsageError(
+            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
+            " version that the run was made with"
+        )
+    if found == FORMAT:
+        return record, []
+    for index, each in enumerate(record.get("connections", ())):
+        each.setdefault("index", index)
+    why = f"run.json has format {found}: an older version of NeuROS wrote it, and kept less"
+    return record, [why]
+
+
+def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """A record from files that were written before and during the run."""
+    from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
+
+    if not (folder / "project.json").is_file():
+        raise UsageError(f"{folder} has no run.json: it is no folder that a run has left behind")
+    project = _json_object(folder / "project.json")
+    connections = []
+    for index, each in enumerate(project.get("connections", ())):
+        name = (
+            f"{each['source_node']}.{each['source_output']} ->"
+            f" {each['destination_node']}.{each['destination_input']}"
+        )
+        figures = {
+            "connection": name,
+            "index": index,
+            "discard_limit": each.get("discard_limit"),
+            "queue_size": each.get("queue_size", 1),
+        }
+        packets = read_packets(folder, _connection_of(figures))
+        sent, received = len(packets.sent_ns), len(packets.received)
+        figures |= {"sent": sent, "received": received, "consumed": len({*packets.taken.tolist()})}
+        connections.append(figures | packet_figures(packets, may_lose=may_have_lost(figures)))
+    nodes = {node["name"]: {"report": None} for node in project.get("nodes", ())}
+    record = {
+        "project": folder.parent.name if folder.parent.parent.name == "runs" else folder.name,
+        "reason": "the run goes on, or its launcher was killed",
+        "connections": connections,
+        "nodes": nodes,
+        "expanded_project": project,
+    }
+    return record, [
+        "run.json: the run goes on, or its launcher was killed. Packets are counted from the"
+        " nodes' lists (up to a second before the end); how nodes spent their time, losses and"
+        " ticks are not known, and so the bottleneck cannot be told"
+    ]
+
+
+def _missing_lists(run: PastRun) -> list[str]:
+    from neuros.recording.system_load import FILE_NAME
+
+    missing = []
+    silent = [name for name, node in run.nodes.items() if not node.get("accounting")]
+    if silent and len(silent) < len(run.nodes):
+        missing.append(f"what {', '.join(silent)} did with its time: it never reported")
+    if not (run.folder / FILE_NAME).is_file():
+        missing.append("processor and memory: the run was made without -m")
+    if not any(len(packets.sent_ns) for packets in run.packets.values()) and run.connections:
+        missing.append("times of single packets: no node has listed any")
+    if not run.traces and run.nodes:
+        missing.append("the first executions of hooks: no node has listed any")
+    return missing
+
+
+def _json_object(file: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(file.read_text("utf-8"))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
+    if not isinstance(found, dict):
+        raise UsageError(f"{file} is broken: it holds no object")
+    return found

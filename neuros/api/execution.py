@@ -31,7 +31,7 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.node.peer_link import ELSEWHERE_VARIABLE
-from neuros.recording.plan import RecordingPlan
+from neuros.recording.recording_plan import RecordingPlan
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)

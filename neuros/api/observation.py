@@ -14,7 +14,7 @@ from neuros.errors import EnvironmentFault
 from neuros.project.model import Project
 
 if TYPE_CHECKING:
-    from neuros.recording.load import LoadMonitor
+    from neuros.recording.system_load import LoadMonitor
 
 HOST = "host"
 """The columns of all nodes together, where they share a process."""
@@ -78,8 +78,7 @@ class Observation:
 def _monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
-    from neuros.recording.load import LAUNCHER, LoadMeter, LoadMonitor
-    from neuros.recording.load_table import LoadTable
+    from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadMonitor, LoadTable
 
     groups = [HOST] if is_one_process else list(names)
     table = LoadTable([*groups, LAUNCHER], os.cpu_count() or 1)

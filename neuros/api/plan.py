@@ -26,7 +26,7 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.recording.selection import Request as RecordingRequest
+from neuros.recording.recording_plan import Request as RecordingRequest
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,

@@ -23,7 +23,7 @@ from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
-from neuros.recording.selection import Request as RecordingRequest
+from neuros.recording.recording_plan import Request as RecordingRequest
 
 _ENVIRONMENT = "environment"
 

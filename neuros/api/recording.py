@@ -22,8 +22,7 @@ from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.project.model import Project
 from neuros.project.split import project_to_json
-from neuros.recording.plan import BAG_NAME, RecordingPlan
-from neuros.recording.selection import plan_recording
+from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
 
 _PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")
 

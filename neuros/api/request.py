@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, field
 
 from neuros.errors import UsageError
-from neuros.recording.selection import Request as RecordingRequest
+from neuros.recording.recording_plan import Request as RecordingRequest
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from neuros.analysis.run_record import open_run, run_table
 from neuros.errors import EnvironmentFault, RunError
 
 if TYPE_CHECKING:
-    from neuros.recording.bag.bag_reader import Bag
+    from neuros.recording.bag_reader import Bag
 
 
 _LATENCIES = ("p50", "p90", "p99", "max")
@@ -113,7 +113,7 @@ class Run:
             UsageError: if nothing was recorded.
             EnvironmentFault: if the bag is damaged.
         """
-        from neuros.recording.bag.bag_reader import open_bag
+        from neuros.recording.bag_reader import open_bag
 
         return open_bag(self.folder)
 

@@ -64,7 +64,7 @@ def start_dashboard(
     environment: Mapping[str, str],
 ) -> int:
     """Start the process for a run that has a control socket; returns its id."""
-    from neuros.viewers.dashboard.plan import plan as shown_plan
+    from neuros.viewers.project_view import project_view
 
     return dashboard.start(
         [sys.executable, "-m", "neuros.cli", "dashboard", str(run_folder)],
@@ -72,7 +72,7 @@ def start_dashboard(
         environment,
         {
             "run": run_id,
-            "plan": shown_plan(plan.project, plan.names),
+            "plan": project_view(plan.project, plan.names),
             "names": plan.names,
             "logs": {name: str(path) for name, path in logs.items()},
             "is_one_process": plan.backend == "in-process",
@@ -105,7 +105,7 @@ def _is_looked_at(listening: socket.socket) -> bool:
 
 def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
     from neuros.api.observation import owner_of_processes
-    from neuros.recording.load import LAUNCHER, LoadMeter, LoadNow
+    from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadNow
     from neuros.viewers.dashboard.server import Sources
 
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])

@@ -19,7 +19,7 @@ from neuros.cli.environments import make_shown_environments
 from neuros.cli.projects import load_with_messages
 from neuros.cli.views import Views
 from neuros.errors import UsageError
-from neuros.recording.selection import Request as RecordingRequest
+from neuros.recording.recording_plan import Request as RecordingRequest
 
 
 def launch(options: argparse.Namespace) -> int:

@@ -64,7 +64,7 @@ def run_node(options: argparse.Namespace) -> int:
 
 def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:
     """Makes the packet recorders of nodes by the recording plan of the run."""
-    from neuros.recording.plan import load_plan
+    from neuros.recording.recording_plan import load_plan
     from neuros.recording.spool import open_recorder
 
     plan = load_plan(run)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
     from neuros.hooks import HookSpec
     from neuros.project.model import NodeFile
-    from neuros.recording.bag.bag_reader import RecordedTopic
+    from neuros.recording.bag_reader import RecordedTopic
     from neuros.replay.node import ReplayedNode
 
 
@@ -115,7 +115,7 @@ def _replay(options: argparse.Namespace) -> int:
     if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
         raise UsageError("replay: --rate must be above 0, --delay and -w not below")
     from neuros.cli.environments import find_messages_of
-    from neuros.recording.bag.bag_reader import open_bag
+    from neuros.recording.bag_reader import open_bag
     from neuros.transport.playing import PlayedTopic, play
 
     find_messages_of(Path(options.run))
@@ -142,7 +142,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _chosen(topics: Sequence[RecordedTopic], patterns: Sequence[str]) -> list[RecordedTopic]:
     """The topics that are asked for. Raises ``UsageError`` if a pattern fits none."""
-    from neuros.recording.selection import is_named
+    from neuros.recording.recording_plan import is_named
 
     for pattern in patterns:
         if not any(is_named(t.name, t.connection, [pattern]) for t in topics):

@@ -16,7 +16,7 @@ from neuros.backends.shared_memory import remove_dead_runs
 from neuros.errors import EnvironmentFault, UsageError
 
 if TYPE_CHECKING:
-    from neuros.analysis.review.run import Run
+    from neuros.analysis.run_record import PastRun
 
 EXIT_DIFFERENT = 1
 EXIT_UNKNOWN = EXIT_LEFT_OUT = 2
@@ -163,9 +163,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _report(options: argparse.Namespace) -> int:
-    from neuros.analysis.review.findings import findings_of
-    from neuros.analysis.review.page import report_page
-    from neuros.analysis.review.run import open_for_review
+    from neuros.analysis.findings import findings_of
+    from neuros.analysis.page import report_page
+    from neuros.analysis.run_record import open_for_review
 
     run = open_for_review(options.run)
     findings = findings_of(run)
@@ -185,8 +185,8 @@ def _report(options: argparse.Namespace) -> int:
     return 0
 
 
-def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.analysis.review.page import figures_of
+def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
+    from neuros.analysis.page import figures_of
 
     try:
         return figures_of(run)
@@ -195,7 +195,7 @@ def _figures(run: Run) -> dict[str, tuple[str, str, bytes]]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from neuros.analysis.review.comparison import comparison_rows, comparison_table, labels_of
+    from neuros.analysis.comparison import comparison_rows, comparison_table, labels_of
 
     runs, refused = _readable(options.runs)
     header, rows = comparison_rows(runs)
@@ -211,9 +211,9 @@ def _compare(options: argparse.Namespace) -> int:
     return EXIT_LEFT_OUT if refused else 0
 
 
-def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
+def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[UsageError]]:
     """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
-    from neuros.analysis.review.run import open_for_review
+    from neuros.analysis.run_record import open_for_review
 
     runs, refused = [], []
     for folder in folders:
@@ -226,10 +226,10 @@ def _readable(folders: Sequence[Path]) -> tuple[list[Run], list[UsageError]]:
     return runs, refused
 
 
-def _comparison(runs: list[Run], header: list[str], rows: list[list[str]]) -> bytes:
-    from neuros.analysis.review.comparison import comparison_figure, labels_of
-    from neuros.analysis.review.findings import findings_of
-    from neuros.analysis.review.page import bottleneck_part, figure_part, page, png, table_part
+def _comparison(runs: list[PastRun], header: list[str], rows: list[list[str]]) -> bytes:
+    from neuros.analysis.comparison import comparison_figure, labels_of
+    from neuros.analysis.findings import findings_of
+    from neuros.analysis.page import bottleneck_part, figure_part, page, png, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")
@@ -277,8 +277,7 @@ def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from neuros.analysis.difference import compare
-    from neuros.analysis.recorded_packets import RecordedPackets
+    from neuros.analysis.difference import RecordedPackets, compare
     from neuros.analysis.run_record import open_run
 
     a, b = open_run(options.run_a), open_run(options.run_b)
@@ -319,7 +318,7 @@ def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def _info(options: argparse.Namespace) -> int:
     from tabulate import tabulate
 
-    from neuros.recording.bag.bag_reader import open_bag
+    from neuros.recording.bag_reader import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]

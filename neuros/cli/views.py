@@ -137,9 +137,9 @@ class Views:
         self._notices.append(f"--visualisations: in Rerun, since {reason}")
 
     def _start_rerun(self, rerun: RerunProcesses, run: Shown, reaper: Reaper) -> None:
-        from neuros.viewers.dashboard.plan import plan as shown_plan
+        from neuros.viewers.project_view import project_view
 
-        sources = shown_plan(self._plan.project, self._plan.names)["sources"]
+        sources = project_view(self._plan.project, self._plan.names)["sources"]
         command = [sys.executable, "-m", "neuros.cli", "view", str(run.folder)]
         told = {"project": self._plan.project.name, "sources": sources}
         self._running.append(rerun)
@@ -166,9 +166,8 @@ def _open(url: str) -> None:
 
 def _run_view(options: argparse.Namespace) -> int:
     from neuros.backends.rerun import await_server
-    from neuros.viewers.observer import look_on
     from neuros.viewers.rerun_feed import RerunFeed
-    from neuros.viewers.visual_types import VisualTypes
+    from neuros.viewers.visual_types import VisualTypes, look_on
 
     told = json.loads(sys.stdin.readline())
     sources = {

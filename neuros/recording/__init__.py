@@ -1,5 +1,5 @@
-"""Recording: the way of a run's packets into a bag.
+"""Recording: packets of a run into a bag, system load, and provenance.
 
 Each node keeps what it sends, as bytes, in a *spool* of its own; one recorder process moves it from
-there into the bag. ``docs/recording.md`` says why. Load and versions are recorded here, too.
+there into the bag. ``docs/recording.md`` says why.
 """

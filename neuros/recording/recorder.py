@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_writer import BagWriter, Definitions
-from neuros.recording.plan import BAG_NAME, LISTENER, RecordingPlan, Topic
+from neuros.recording.bag_files import BagWriter, Stored
+from neuros.recording.recording_plan import BAG_NAME, LISTENER, RecordingPlan, Topic
 from neuros.recording.spool import (
     NO_TIME,
     ForwardClock,
@@ -18,7 +19,6 @@ from neuros.recording.spool import (
     forget_listened,
     listened_topics,
 )
-from neuros.recording.stored import Stored
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
 # running. Readers of bags sort, so a packet that comes later is only less convenient.
@@ -61,7 +61,6 @@ class Recorder:
         self._complain = complain
         self._is_new = is_new
         self._clock = clock
-        self._definitions = Definitions()
         self.bag = BagWriter(run / BAG_NAME, plan.storage, plan.custom)
         self.topics: dict[Topic, int | None] = {}
         for topic in plan.topics:
@@ -90,7 +89,7 @@ class Recorder:
         """The number of a topic in the bag, ``None`` if it cannot be recorded."""
         if topic not in self.topics:
             try:
-                self.topics[topic] = self.bag.add_topic(topic, self._definitions)
+                self.topics[topic] = self.bag.add_topic(topic)
             except EnvironmentFault as error:
                 self.topics[topic] = None
                 self._complain(f"{topic.name} is not recorded: {error}")
@@ -206,20 +205,18 @@ class Recorder:
         for source in self._sources:
             source.reader.remove_up_to(safe_ns)
 
-    def _numbers(self, topics: Any) -> tuple[int, ...]:
+    def _numbers(self, topics: Iterable[Topic]) -> tuple[int, ...]:
         numbers = (self.number_of(topic) for topic in topics)
         return tuple(number for number in numbers if number is not None)
 
 
+@dataclass
 class _SpoolSource:
-    """A spool, and the topics of its streams."""
+    """A spool, and the numbers of the topics of each of its streams."""
 
-    def __init__(
-        self, reader: SpoolReader, topics: list[tuple[int, ...]], *, owns_time: bool
-    ) -> None:
-        self.reader = reader
-        self.topics = topics
-        self.owns_time = owns_time
+    reader: SpoolReader
+    topics: list[tuple[int, ...]]
+    owns_time: bool
 
 
 def has_spools(run: Path, nodes: Collection[str]) -> bool:

@@ -13,17 +13,16 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader, ReaderError
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.plan import (
+from neuros.recording.bag_files import is_whole, stored_messages
+from neuros.recording.recorder import Recorder, has_spools
+from neuros.recording.recording_plan import (
     BAG_NAME,
     LISTENER,
     PLAN_NAME,
     RecordingPlan,
-    Topic,
     load_plan,
 )
-from neuros.recording.recorder import Recorder, has_spools
 from neuros.recording.spool import SpoolReader, listened_topics
-from neuros.recording.stored import is_whole, stored_messages
 
 DAMAGED_NAME = "bag.damaged"
 
@@ -90,10 +89,15 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
             bag.rename(damaged)
     elif bag.exists():  # a repair that did not come to its end
         shutil.rmtree(bag)
+    topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     present: set[tuple[int, int]] = set()
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        _copy(damaged, recorder, _topics(run, plan), present)
+        for message in stored_messages(damaged):
+            topic = topics.get(message.topic)
+            number = None if topic is None else recorder.copy(topic, message)
+            if number is not None:
+                present.add((number, message.log_ns))
         recorder.complete()
     except BaseException:
         recorder.abandon()
@@ -103,17 +107,3 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
         shutil.rmtree(damaged)
     recorder.clean_up()
     return recorder.counts()
-
-
-def _topics(run: Path, plan: RecordingPlan) -> dict[str, Topic]:
-    return {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
-
-
-def _copy(
-    damaged: Path, recorder: Recorder, topics: dict[str, Topic], present: set[tuple[int, int]]
-) -> None:
-    for message in stored_messages(damaged):
-        topic = topics.get(message.topic)
-        number = None if topic is None else recorder.copy(topic, message)
-        if number is not None:
-            present.add((number, message.log_ns))

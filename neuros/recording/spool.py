@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neuros.ports import Way
-from neuros.recording.plan import LISTENER, RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
 
 FILE_BYTES = 8 << 20
 NO_TIME = -1
@@ -118,7 +118,7 @@ class SpoolWriter:
         self._folder.mkdir(parents=True, exist_ok=True)
         path = self._folder / f"{self._files:08d}"
         self._descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND, 0o644)
-        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # as long as there is somebody who may write
+        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until the writer closes it or ends
         self._files += 1
         self._size = 0
 

@@ -1,4 +1,4 @@
-"""Visual types: poses, points, numbers and pictures that viewers show of a message type.
+"""Visual types: poses, points, numbers and pictures that viewers show of a run's packets.
 
 Poses and scans stand in one world, images beside it, and all other numbers are curves. The
 fields of an unknown message type are asked for once; its first numbers are shown.
@@ -6,13 +6,20 @@ fields of an unknown message type are asked for once; its first numbers are show
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import select
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+from neuros.control import Lines, connect
 
 MOST_NUMBERS = 16
 _MOST_BEAMS = 1500
+_PERIOD_S = 0.2
 _XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
 
 # Where position and orientation are; "" for one that there is not.
@@ -39,7 +46,7 @@ _NUMBERS: dict[str, list[str]] = {
         f"{part}.{axis}" for part in ("angular_velocity", "linear_acceleration") for axis in _XYZ
     ],
 }
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _NOT_FINITE = ("nan", "inf", "-inf")  # as a sample tells them; the next may be a number
 _SCAN = "sensor_msgs/msg/LaserScan"
 
@@ -82,7 +89,7 @@ class VisualTypes:
     """Visual types of one output or external input."""
 
     def __init__(self, type_name: str) -> None:
-        self.is_image = type_name in _IMAGES
+        self.is_image = type_name in IMAGES
         self.is_scan = type_name == _SCAN
         self._position, self._orientation = _POSES.get(type_name, ("", ""))
         self.is_in_space = bool(self._position or self._orientation or self.is_scan)
@@ -169,3 +176,48 @@ def _beams(scan: Mapping[str, Any]) -> list[tuple[float, float, float]]:
             direction = angle + place * step
             points.append((distance * math.cos(direction), distance * math.sin(direction), 0.0))
     return points
+
+
+def look_on(
+    run: Path,
+    sources: Mapping[str, tuple[str, str, VisualTypes]],
+    show: Callable[[str, float, Sequence[Mark]], None],
+) -> None:
+    """Ask for samples of packets until the run is over.
+
+    Args:
+        sources: by name, the node and the port, and what is shown of it.
+        show: called with a name, the time since the start in seconds, and what was seen.
+
+    Raises:
+        OSError: where no supervisor listens.
+    """
+    names = {(node, port): name for name, (node, port, _) in sources.items()}
+    begin_s = next_s = time.monotonic()
+    with contextlib.closing(connect(run)) as lines:
+        lines.send("watch")
+        while True:
+            now_s = time.monotonic()
+            if now_s >= next_s:
+                next_s = now_s + _PERIOD_S
+                _ask(lines, sources)
+            if not select.select([lines], [], [], max(0.0, next_s - now_s))[0]:
+                continue
+            messages = lines.receive()
+            if messages is None:
+                return
+            for message in messages:
+                if message["kind"] != "node_status":
+                    continue
+                for port, sample in message["samples"].items():
+                    name = names[message["node"], port]
+                    for row in sample.get("values", ()):
+                        row[0] -= begin_s
+                    show(name, now_s - begin_s, list(sources[name][2].marks(sample)))
+
+
+def _ask(lines: Lines, sources: Mapping[str, tuple[str, str, VisualTypes]]) -> None:
+    wanted: dict[str, dict[str, Any]] = {}
+    for node, port, visual_types in sources.values():
+        wanted.setdefault(node, {})[port] = visual_types.wanted()
+    lines.send("look", wanted=wanted)

@@ -1,11 +1,24 @@
-"""Figures that plugins make and feed; their process draws, so Matplotlib is not imported here."""
+"""Figures that plugins make and feed; their process draws, so Matplotlib is not imported here.
+
+A hook never waits: a message goes into the socket as far as that takes it, the rest with the next
+one. Messages that the drawing process cannot take are kept, and left out at last.
+"""
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import itertools
 import math
 import os
+import pickle
 import re
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,11 +27,139 @@ from typing import Any
 import numpy as np
 
 from neuros.errors import EnvironmentFault
-from neuros.visualise.feed import Feed, is_drawn
 
 _LARGEST_SIDE = 320
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
+_MOST_UNSENT_BYTES = 1 << 22
+_NICENESS = 5
+_PATIENCE_S = 30.0
+# A node has 5 s in all to end.
+_PATIENCE_AT_END_S = 4.0
+_LENGTH = struct.Struct("!I")
+# The program needs no ROS: it must not start a second time to find its libraries.
+_ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+
+
+class _Feed:
+    """The drawing process of one figure, and the way to it.
+
+    Args:
+        first: the first message.
+        file: where the figure is saved.
+
+    Attributes:
+        dropped: messages that were left out.
+
+    Raises:
+        EnvironmentFault: if it cannot be started.
+    """
+
+    def __init__(self, first: Sequence[Any], file: Path) -> None:
+        self.file = file
+        self.dropped = 0
+        self._sent = 0
+        self._unsent = bytearray()
+        self._latest: dict[str, Sequence[Any]] = {}
+        self._is_gone = False
+        self._socket, far_end = socket.socketpair()
+        self._socket.setblocking(False)
+        try:
+            self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                [sys.executable, "-m", "neuros.visualise.program"],
+                stdin=far_end.fileno(),
+                env={**os.environ, **_ENVIRONMENT},
+            )
+        except OSError as error:
+            self._socket.close()
+            raise EnvironmentFault(f"the drawing process cannot be started: {error}") from error
+        finally:
+            far_end.close()
+        with contextlib.suppress(OSError):  # the node comes first
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
+        _OPEN.append(self)
+        self.send(first)
+
+    def send(self, message: Sequence[Any]) -> None:
+        """Have something drawn, or leave it out."""
+        self._flush()
+        if self._is_gone or len(self._unsent) > _MOST_UNSENT_BYTES:
+            self.dropped += 1
+            return
+        self._add(message)
+        self._flush()
+
+    def send_latest(self, name: str, message: Sequence[Any]) -> None:
+        """Have something drawn in the place of what was to be drawn under that name before."""
+        self.dropped += self._is_gone or name in self._latest
+        self._latest[name] = message
+        self._flush()
+
+    def close(self) -> None:
+        """Let it draw the rest, save and end; wait for that some seconds. May be called again."""
+        _close([self], _PATIENCE_S)
+
+    def hang_up(self, deadline_s: float) -> None:
+        """Send the rest, and say that there will be no more."""
+        while self._has_more and time.monotonic() < deadline_s:
+            select.select([], [self._socket], [], 0.1)
+            self._flush()
+        self._socket.close()
+
+    def wait(self, deadline_s: float) -> None:
+        """Until the process has ended."""
+        try:
+            self._process.wait(max(0.1, deadline_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            print(
+                "a figure could not be drawn in time, and was not saved at the end", file=sys.stderr
+            )
+        if self.dropped:
+            count = self.dropped + self._sent
+            print(f"{self.dropped} of {count} updates were not drawn", file=sys.stderr)
+
+    @property
+    def _has_more(self) -> bool:
+        return not self._is_gone and bool(self._unsent or self._latest)
+
+    def _add(self, message: Sequence[Any]) -> None:
+        data = pickle.dumps(tuple(message), pickle.HIGHEST_PROTOCOL)
+        self._unsent += _LENGTH.pack(len(data)) + data
+        self._sent += 1
+
+    def _flush(self) -> None:
+        try:
+            while self._has_more:
+                if not self._unsent:
+                    self._add(self._latest.pop(next(iter(self._latest))))
+                sent = self._socket.send(self._unsent, socket.MSG_NOSIGNAL)
+                del self._unsent[:sent]
+        except BlockingIOError:
+            return
+        except OSError:  # it has ended, and has said why
+            self._is_gone = True
+
+
+_OPEN: list[_Feed] = []
+
+
+def _close(feeds: Sequence[_Feed], patience_s: float) -> None:
+    """Let them end side by side."""
+    deadline_s = time.monotonic() + patience_s
+    closing = [feed for feed in feeds if feed in _OPEN]
+    for feed in closing:
+        _OPEN.remove(feed)
+        feed.hang_up(deadline_s)
+    for feed in closing:
+        feed.wait(deadline_s)
+
+
+@atexit.register
+def _close_all() -> None:
+    """The process of the node ends; its figures are saved before."""
+    _close(tuple(_OPEN), _PATIENCE_AT_END_S)
 
 
 class _Figure:
@@ -48,12 +189,12 @@ class _Figure:
         save_every: float = 10.0,
         **options: Any,
     ) -> None:
-        self._names: set[str] = set()
+        self._kinds: dict[str, str] = {}
         if below is None:
             if find_spec("matplotlib") is None:
                 raise EnvironmentFault("figures need Matplotlib: pip install 'neuros[plot]'")
             self.file = _file_for(title)
-            self._feed = Feed(("figure", title, str(self.file), float(save_every)), self.file)
+            self._feed = _Feed(("figure", title, str(self.file), float(save_every)), self.file)
             self._panels = [self]
         else:
             self.file, self._feed, self._panels = below.file, below._feed, below._panels
@@ -75,8 +216,8 @@ class _Figure:
         """Save the figure and close its window; happens by itself when the node ends."""
         self._feed.close()
 
-    def _add(self, name: str, colour: str | None, **options: Any) -> None:
-        self._names.add(name)
+    def _add(self, name: str, colour: str | None, kind: str = "", **options: Any) -> None:
+        self._kinds[name] = kind
         self._feed.send(("series", self._number, name, {"colour": colour, **options}))
 
     def _send(self, name: str, *values: Any) -> None:
@@ -84,8 +225,8 @@ class _Figure:
         self._feed.send(("data", self._number, name, *values))
 
     def _check(self, name: str) -> None:
-        if name not in self._names:
-            known = ", ".join(sorted(self._names)) or "none"
+        if name not in self._kinds:
+            known = ", ".join(sorted(self._kinds)) or "none"
             raise ValueError(f"'{name}' was not added to the figure; there are {known}")
 
 
@@ -135,31 +276,17 @@ class VisualiseRotations(_Figure):
 
     _KIND = "angles"
 
-    def __init__(
-        self,
-        title: str,
-        duration: float | None = 60,
-        *,
-        below: _Figure | None = None,
-        save_every: float = 10.0,
-    ) -> None:
-        super().__init__(title, duration, below=below, save_every=save_every)
-        self._kinds: dict[str, str] = {}
-
     def add_quaternion(self, name: str, colour: str | None = None, style: str = "-") -> None:
         """Add a line fed with orientations, whose rotation about the vertical is shown."""
-        self._kinds[name] = "quaternion"
-        self._add(name, colour, style=style)
+        self._add(name, colour, "quaternion", style=style)
 
     def add_degrees(self, name: str, colour: str | None = None, style: str = "-") -> None:
         """Add a line fed with angles in degrees."""
-        self._kinds[name] = "degrees"
-        self._add(name, colour, style=style)
+        self._add(name, colour, "degrees", style=style)
 
     def add_radians(self, name: str, colour: str | None = None, style: str = "-") -> None:
         """Add a line fed with angles in radians."""
-        self._kinds[name] = "radians"
-        self._add(name, colour, style=style)
+        self._add(name, colour, "radians", style=style)
 
     def plot(self, line_name: str, orientation: Any, timestamp: float) -> None:
         """Add a point.
@@ -259,9 +386,9 @@ def _file_for(title: str) -> Path:
     """A file in which no other figure of this process is saved."""
     folder = Path(os.environ.get("NEUROS_RUN_DIR") or ".").absolute()
     stem = re.sub(r"[\W_]+", "_", title).strip("_").lower()[:_LONGEST_STEM] or "figure"
-    numbered = (f"{stem}_{number}" for number in itertools.count(2))
-    names = itertools.chain([stem], numbered)
-    return next(file for name in names if not is_drawn(file := folder / f"{name}.png"))
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    taken = {feed.file for feed in _OPEN}
+    return next(file for name in names if (file := folder / f"{name}.png") not in taken)
 
 
 def _small_pixels(image: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import select
@@ -13,10 +14,270 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from neuros.visualise.panels import PANELS, Panel
+Array = npt.NDArray[np.float64]
+
+_MOST_POINTS = 20_000
+_RING_COLUMNS = 600
+_GREY, _ALPHA = "0.6", 0.9
+
+
+class Series:
+    """Values over time: the last ``duration_s`` seconds, or all, and of very many every other."""
+
+    def __init__(self, duration_s: float | None) -> None:
+        self._duration_s = duration_s
+        self.times: list[float] = []
+        self.values: list[Any] = []
+
+    def add(self, time_s: float, value: Any) -> None:
+        if not math.isfinite(time_s):
+            return  # there is no place for it
+        self.times.append(time_s)
+        self.values.append(value)
+        if len(self.times) > _MOST_POINTS:
+            self._shorten()
+
+    def shown(self, end_s: float) -> tuple[Array, list[Any]]:
+        """Times and values of the shown time before ``end_s``."""
+        times = np.array(self.times)
+        if self._duration_s is None or not times.size:
+            return times, self.values
+        is_shown = times >= end_s - self._duration_s
+        return times[is_shown], [v for v, shown in zip(self.values, is_shown, strict=True) if shown]
+
+    def _shorten(self) -> None:
+        if self._duration_s is not None:
+            start_s = max(self.times) - self._duration_s
+            kept = [
+                pair for pair in zip(self.times, self.values, strict=True) if pair[0] >= start_s
+            ]
+            if len(kept) < _MOST_POINTS * 3 // 4:
+                self.times, self.values = (list(each) for each in zip(*kept, strict=True))
+                return
+        del self.times[1::2], self.values[1::2]
+
+
+class Panel:
+    """One part of a figure.
+
+    Attributes:
+        columns: how many axes it needs, side by side.
+        caption: a line above it.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self.caption = ""
+        self.title = str(options["title"])
+        self.duration_s: float | None = options["duration"]
+        self.y_label = str(options.get("y_label", ""))
+        self.series: dict[str, Series] = {}
+        self.options: dict[str, Mapping[str, Any]] = {}
+
+    @property
+    def columns(self) -> Sequence[float]:
+        """The widths of its axes, side by side."""
+        return [1.0]
+
+    @property
+    def projections(self) -> Sequence[str | None]:
+        return [None] * len(self.columns)
+
+    @property
+    def end_s(self) -> float:
+        """The latest time that there is."""
+        ends = [max(series.times) for series in self.series.values() if series.times]
+        return max(ends, default=0.0)
+
+    def add_series(self, name: str, options: Mapping[str, Any]) -> None:
+        self.series[name] = Series(self.duration_s)
+        self.options[name] = options
+
+    def add_data(self, name: str, time_s: Any, value: Any) -> None:
+        self.series[name].add(time_s, value)
+
+    def draw(self, axes: Sequence[Any], end_s: float) -> None:
+        """Draw everything anew, up to a time that all parts of the figure share."""
+        self._draw(axes, end_s)
+        axes[0].set_title(self.caption, loc="left", fontsize="small")
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        raise NotImplementedError
+
+    def _time_axis(self, axes: Any, end_s: float) -> None:
+        starts = [series.times[0] for series in self.series.values() if series.times]
+        start_s = min(starts, default=0.0)
+        if self.duration_s is not None:
+            start_s = max(start_s, end_s - self.duration_s)
+        axes.set_xlim(start_s, max(end_s, start_s + 1e-3))
+        axes.set_xlabel("time (s)")
+
+    def _colour(self, name: str) -> Any:
+        return self.options[name]["colour"] or f"C{list(self.series).index(name)}"
+
+
+class LinesPanel(Panel):
+    """Numbers over time."""
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        (only,) = axes
+        for name, series in self.series.items():
+            times, values = series.shown(end_s)
+            times, numbers = self._prepared(times, np.array(values, np.float64))
+            style = self.options[name].get("style", "-")
+            only.plot(times, numbers, style, color=self._colour(name), label=name, alpha=_ALPHA)
+        self._time_axis(only, end_s)
+        only.set_ylabel(self.y_label)
+        only.grid(alpha=0.3)
+        if self.series:
+            only.legend(
+                loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
+                fontsize="small", borderaxespad=0.1,
+            )  # fmt: skip
+
+    def _prepared(self, times: Array, values: Array) -> tuple[Array, Array]:
+        return times, values
+
+
+class AnglesPanel(LinesPanel):
+    """Angles over time, in radians."""
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        super()._draw(axes, end_s)
+        axes[0].set_ylabel("angle (rad)")
+        axes[0].set_ylim(-math.pi * 1.03, math.pi * 1.03)
+        quarters = [-math.pi, -math.pi / 2, 0.0, math.pi / 2, math.pi]
+        axes[0].set_yticks(quarters, [r"$-\pi$", "", "0", "", r"$\pi$"])
+
+    def _prepared(self, times: Array, values: Array) -> tuple[Array, Array]:
+        return _broken_at_wraps(times, values)
+
+
+class ImagesPanel(Panel):
+    """The latest image of each name."""
+
+    @property
+    def columns(self) -> Sequence[float]:
+        return [1.0] * max(1, len(self.series))
+
+    def add_data(self, name: str, time_s: Any, value: Any) -> None:
+        self.series[name].times[:] = [] if time_s is None else [time_s]
+        self.series[name].values[:] = [value]
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        for place, (name, series) in zip(axes, self.series.items(), strict=True):
+            place.set_axis_off()
+            for image in series.values:
+                top = 255 if image.dtype == np.uint8 else None
+                place.imshow(image, cmap="gray", vmin=0, vmax=top)
+            when = f" {series.times[0]:.2f} s" if series.times else ""
+            place.set_title(f"{name}{when}", fontsize="small")
+
+    def draw(self, axes: Sequence[Any], end_s: float) -> None:
+        self._draw(axes, end_s)  # its titles are names
+
+
+class SpikesPanel(Panel):
+    """A raster of spikes."""
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        (only,) = axes
+        lowest, middles = 0, []
+        for name, series in self.series.items():
+            size = self.options[name]["size"]
+            start_s = -math.inf if self.duration_s is None else end_s - self.duration_s
+            times = np.concatenate([np.empty(0), *(when for when, _ in series.values)])
+            which = np.concatenate([np.empty(0), *(who for _, who in series.values)])
+            shown = times >= start_s
+            only.plot(
+                times[shown], which[shown] + lowest, "|", color=self._colour(name), markersize=2.5
+            )
+            middles.append((lowest + size / 2, f"{name}\n({size})"))
+            lowest += size
+            only.axhline(lowest - 0.5, color=_GREY, linewidth=0.5)
+        self._time_axis(only, end_s)
+        only.set_ylim(-1, max(lowest, 1))
+        only.set_yticks([y for y, _ in middles], [text for _, text in middles])
+
+    def add_data(self, name: str, time_s: Any, value: Any) -> None:
+        if time_s.size:
+            self.series[name].add(float(time_s.max()), (time_s, value))
+
+
+class RingPanel(Panel):
+    """Activity around the circle, and over time."""
+
+    @property
+    def columns(self) -> Sequence[float]:
+        return [1.0, *(2.5 for _ in self.series)]
+
+    @property
+    def projections(self) -> Sequence[str | None]:
+        return ["polar", *(None for _ in self.series)]
+
+    def _draw(self, axes: Sequence[Any], end_s: float) -> None:
+        circle, *histories = axes
+        circle.set_yticklabels([])
+        circle.tick_params(labelsize="small")
+        for name, history in zip(self.series, histories, strict=True):
+            times, values = self.series[name].shown(end_s)
+            history.set_title(name, fontsize="small", color=self._colour(name))
+            if len(values):
+                self._draw_now(circle, name, values[-1])
+                self._draw_history(history, times, np.array(values))
+            self._time_axis(history, end_s)
+
+    def _draw_now(self, circle: Any, name: str, activity: Array) -> None:
+        phases = 2.0 * np.pi * (np.arange(activity.size + 1) + 0.5) / activity.size
+        circle.plot(phases, np.append(activity, activity[0]), color=self._colour(name))
+        direction = _population_vector(activity)
+        if direction is not None:
+            circle.plot([direction, direction], [0.0, activity.max()], "--", color="0.2")
+
+    def _draw_history(self, history: Any, times: Array, values: Array) -> None:
+        """Activity by direction and time; columns are those nearest in time."""
+        grid = np.linspace(times[0], times[-1], min(_RING_COLUMNS, max(2, times.size)))
+        nearest = np.clip(np.searchsorted(times, grid), 0, times.size - 1)
+        half = values.shape[1] // 2
+        rolled = np.roll(values[nearest], half, axis=1).T  # from -pi to pi
+        extent = (times[0], max(times[-1], times[0] + 1e-3), -math.pi, math.pi)
+        history.imshow(rolled, aspect="auto", origin="lower", extent=extent, interpolation="none")
+        directions = [_population_vector(column) for column in values[nearest]]
+        decoded = np.array([math.nan if d is None else d for d in directions])
+        history.plot(*_broken_at_wraps(grid, decoded), color="w", linewidth=1)
+        history.set_ylim(-math.pi, math.pi)
+        history.set_yticks([-math.pi, 0.0, math.pi], [r"$-\pi$", "0", r"$\pi$"])
+
+
+def _broken_at_wraps(time_s: Array, angle_rad: Array) -> tuple[Array, Array]:
+    """Both series with a NaN where a line from one angle to the next would cross the figure."""
+    jumps = np.flatnonzero(np.abs(np.diff(angle_rad)) > math.pi) + 1
+    return np.insert(time_s, jumps, np.nan), np.insert(angle_rad, jumps, np.nan)
+
+
+def _population_vector(activity: Array) -> float | None:
+    """The direction, in radians, that a ring of neurons stands for; ``None`` if it is silent.
+
+    Neuron ``i`` of ``n`` prefers ``2 pi (i + 1/2) / n``; the direction is that of the sum of these
+    unit vectors, weighted by activity (Georgopoulos, Schwartz & Kettner, Science 233, 1416, 1986).
+    """
+    phases = 2.0 * np.pi * (np.arange(activity.size) + 0.5) / max(activity.size, 1)
+    total = complex(np.sum(activity * np.exp(1j * phases)))
+    return None if abs(total) < 1e-12 else math.atan2(total.imag, total.real)
+
+
+PANELS = {
+    "lines": LinesPanel,
+    "angles": AnglesPanel,
+    "images": ImagesPanel,
+    "spikes": SpikesPanel,
+    "ring": RingPanel,
+}
+
 
 _TOOLKITS = ("QtAgg", "TkAgg", "macosx")
 _WIDTH_INCHES, _PANEL_INCHES = 9.0, 2.6
@@ -132,9 +393,9 @@ class Messages:
         self._data = bytearray()
         self.is_over = False
 
-    def wait(self, timeout_s: float) -> None:
-        """Until something can be read."""
-        select.select([self._descriptor], [], [], timeout_s)
+    def wait(self, timeout_s: float) -> bool:
+        """Whether something can be read, now or before the time is over."""
+        return bool(select.select([self._descriptor], [], [], timeout_s)[0])
 
     def read(self) -> Iterator[tuple[Any, ...]]:
         """All that is complete after one read; the other end is NeuROS in a node's process."""
@@ -232,8 +493,7 @@ def main() -> None:
     drawing: Drawing | None = None
     pause_s = _HEED_S
     while not messages.is_over:
-        messages.wait(pause_s)
-        if select.select([0], [], [], 0.0)[0]:
+        if messages.wait(pause_s):
             for message in messages.read():
                 if message[0] == "figure":
                     drawing = Drawing(*message[1:])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from neuros.recording.plan import RecordingPlan, Stream, Topic
 from neuros.recording.recorder import Recorder
+from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
 from neuros.recording.spool import NO_TIME, SpoolWriter
 
 NUMBER = Topic("/neuros/a/number/b/number/data", "std_msgs/msg/Int32", True, 1, "a.number -> b.n")

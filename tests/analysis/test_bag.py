@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import neuros.bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.bag.columns import columns_of
+from neuros.recording.bag_reader import columns_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

@@ -264,7 +264,7 @@ def test_what_was_recorded_tells_the_field(folders: tuple[Path, Path]) -> None:
     [
         (None, "no folder that a run has left behind"),
         ('{"format": 1', "is broken"),
-        ("[]", "has format None"),
+        ("[]", "is broken: it holds no object"),
         ('{"format": 2}', "is broken"),
         ('{"format": 2, "connections": [{}]}', "is broken"),
         ('{"project": "old"}', "has format 1, and this version of NeuROS reads format 2"),

@@ -16,8 +16,16 @@ from pathlib import Path
 import psutil
 import pytest
 
-from neuros.recording.load import LAUNCHER, LoadMeter, LoadMonitor, LoadNow
-from neuros.recording.load_table import FILE_NAME, GroupLoad, LoadTable, MachineLoad
+from neuros.recording.system_load import (
+    FILE_NAME,
+    LAUNCHER,
+    GroupLoad,
+    LoadMeter,
+    LoadMonitor,
+    LoadNow,
+    LoadTable,
+    MachineLoad,
+)
 
 DEADLINE_S = 20.0
 MARK = "NEUROS_TEST_GROUP"

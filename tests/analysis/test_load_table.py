@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 
-from neuros.recording.load_table import GroupLoad, LoadTable, MachineLoad, load_table
+from neuros.recording.system_load import GroupLoad, LoadTable, MachineLoad, load_table
 
 
 def machine(cores: tuple[float, ...] = (10.0, 30.0), sent_bytes: int = 0) -> MachineLoad:

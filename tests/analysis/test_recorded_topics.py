@@ -12,8 +12,7 @@ import neuros.bag
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
 from neuros.project.qos import PRESETS, Qos
-from neuros.recording.plan import RecordingPlan, Topic
-from neuros.recording.selection import Request, plan_recording
+from neuros.recording.recording_plan import RecordingPlan, Request, Topic, plan_recording
 
 INT = "std_msgs/msg/Int32"
 LATCHED = Qos("reliable", "transient_local", 1)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,18 @@ from analysis.recordings import ANSWER, NUMBER, answer, fail, number, plan, reco
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex, SummaryOffset
+from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from neuros.recording import recorder as recording
-from neuros.recording.bag_writer import BagWriter
-from neuros.recording.plan import RecordingPlan, Stream, Topic, load_plan
+from neuros.recording.bag_files import BagWriter, Stored, stored_messages
 from neuros.recording.recorder import Recorder
+from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
 from neuros.recording.repair import repair
 from neuros.recording.spool import NO_TIME, SpoolWriter
-from neuros.recording.stored import Stored, stored_messages
 
 
 def bag_file(run: Path) -> Path:
@@ -98,6 +101,32 @@ def test_mcap_reads_index_and_both_times(tmp_path: Path) -> None:
         assert summary.statistics.message_count == 4
         found = [(m.log_time, m.publish_time, m.sequence) for _, _, m in reader.iter_messages()]
     assert found == [(10, 500, 1), (10, 500, 1), (30, 600, 2), (30, 600, 2)]
+
+
+def test_the_parts_of_the_summary_are_where_it_says(tmp_path: Path) -> None:
+    recorder = Recorder(plan(), tmp_path, fail)
+    for at in range(3):
+        recorder.bag.put(1, at, at, bytes(600_000))  # two to a chunk
+    recorder.complete()
+    data = bag_file(tmp_path).read_bytes()
+    records = [*StreamReader(io.BytesIO(data), emit_chunks=True).records]
+    offsets = [each for each in records if isinstance(each, SummaryOffset)]
+    assert [each.group_opcode for each in offsets] == [3, 4, 8, 0x0D, 0x0B]
+    assert all(data[each.group_start] == each.group_opcode for each in offsets)
+    indexes = [each for each in records if isinstance(each, ChunkIndex)]
+    times = [(each.message_start_time, each.message_end_time) for each in indexes]
+    assert times == [(0, 0), (0, 1), (2, 2)]  # the first chunk has definitions alone
+    for each in indexes:
+        assert data[each.chunk_start_offset] == 6
+        assert all(data[at] == 7 for at in each.message_index_offsets.values())
+
+
+def test_metadata_keep_every_letter(tmp_path: Path) -> None:
+    text = 'Größe 大きさ 🤖: "a\\b"\n- c\t#'
+    recorder = Recorder(replace(plan(), custom={"project": text}), tmp_path, fail)
+    recorder.complete()
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.storage.metadata.custom == {"project": text}
 
 
 def test_mcap_ros2_support_decodes_the_messages(tmp_path: Path) -> None:
@@ -227,6 +256,18 @@ def test_a_full_disk_leaves_the_bag_of_the_last_checkpoint(
     recorder.bag.put(1, 20, 20, bytes(50_000))
     with pytest.raises(OSError, match="No space left"):
         recorder.bag.checkpoint()
+    recorder.abandon()
+    with Reader(tmp_path / "bag") as reader:
+        assert [at for _, at, _ in reader.messages()] == [10]
+
+
+def test_a_full_disk_leaves_the_sqlite_bag_of_the_last_checkpoint(tmp_path: Path) -> None:
+    recorder = Recorder(plan(storage="sqlite3"), tmp_path, fail)
+    recorder.bag.put(1, 10, 10, number(1))
+    recorder.bag.checkpoint()
+    recorder.bag._file._connection.execute("PRAGMA max_page_count=1")  # as many as there are
+    with pytest.raises(OSError, match="disk is full"):
+        recorder.bag.put(1, 20, 20, bytes(50_000))
     recorder.abandon()
     with Reader(tmp_path / "bag") as reader:
         assert [at for _, at, _ in reader.messages()] == [10]

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuros.ports import Way
-from neuros.recording.plan import Stream
+from neuros.recording.recording_plan import Stream
 from neuros.recording.spool import NO_TIME, Record, SpoolReader, SpoolWriter
 
 STREAMS = (Stream("sent", "imu", (0,)), Stream("heard", "camera", (1,)))

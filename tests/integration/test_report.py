@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from launching import BACKENDS, EXAMPLES, launch
 
-from neuros.analysis.review.figures import time_budget_figure
-from neuros.analysis.review.run import open_for_review
+from neuros.analysis.charts import time_budget_figure
+from neuros.analysis.run_record import open_for_review
 from neuros.cli.main import main
 
 FIGURES = {"graph", "time_shares", "swim_lanes", "real_time", "packets", "latency"}

@@ -151,9 +151,11 @@ def test_figures_of_any_titles_have_files_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files: list[Path] = []
-    monkeypatch.setattr(figure_files, "is_drawn", files.__contains__)
+    drawn: list[SimpleNamespace] = []
+    monkeypatch.setattr(figure_files, "_OPEN", drawn)
     for title in ("Größe", "大きさ", "left eye", "Left-Eye", "???", "!", "x" * 300):
         files.append(figure_files._file_for(title))
+        drawn.append(SimpleNamespace(file=files[-1]))
     assert [file.parent for file in files] == [tmp_path] * len(files)
     assert [file.stem for file in files] == [
         "größe", "大きさ", "left_eye", "left_eye_2", "figure", "figure_2", "x" * 60
@@ -173,14 +175,15 @@ def test_a_hook_never_waits_and_what_is_left_out_is_counted(capfd: Any) -> None:
     figure.add_image("eye")
     lines = VisualiseLines("speed", below=figure)
     lines.add_line("v")
-    os.kill(figure._feed.pid, signal.SIGSTOP)  # a drawing process that takes nothing at all
+    drawing = figure._feed._process.pid
+    os.kill(drawing, signal.SIGSTOP)  # a drawing process that takes nothing at all
     image = np.random.default_rng(1).integers(0, 255, (320, 320, 3), np.uint8)
     for step in range(100):
         figure.plot("eye", image, step)
     while not lines.dropped > 200:
         lines.plot("v", 1.0, 0.0)
     dropped = figure.dropped
-    os.kill(figure._feed.pid, signal.SIGCONT)
+    os.kill(drawing, signal.SIGCONT)
     figure.close()
     assert f"{dropped} of " in capfd.readouterr().err
     assert figure.file.exists()
@@ -194,7 +197,7 @@ import sys, time
 from neuros.visualise import VisualiseLines
 figure = VisualiseLines("speed", save_every=0.1)
 figure.add_line("v")
-print(figure._feed.pid, flush=True)
+print(figure._feed._process.pid, flush=True)
 while True:
     figure.plot("v", time.monotonic(), time.monotonic())
     time.sleep(0.01)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.launcher.channels import Channels
-from neuros.viewers.observer import look_on
-from neuros.viewers.visual_types import Mark, Numbers, VisualTypes
+from neuros.viewers.visual_types import Mark, Numbers, VisualTypes, look_on
 
 
 def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:

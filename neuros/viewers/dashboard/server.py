@@ -88,7 +88,7 @@ class Dashboard:
     """Serves one run until that is over.
 
     Args:
-        plan: what :func:`neuros.viewers.dashboard.plan.plan` tells of the project.
+        plan: what :func:`neuros.viewers.project_view.project_view` tells of the project.
         names: the nodes of the run.
         start_s: monotonic time from which the page counts.
     """

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from run_folders import accounting, run_folder
 
-from neuros.analysis.review.findings import Bottleneck, Findings, find_bottleneck, findings_of
-from neuros.analysis.review.run import open_for_review
+from neuros.analysis.findings import Bottleneck, Findings, find_bottleneck, findings_of
+from neuros.analysis.run_record import open_for_review
 from neuros.engine.time_budget import TimeBudget
 from neuros.project.model import Connection
 

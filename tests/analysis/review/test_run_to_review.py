@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from run_folders import PACKETS, accounting, run_folder
 
-from neuros.analysis.review.run import open_for_review
+from neuros.analysis.run_record import open_for_review
 from neuros.errors import UsageError
 
 WIRE = "a.out -> b.in"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from neuros.project.load import load_project
-from neuros.viewers.dashboard.plan import plan
+from neuros.viewers.project_view import project_view
 
 BOOL = "std_msgs/msg/Bool"
 NODE = {
@@ -24,7 +24,7 @@ def test_external_topics_are_shown_by_the_names_that_they_have_on_the_graph(tmp_
     named = {"namespace": "/left", "remap": ["fine:=/all_well"]}
     project = load_project(tmp_path, workspace=tmp_path, **named).project
 
-    told = plan(project, ["rover"])
+    told = project_view(project, ["rover"])
 
     assert [(each["full"], each["title"]) for each in told["topics"]] == [
         ("/left/halt", "/left/halt -> rover.stop"),

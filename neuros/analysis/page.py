@@ -11,7 +11,7 @@ from html import escape
 from string import Template
 from typing import Any
 
-from neuros.analysis.review.figures import (
+from neuros.analysis.charts import (
     counts_figure,
     graph_figure,
     latency_figure,
@@ -19,10 +19,10 @@ from neuros.analysis.review.figures import (
     ticks_figure,
     time_budget_figure,
     time_figure,
+    timeline_figure,
 )
-from neuros.analysis.review.findings import Findings
-from neuros.analysis.review.run import Run
-from neuros.analysis.review.timeline import timeline_figure
+from neuros.analysis.findings import Findings
+from neuros.analysis.run_record import PastRun
 
 _PAGE = Template("""\
 <!DOCTYPE html>
@@ -61,7 +61,7 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def report_page(run: Run, findings: Findings, figures: Mapping[str, tuple[str, bytes]]) -> str:
+def report_page(run: PastRun, findings: Findings, figures: Mapping[str, tuple[str, bytes]]) -> str:
     """The page of a run.
 
     Args:
@@ -114,7 +114,7 @@ def figure_part(title: str, text: str, data: bytes) -> str:
     )
 
 
-def _facts(run: Run) -> str:
+def _facts(run: PastRun) -> str:
     record = run.record
     parts = [str(record.get("reason") or "ended normally")]
     if record.get("sim_s") is not None:
@@ -132,7 +132,7 @@ def _missing(missing: Sequence[str]) -> str:
     return f'<div class="missing"><p>What this page lacks:</p><ul>{items}</ul></div>'
 
 
-def _connections(run: Run) -> str:
+def _connections(run: PastRun) -> str:
     header = ["connection", "sent", "received", "consumed", "discarded", "lost",
               "longest discard", "rate / Hz", "median / ms", "99 % / ms", "max / ms"]  # fmt: skip
     counts = ("sent", "received", "consumed", "discarded", "lost", "longest_discard")
@@ -154,7 +154,7 @@ def _number(value: float | None, digits: int) -> str:
     return "?" if value is None else f"{value:,.{digits}f}"
 
 
-def _provenance(run: Run) -> str:
+def _provenance(run: PastRun) -> str:
     record = run.record
     machine, versions = record.get("machine") or {}, record.get("versions") or {}
     git = record.get("git") or {}
@@ -188,7 +188,7 @@ def _machine(machine: Mapping[str, Any]) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-_FIGURES: tuple[tuple[str, str, str, Callable[[Run], Any]], ...] = (
+_FIGURES: tuple[tuple[str, str, str, Callable[[PastRun], Any]], ...] = (
     (
         "graph",
         "Nodes and connections",
@@ -243,7 +243,7 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[Run], Any]], ...] = (
 )
 
 
-def figures_of(run: Run) -> dict[str, tuple[str, str, bytes]]:
+def figures_of(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
     """By file name (without ending): title, what is seen, PNG; only what says something."""
     found = {}
     for name, title, text, draw in _FIGURES:

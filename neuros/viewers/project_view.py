@@ -1,26 +1,34 @@
-"""Project as the page gets it: nodes, connections, topics, and ports that can be sampled."""
+"""Project as viewers get it: nodes, connections, topics, and ports that can be sampled."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from neuros.project.graph import guarantee
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
+from neuros.viewers.visual_types import IMAGES
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
-
-def plan(project: Project, names: Sequence[str]) -> dict[str, Any]:
-    """The project for the page, ready for JSON.
+def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
+    """The project for viewers, ready for JSON.
 
     Args:
         names: the nodes of this run; the others run elsewhere, and nothing is seen of them.
     """
     return {
         "project": project.name,
-        "nodes": [_node(node, is_here=node.name in names) for node in project.nodes],
+        "nodes": [
+            {
+                "name": node.name,
+                "container": node.container,
+                "plugin": node.plugin.name,
+                "is_here": node.name in names,
+                "owns_time": node.owns_time,
+            }
+            for node in project.nodes
+        ],
         "connections": [_connection(c) for c in project.connections],
         "topics": list(_topics(project)),
         "sources": [
@@ -29,16 +37,6 @@ def plan(project: Project, names: Sequence[str]) -> dict[str, Any]:
             if node.name in names
             for source in _sources(node, project.names)
         ],
-    }
-
-
-def _node(node: Node, *, is_here: bool) -> dict[str, Any]:
-    return {
-        "name": node.name,
-        "container": node.container,
-        "plugin": node.plugin.name,
-        "is_here": is_here,
-        "owns_time": node.owns_time,
     }
 
 
@@ -56,13 +54,12 @@ def _connection(connection: Connection) -> dict[str, Any]:
     }
 
 
-def _topics(project: Project) -> Iterable[dict[str, Any]]:
+def _topics(project: Project) -> Iterator[dict[str, Any]]:
     """External topics: ``name`` is as in the project file, ``title`` as on the ROS graph."""
     for node in project.nodes:
         for port in (*node.inputs, *node.outputs):
             if port.external_topic is not None:
-                is_in = port in node.inputs
-                end = f"{node.name}.{port.name}"
+                is_in, end = port in node.inputs, f"{node.name}.{port.name}"
                 full = project.names.resolve(port.external_topic, node.name)
                 name, title = (
                     f"{topic} -> {end}" if is_in else f"{end} -> {topic}"
@@ -78,7 +75,7 @@ def _topics(project: Project) -> Iterable[dict[str, Any]]:
                 }
 
 
-def _sources(node: Node, names: Names) -> Iterable[dict[str, Any]]:
+def _sources(node: Node, names: Names) -> Iterator[dict[str, Any]]:
     """Ports whose packets can be sampled: outputs and external inputs."""
     for port in node.outputs:
         yield _source(node, port, port.name, port.name)

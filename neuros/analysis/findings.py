@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.analysis.review.run import Run
+from neuros.analysis.run_record import PastRun
 from neuros.engine.time_budget import TimeBudget
 from neuros.project.model import Connection
 
@@ -98,156 +98,125 @@ def find_bottleneck(
     """
     if not budgets or running_s <= 0:
         return None
-    pacing = time_owner if time_owner in budgets else _most_held_up(budgets)
-    assert pacing is not None
-    steps, loop = _follow(pacing, budgets, connections, running_s)
-    root: str | None = steps[-1].node
-    if steps[-1].state not in ("executing", "idle"):
-        root = max(loop or (steps[-1].node,), key=lambda node: budgets[node].own_s)
-        if budgets[root].own_s < running_s / 2:
-            root = None
-    gains = _gains(pacing, budgets, connections, running_s)
-    return Bottleneck(pacing, tuple(steps), root, loop, gains)
+    return _Search(budgets, connections, running_s).bottleneck(time_owner)
 
 
-def _most_held_up(budgets: Mapping[str, TimeBudget]) -> str:
-    blocked = {node: sum(spent.blocked.values()) for node, spent in budgets.items()}
-    most = max(blocked, key=lambda node: blocked[node])
-    if blocked[most] > WORTH_NAMING * budgets[most].total_s:
-        return most
-    return max(budgets, key=lambda node: budgets[node].own_s)
+@dataclass(frozen=True)
+class _Search:
+    budgets: Mapping[str, TimeBudget]
+    connections: Mapping[str, Connection]
+    running_s: float
 
+    def bottleneck(self, time_owner: str | None) -> Bottleneck:
+        pacing = time_owner if time_owner in self.budgets else self._most_held_up()
+        assert pacing is not None
+        steps, loop = self._follow(pacing)
+        root: str | None = steps[-1].node
+        if steps[-1].state not in ("executing", "idle"):
+            root = max(loop or (steps[-1].node,), key=self._own_s)
+            if self._own_s(root) < self.running_s / 2:
+                root = None
+        return Bottleneck(pacing, tuple(steps), root, loop, self._gains(pacing))
 
-def _follow(
-    node: str,
-    budgets: Mapping[str, TimeBudget],
-    connections: Mapping[str, Connection],
-    running_s: float,
-) -> tuple[list[Step], tuple[str, ...]]:
-    """The steps, and the loop in which they end."""
-    steps: list[Step] = []
-    seen: list[str] = []
-    while True:
-        seen.append(node)
-        step = _largest(node, budgets[node], running_s)
-        steps.append(step)
-        following = _held_up_by(step, budgets, connections)
-        if following is None:
-            return steps, ()
-        if following in seen:
-            return steps, tuple(seen[seen.index(following) :])
-        node = following
+    def _own_s(self, node: str) -> float:
+        return self.budgets[node].own_s
 
+    def _most_held_up(self) -> str:
+        blocked = {node: sum(spent.blocked.values()) for node, spent in self.budgets.items()}
+        most = max(blocked, key=lambda node: blocked[node])
+        if blocked[most] > WORTH_NAMING * self.budgets[most].total_s:
+            return most
+        return max(self.budgets, key=self._own_s)
 
-def _largest(node: str, spent: TimeBudget, running_s: float) -> Step:
-    sums = {
-        "executing": spent.own_s,
-        "blocked": sum(spent.blocked.values()),
-        "waiting": sum(spent.waiting.values()),
-        "idle": spent.idle_s,
-    }
-    held_s = sums["blocked"] + sums["waiting"]
-    if spent.idle_s > max(spent.own_s, held_s):
-        state = "idle"
-    elif held_s < HELD_UP * running_s:
-        state = "executing"
-    else:
-        state = "blocked" if sums["blocked"] >= sums["waiting"] else "waiting"
-    causes: Mapping[str, float] = {}
-    if state == "executing":
-        causes = spent.executing
-    elif state == "blocked":
-        causes = spent.blocked
-    elif state == "waiting":
-        causes = spent.waiting
-    cause = max(causes, key=lambda cause: causes[cause], default="")
-    share_s = spent.executing_s if state == "executing" else sums[state]
-    return Step(node, state, cause, spent.share(share_s))
+    def _follow(self, node: str) -> tuple[list[Step], tuple[str, ...]]:
+        """The steps, and the loop in which they end."""
+        steps: list[Step] = []
+        seen: list[str] = []
+        while True:
+            seen.append(node)
+            steps.append(self._largest(node))
+            following = self._held_up_by(steps[-1])
+            if following is None:
+                return steps, ()
+            if following in seen:
+                return steps, tuple(seen[seen.index(following) :])
+            node = following
 
+    def _largest(self, node: str) -> Step:
+        spent = self.budgets[node]
+        blocked_s, waiting_s = sum(spent.blocked.values()), sum(spent.waiting.values())
+        causes: Mapping[str, float] = {}
+        if spent.idle_s > max(spent.own_s, blocked_s + waiting_s):
+            state, share_s = "idle", spent.idle_s
+        elif blocked_s + waiting_s < HELD_UP * self.running_s:
+            state, share_s, causes = "executing", spent.executing_s, spent.executing
+        elif blocked_s >= waiting_s:
+            state, share_s, causes = "blocked", blocked_s, spent.blocked
+        else:
+            state, share_s, causes = "waiting", waiting_s, spent.waiting
+        cause = max(causes, key=lambda cause: causes[cause], default="")
+        return Step(node, state, cause, spent.share(share_s))
 
-def _held_up_by(
-    step: Step, budgets: Mapping[str, TimeBudget], connections: Mapping[str, Connection]
-) -> str | None:
-    """The node to ask next, ``None`` where the search ends."""
-    if step.state == "blocked" and step.cause in connections:
-        receiver = connections[step.cause].destination_node
-        return receiver if receiver in budgets else None
-    if step.state == "waiting":
-        senders = [
-            c.source_node
-            for c in connections.values()
-            if (c.destination_node, c.destination_input) == (step.node, step.cause)
-            and c.source_node in budgets
-        ]
-        # Of several senders of one input, the one with most to do is taken for the late one.
-        return max(senders, key=lambda sender: budgets[sender].own_s, default=None)
-    return None
+    def _held_up_by(self, step: Step) -> str | None:
+        """The node to ask next, ``None`` where the search ends."""
+        if step.state == "blocked" and step.cause in self.connections:
+            receiver = self.connections[step.cause].destination_node
+            return receiver if receiver in self.budgets else None
+        if step.state == "waiting":
+            senders = [
+                c.source_node
+                for c in self.connections.values()
+                if (c.destination_node, c.destination_input) == (step.node, step.cause)
+                and c.source_node in self.budgets
+            ]
+            # Of several senders of one input, the one with most to do is taken for the late one.
+            return max(senders, key=self._own_s, default=None)
+        return None
 
-
-def _gains(
-    pacing: str,
-    budgets: Mapping[str, TimeBudget],
-    connections: Mapping[str, Connection],
-    running_s: float,
-) -> tuple[Gain, ...]:
-    reached = _coupled(pacing, budgets, connections, ())
-    limiting = [
-        name
-        for name, c in connections.items()
-        if c.discard_limit is not None
-        and c.source_node in reached
-        and c.source_node != c.destination_node
-        and budgets[c.source_node].blocked.get(name, 0.0) > WORTH_NAMING * running_s
-    ]
-    cuts: list[tuple[str, ...]] = [(name,) for name in limiting]
-    for receiver in dict.fromkeys(connections[name].destination_node for name in limiting):
-        together = tuple(
-            name
-            for name, c in connections.items()
+    def _gains(self, pacing: str) -> tuple[Gain, ...]:
+        reached = self._coupled(pacing, ())
+        limited = {
+            name: c
+            for name, c in self.connections.items()
             if c.discard_limit is not None
-            and c.destination_node == receiver != c.source_node
-            and c.source_node in budgets
-        )
-        if len(together) > 1:
-            cuts.append(together)
-    gains = [
-        Gain(cut, running_s / _least_s(pacing, cut, budgets, connections, running_s))
-        for cut in cuts
-    ]
-    return tuple(sorted(gains, key=lambda gain: (-round(gain.up_to, 2), len(gain.connections))))
+            and c.source_node in self.budgets
+            and c.source_node != c.destination_node
+        }
+        limiting = [
+            name
+            for name, c in limited.items()
+            if c.source_node in reached and self._blocked_s(name) > WORTH_NAMING * self.running_s
+        ]
+        cuts: list[tuple[str, ...]] = [(name,) for name in limiting]
+        for receiver in dict.fromkeys(limited[name].destination_node for name in limiting):
+            together = tuple(n for n, c in limited.items() if c.destination_node == receiver)
+            if len(together) > 1:
+                cuts.append(together)
+        gains = [Gain(cut, self.running_s / self._least_s(pacing, cut)) for cut in cuts]
+        return tuple(sorted(gains, key=lambda gain: (-round(gain.up_to, 2), len(gain.connections))))
 
+    def _blocked_s(self, connection: str) -> float:
+        sender = self.connections[connection].source_node
+        return self.budgets[sender].blocked.get(connection, 0.0)
 
-def _least_s(
-    pacing: str,
-    cut: Sequence[str],
-    budgets: Mapping[str, TimeBudget],
-    connections: Mapping[str, Connection],
-    running_s: float,
-) -> float:
-    """The least time that the same run could take with ``cut`` free of discard limits."""
-    spared_s = sum(budgets[connections[n].source_node].blocked.get(n, 0.0) for n in cut)
-    coupled = _coupled(pacing, budgets, connections, cut)
-    slowest_s = max(budgets[node].own_s for node in coupled)
-    return min(running_s, max(running_s - spared_s, slowest_s, 1e-9))
+    def _least_s(self, pacing: str, cut: Sequence[str]) -> float:
+        """The least time that the same run could take with ``cut`` free of discard limits."""
+        spared_s = sum(map(self._blocked_s, cut))
+        slowest_s = max(map(self._own_s, self._coupled(pacing, cut)))
+        return min(self.running_s, max(self.running_s - spared_s, slowest_s, 1e-9))
 
-
-def _coupled(
-    node: str,
-    budgets: Mapping[str, TimeBudget],
-    connections: Mapping[str, Connection],
-    cut: Sequence[str],
-) -> set[str]:
-    """The nodes that must keep up with ``node``: behind it, by lossless connections."""
-    found, new = {node} & {*budgets}, [node]
-    while new:
-        at = new.pop()
-        for name, c in connections.items():
-            to = c.destination_node
-            is_tight = c.discard_limit == 0 and name not in cut
-            if c.source_node == at and is_tight and to in budgets and to not in found:
-                found.add(to)
-                new.append(to)
-    return found
+    def _coupled(self, node: str, cut: Sequence[str]) -> set[str]:
+        """The nodes that must keep up with ``node``: behind it, by lossless connections."""
+        found, new = {node}, [node]
+        while new:
+            at = new.pop()
+            for name, c in self.connections.items():
+                to = c.destination_node
+                is_tight = c.discard_limit == 0 and name not in cut
+                if c.source_node == at and is_tight and to in self.budgets and to not in found:
+                    found.add(to)
+                    new.append(to)
+        return found
 
 
 _WORTH_A_TRY = 1.05
@@ -271,7 +240,7 @@ class Findings:
     trial: str | None = None
 
 
-def findings_of(run: Run) -> Findings:
+def findings_of(run: PastRun) -> Findings:
     """Say what limits a run."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
@@ -357,7 +326,7 @@ def _reason(step: Step, spent: TimeBudget) -> str:
     )
 
 
-def _caveats(run: Run, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
+def _caveats(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
     cores = (run.record.get("machine") or {}).get("cores")
     machine = (run.record.get("system_load") or {}).get("machine")
     shares = [sum(sum(s.executing.values()) for s in budgets.values()) / running_s / (cores or 1)]
@@ -373,19 +342,18 @@ def _caveats(run: Run, budgets: Mapping[str, TimeBudget], running_s: float) -> l
 
 
 def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
-    names = " and ".join(gain.connections)
-    one = len(gain.connections) == 1
+    plural = "" if len(gain.connections) == 1 else "s"
+    text = f"Without the discard limit{plural} of {' and '.join(gain.connections)}:"
     if gain.up_to < _WORTH_A_TRY:
-        return f"Without the discard limit{'' if one else 's'} of {names}: next to nothing."
-    text = f"Without the discard limit{'' if one else 's'} of {names}: up to"
-    text += f" {gain.up_to:.1f} times as fast"
+        return f"{text} next to nothing."
+    text += f" up to {gain.up_to:.1f} times as fast"
     factor = record.get("real_time_factor")
     if factor:
         text += f" (real-time factor {factor:.2f}, then up to {factor * gain.up_to:.2f})"
     return f"{text}. Packets may then be lost there."
 
 
-def _trial(gain: Gain, run: Run) -> str:
+def _trial(gain: Gain, run: PastRun) -> str:
     settings = []
     for name in gain.connections:
         c = run.ends[name]
@@ -394,7 +362,7 @@ def _trial(gain: Gain, run: Run) -> str:
     return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
 
 
-def _in_process(run: Run, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
+def _in_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
     """One thread runs all hooks: none overlap, so that no node holds up another."""
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in budgets.items()), key=lambda x: x[1][1]

@@ -1,0 +1,552 @@
+"""Figures of one run: its graph, times, packets, latencies, timeline, ticks and load."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuros.analysis.packets import Numbers
+from neuros.analysis.run_record import PastRun
+from neuros.engine.time_budget import TimeBudget
+from neuros.project.graph import guarantee, port_names
+from neuros.project.layout import Place, lay_out
+from neuros.recording.system_load import FILE_NAME
+
+# Okabe and Ito, Color Universal Design (2008).
+BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
+SKY, RED, YELLOW, GREY = "#56B4E9", "#D55E00", "#F0E442", "#999999"
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED, YELLOW, GREY)
+
+_STATES = {"executing": GREEN, "waiting": SKY, "blocked": RED, "idle": "#DDDDDD"}
+_FATES = {"consumed": BLUE, "unread": YELLOW, "discarded": ORANGE, "lost": RED}
+_DPI, _WIDTH_IN = 110, 9.5
+_POINTS = 500
+_MOST_TICKS = 12
+_DOTTED = (0, (2, 2))
+
+
+def colour(index: int) -> str:
+    """The colour of the nth of several things."""
+    return CYCLE[index % len(CYCLE)]
+
+
+def new_figure(height_in: float, width_in: float = _WIDTH_IN) -> Any:
+    """An empty ``matplotlib`` figure; no window, no global state."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+
+
+def plain(axes: Any) -> Any:
+    """Leave out the frame where nothing is read off; returns the axes."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, color="#E6E6E6", linewidth=0.7)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def add_legend(figure: Any, columns: int, **options: Any) -> None:
+    """A legend below all axes."""
+    figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=8, **options)
+
+
+def _stacked_bars(names: Sequence[str], parts: Mapping[str, tuple[str, Any]]) -> tuple[Any, Any]:
+    """A bar per name, from the top down, of coloured parts; the figure and its axes."""
+    figure = new_figure(0.42 * len(names) + 1.2)
+    axes = plain(figure.add_subplot())
+    lefts = np.zeros(len(names))
+    for label, (shade, lengths) in parts.items():
+        axes.barh(names, lengths, left=lefts, color=shade, label=label, height=0.65)
+        lefts = lefts + lengths
+    add_legend(figure, 4)
+    return figure, axes
+
+
+def time_budget_figure(run: PastRun) -> Any | None:
+    """Time budgets of all nodes; ``None`` if none has reported."""
+    budgets = run.time_budgets
+    if not budgets:
+        return None
+    names = list(budgets)[::-1]
+    shares = {
+        state: np.array([100 * budgets[name].shares[state] for name in names]) for state in _STATES
+    }
+    parts = {state: (shade, shares[state]) for state, shade in _STATES.items()}
+    figure, axes = _stacked_bars(names, parts)
+    lefts = np.zeros(len(names))
+    for lengths in shares.values():
+        for row, share in enumerate(lengths):
+            if share >= 6:
+                where = lefts[row] + share / 2
+                axes.text(where, row, f"{share:.0f}", ha="center", va="center", fontsize=8)
+        lefts += lengths
+    axes.set(xlabel="share of the time in which all nodes ran / %", xlim=(0, 100))
+    return figure
+
+
+def counts_figure(run: PastRun) -> Any | None:
+    """Packets of every connection: consumed, unread, discarded, lost."""
+    names = list(run.connections)[::-1]
+    if not names:
+        return None
+    figures = [run.connections[name] for name in names]
+    counts = {fate: np.array([each.get(fate) or 0 for each in figures], float) for fate in _FATES}
+    figure, axes = _stacked_bars(names, {f: (shade, counts[f]) for f, shade in _FATES.items()})
+    ends = np.sum([*counts.values()], axis=0)
+    for row, (end, each) in enumerate(zip(ends, figures, strict=True)):
+        axes.text(end, row, f" {_count(each.get('sent'))} sent", va="center", fontsize=8)
+    axes.set_xlim(0, max(float(ends.max()), 1.0) * 1.18)
+    axes.set_xlabel("packets")
+    return figure
+
+
+def _count(value: int | None) -> str:
+    return "?" if value is None else f"{value:,}"
+
+
+def latency_figure(run: PastRun) -> Any | None:
+    """The share of packets on which a hook had started after a time; ``None`` without lists."""
+    curves = {}
+    for name in run.packets:
+        latencies_ns = run.latencies_ns(name)
+        if latencies_ns is not None and len(latencies_ns):
+            shares = np.linspace(0, 100, min(_POINTS, len(latencies_ns) + 1))
+            curves[name] = np.percentile(latencies_ns, shares) / 1e6, shares
+    if not curves:
+        return None
+    rows = -(-len(curves) // 2)
+    figure = new_figure(3.2 + 0.2 * rows)
+    axes = plain(figure.add_subplot())
+    for place, (name, (ms, shares)) in enumerate(curves.items()):
+        style = ("-", "--", ":")[place // 8 % 3]
+        axes.plot(np.maximum(ms, 1e-3), shares, style, color=colour(place), label=name)
+    axes.set_xscale("log")
+    axes.set(xlabel="from sending to the start of a hook / ms", ylabel="packets / %", ylim=(0, 100))
+    add_legend(figure, 2)
+    return figure
+
+
+def ticks_figure(run: PastRun) -> Any | None:
+    """Histograms of the intervals of timed hooks; ``None`` if there are none."""
+    ticks = [
+        (f"{node}.{hook}", figures["ticks"])
+        for node, metrics in run.nodes.items()
+        for hook, figures in (metrics.get("hooks") or {}).items()
+        if figures.get("ticks")
+    ][:_MOST_TICKS]
+    if not ticks:
+        return None
+    figure = new_figure(2.6 * len(ticks))
+    rows = figure.subplots(len(ticks), squeeze=False)[:, 0]
+    for axes, (name, each) in zip(rows, ticks, strict=True):
+        _draw_ticks(plain(axes), name, each)
+    return figure
+
+
+def _draw_ticks(axes: Any, name: str, ticks: Mapping[str, Any]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    from_ms, counts = zip(*ticks["histogram"], strict=True)
+    low, high = min(from_ms), max(from_ms) + 0.1
+    bins = max(1, round((high - low) / 0.1))
+    width = 0.1 * max(1, -(-bins // 80))
+    edges = np.arange(low, high + width, width)
+    axes.hist(np.array(from_ms) + 0.05, bins=edges, weights=counts, color=BLUE)
+    axes.axvline(ticks["period_ms"], color=GREY, linestyle="--", linewidth=1)
+    within = ", ".join(f"{share:.1%} within {ms}" for ms, share in ticks["within"].items())
+    axes.set_title(
+        f"{name}: period {ticks['period_ms']:g} ms (dashed), standard deviation"
+        f" {ticks['std_ms']:.2f} ms\n{within}",
+        fontsize=9, loc="left",
+    )  # fmt: skip
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="interval between starts / ms", ylabel="intervals")
+
+
+def time_figure(run: PastRun) -> Any | None:
+    """Simulated against wall time, and the real-time factor of each second; ``None`` without."""
+    timelines = {
+        name: points for name, points in run.record.get("timeline", {}).items() if len(points) > 1
+    }
+    if not timelines:
+        return None
+    figure = new_figure(3.4)
+    left, right = (plain(axes) for axes in figure.subplots(1, 2))
+    for place, (name, points) in enumerate(timelines.items()):
+        sims, walls = zip(*points, strict=True)
+        left.plot(walls, sims, color=colour(place), label=name, marker="o", markersize=3)
+        factors = [
+            (b[0] - a[0]) / (b[1] - a[1]) for a, b in itertools.pairwise(points) if b[1] > a[1]
+        ]
+        right.step(range(1, len(factors) + 1), factors, where="mid", color=colour(place))
+    low, high = left.get_xlim()
+    left.axline((low, low), slope=1, color=GREY, linestyle="--", linewidth=1, label="real time")
+    left.set_xlim(low, high)
+    left.set(xlabel="wall time / s", ylabel="simulated time / s")
+    left.legend(frameon=False, fontsize=8)
+    right.axhline(1, color=GREY, linestyle="--", linewidth=1)
+    right.set(xlabel="simulated second", ylabel="real-time factor", ylim=(0, None))
+    return figure
+
+
+def load_figure(run: PastRun) -> Any | None:
+    """Processor and memory of every node; ``None`` if nothing was recorded."""
+    series = read_load(run.folder / FILE_NAME)
+    if not series.get("time_s"):
+        return None
+    figure = new_figure(3.6)
+    left, right = (plain(axes) for axes in figure.subplots(1, 2))
+    suffix, marker = ".cpu_percent", {"marker": "o", "markersize": 3}
+    groups = [name.removesuffix(suffix) for name in series if name.endswith(suffix)]
+    for place, name in enumerate(groups):
+        left.plot(series["time_s"], series[name + suffix], color=colour(place), **marker)
+        memory = [each / 1e6 for each in series[f"{name}.memory_bytes"]]
+        right.plot(series["time_s"], memory, color=colour(place), label=name, **marker)
+    cores = [name for name in series if name.startswith("core")]
+    whole = [sum(each) for each in zip(*(series[core] for core in cores), strict=True)]
+    label = f"whole machine, {len(cores)} core{'' if len(cores) == 1 else 's'}"
+    left.plot(series["time_s"], whole, color=GREY, linestyle="--", label=label)
+    left.set(xlabel="wall time / s", ylabel="processor time / % of one core", ylim=(0, None))
+    right.set(xlabel="wall time / s", ylabel="resident memory / MB", ylim=(0, None))
+    add_legend(figure, 5)
+    return figure
+
+
+def read_load(file: Path) -> dict[str, list[float]]:
+    """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
+
+    The last row of a run that was cut off may be broken, and is left out.
+    """
+    try:
+        with open(file, encoding="utf-8", newline="") as lines:
+            header, *rows = csv.reader(lines)
+    except (OSError, ValueError):
+        return {}
+    series: dict[str, list[float]] = {name: [] for name in header}
+    for row in rows:
+        try:
+            numbers = [float(cell) if cell else float("nan") for cell in row]
+        except ValueError:
+            continue
+        if len(numbers) == len(header):
+            for name, number in zip(header, numbers, strict=True):
+                series[name].append(number)
+    return series
+
+
+_COLUMN_IN, _ROW_IN = 2.45, 1.12
+_NODE, _BOX = (1.75, 0.8), (2.05, 0.8)
+
+
+def graph_figure(run: PastRun) -> Any | None:
+    """Nodes with how they spent their time, connections with what they carried and how fast."""
+    if not run.nodes:
+        return None
+    budgets = run.time_budgets
+    first = run.time_owner or next(iter(run.nodes))
+    known = {
+        name: end
+        for name, end in run.ends.items()
+        if {end.source_node, end.destination_node} <= {*run.nodes}
+    }
+    layout = lay_out(list(run.nodes), known, first)
+    places = [*layout.nodes.values(), *layout.boxes.values()]
+    columns = max(place.column for place in places) + 1
+    rows = max(abs(place.row) for place in places) * 2 + 1
+    figure = new_figure(rows * _ROW_IN + 0.4, max(6.0, columns * _COLUMN_IN))
+    axes = figure.add_subplot()
+    axes.set_axis_off()
+    axes.set_xlim(-_COLUMN_IN / 2, (columns - 0.5) * _COLUMN_IN)
+    axes.set_ylim(-rows * _ROW_IN / 2 - 0.4, rows * _ROW_IN / 2)
+    widths = dict.fromkeys(layout.nodes.values(), _NODE[0])
+    widths |= dict.fromkeys(layout.boxes.values(), _BOX[0])
+    for name, route in layout.routes.items():
+        _draw_route(axes, route, widths, _shade(run, name), known[name].discard_limit is None)
+    for name, place in layout.boxes.items():
+        _draw_box(axes, run, name, place)
+    for name, place in layout.nodes.items():
+        _draw_node(axes, name, place, budgets.get(name))
+    _draw_key(axes, rows)
+    return figure
+
+
+def _at(place: Place) -> tuple[float, float]:
+    return place.column * _COLUMN_IN, -place.row * _ROW_IN
+
+
+def _shade(run: PastRun, name: str) -> str:
+    """Red where the sender was held up for long."""
+    spent = run.time_budgets.get(run.ends[name].source_node)
+    if spent and run.running_s and spent.blocked.get(name, 0.0) > 0.1 * run.running_s:
+        return RED
+    return BLUE if run.ends[name].discard_limit is not None else GREY
+
+
+def _draw_route(
+    axes: Any, route: Sequence[Place], widths: Mapping[Place, float], shade: str, is_dotted: bool
+) -> None:
+    """A line from the sender's side to the receiver's; its end has the arrow."""
+    from matplotlib.patches import FancyArrowPatch
+
+    for number, (a, b) in enumerate(itertools.pairwise(route)):
+        (x, y), (to_x, to_y) = _at(a), _at(b)
+        side = 1 if to_x > x else -1
+        is_last = number == len(route) - 2
+        from_half, to_half = widths.get(a, 0.0) / 2, widths.get(b, 0.0) / 2
+        line = FancyArrowPatch(
+            (x + side * from_half, y), (to_x - side * to_half, to_y),
+            arrowstyle="-|>" if is_last else "-", mutation_scale=12, shrinkA=0, shrinkB=0,
+            color=shade, linewidth=1.8, linestyle=_DOTTED if is_dotted else "solid",
+        )  # fmt: skip
+        axes.add_patch(line)
+
+
+def _draw_box(axes: Any, run: PastRun, name: str, place: Place) -> None:
+    x, y = _at(place)
+    _rectangle(axes, x, y, _BOX, "white", _shade(run, name))
+    connection, figures = run.ends[name], run.connections[name]
+    lines = [guarantee(connection), _counts(figures), _speed(figures)]
+    _write(axes, x, y + 0.25, _short(port_names(connection), 30), 8, weight="bold")
+    _write(axes, x, y - 0.11, "\n".join(lines), 6.8, linespacing=1.25)
+
+
+def _write(axes: Any, x: float, y: float, text: str, size: float, **options: Any) -> None:
+    axes.text(x, y, text, ha="center", va="center", fontsize=size, **options)
+
+
+def _counts(figures: Mapping[str, Any]) -> str:
+    lost = [
+        f"{figures[key]:,} {key}" for key in ("discarded", "lost") if (figures.get(key) or 0) > 0
+    ]
+    return f"{_count(figures.get('sent'))} sent, {', '.join(lost) or 'none lost'}"
+
+
+def _speed(figures: Mapping[str, Any]) -> str:
+    rate, latency = figures.get("rate_hz"), figures.get("latency_ms")
+    parts = [] if rate is None else [f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s"]
+    if latency:
+        parts.append(f"{_ms(latency['p50'])} (99 %: {_ms(latency['p99'])})")
+    return ", ".join(parts)
+
+
+def _ms(value: float) -> str:
+    return f"{value:.2f} ms" if value < 10 else f"{value:,.0f} ms"
+
+
+def _draw_node(axes: Any, name: str, place: Place, spent: TimeBudget | None) -> None:
+    x, y = _at(place)
+    _rectangle(axes, x, y, _NODE, "#F7F7F7", "#333333")
+    _write(axes, x, y + 0.2, _short(name, 22), 9.5, weight="bold")
+    if spent is None or spent.total_s <= 0:
+        _write(axes, x, y - 0.1, "never reported", 7)
+        return
+    hook, busy_s = spent.busiest_hook
+    if hook:
+        _write(axes, x, y - 0.03, _short(f"{hook} {spent.share(busy_s):.0%}", 28), 7)
+    left = x - _NODE[0] / 2 + 0.1
+    for state, share in spent.shares.items():
+        wide = share * (_NODE[0] - 0.2)
+        axes.barh(y - 0.23, wide, left=left, height=0.13, color=_STATES[state], linewidth=0)
+        left += wide
+
+
+def _draw_key(axes: Any, rows: float) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles = [
+        *(Patch(color=shade, label=state) for state, shade in _STATES.items()),
+        Line2D([], [], color=GREY, linestyle=_DOTTED, label="no discard limit"),
+        Line2D([], [], color=BLUE, label="discard limit"),
+        Line2D([], [], color=RED, label="blocked its sender over 10 % of the time"),
+    ]
+    axes.legend(
+        handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=7.5,
+        bbox_to_anchor=(0.5, -0.02 - 0.06 / rows), handlelength=1.6,
+    )  # fmt: skip
+
+
+def _rectangle(
+    axes: Any, x: float, y: float, size: tuple[float, float], face: str, edge: str
+) -> None:
+    from matplotlib.patches import FancyBboxPatch
+
+    width, height = size
+    axes.add_patch(
+        FancyBboxPatch(
+            (x - width / 2, y - height / 2), width, height,
+            boxstyle="round,pad=0,rounding_size=0.06", facecolor=face, edgecolor=edge,
+        )
+    )  # fmt: skip
+
+
+def _short(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+_SECOND_NS = 1_000_000_000
+_MOST_LINES = 4_000
+_CLOSE_LOOK = 12
+"""Packets on the busiest connection that the enlarged part shows."""
+_HALF = 0.3
+_DASHES = (0, (2, 1.5))
+_Colours = dict[tuple[str, str], str]
+_HOOKS = (GREEN, SKY, PURPLE, RED, GREY, YELLOW)
+"""Colours of bars: those that lines do not have."""
+_CROWD = 60
+"""Lines of a kind above which they are drawn finer."""
+
+
+def timeline_figure(run: PastRun) -> Any | None:
+    """The first second in which all nodes ran, and a part of it enlarged; ``None`` without lists.
+
+    A lane of hooks for each node, packets and acknowledgements between them.
+    """
+    running = {name: trace.starts_ns[trace.is_running] for name, trace in run.traces.items()}
+    start_ns = max((int(starts[0]) for starts in running.values() if len(starts)), default=None)
+    if start_ns is None:
+        return None
+    nodes = [name for name in run.nodes if name in run.traces]
+    colours = _hook_colours(run, nodes)
+    figure = new_figure(2 * (0.62 * len(nodes) + 1.0) + 0.6)
+    above, below = figure.subplots(2, 1)
+    close_ns = _close_look_ns(run, start_ns)
+    _draw(above, run, colours, start_ns, _SECOND_NS)
+    above.set_title("the first second in which all nodes ran", fontsize=10, loc="left")
+    _draw(below, run, colours, start_ns, close_ns)
+    close_ms = float(f"{close_ns / 1e6:.3g}")
+    below.set_title(f"the first {close_ms:g} ms of it", fontsize=10, loc="left")
+    _legend(figure, run, colours)
+    return figure
+
+
+def _hook_colours(run: PastRun, nodes: list[str]) -> _Colours:
+    """A colour for each hook; those of initialise hooks, which are seldom seen, come last."""
+    hooks = [(name, *each) for name in nodes for each in run.traces[name].hooks]
+    hooks.sort(key=lambda each: each[2] == "initialise")
+    names = dict.fromkeys((node, hook) for node, hook, _ in hooks)
+    return {each: _HOOKS[place % len(_HOOKS)] for place, each in enumerate(names)}
+
+
+def _close_look_ns(run: PastRun, start_ns: int) -> int:
+    """A length that shows a dozen packets of the busiest connection."""
+    shortest = _SECOND_NS
+    for packets in run.packets.values():
+        after = packets.sent_ns[packets.sent_ns >= start_ns][: _CLOSE_LOOK + 1]
+        if len(after) > _CLOSE_LOOK:
+            shortest = min(shortest, int(after[-1]) - start_ns)
+    return max(shortest, 1_000)
+
+
+def _draw(axes: Any, run: PastRun, colours: _Colours, start_ns: int, length_ns: int) -> None:
+    nodes = [name for name in run.nodes if name in run.traces]
+    row = {name: len(nodes) - 1 - place for place, name in enumerate(nodes)}
+    for name in nodes:
+        trace = run.traces[name]
+        is_here = (trace.ends_ns >= start_ns) & (trace.starts_ns < start_ns + length_ns)
+        for place, (hook, _) in enumerate(trace.hooks):
+            chosen = is_here & (trace.which == place)
+            starts_ns = trace.starts_ns[chosen]
+            spans = np.column_stack([starts_ns - start_ns, trace.ends_ns[chosen] - starts_ns]) / 1e6
+            # A line around each keeps visible what is shorter than a dot.
+            shade = colours[name, hook]
+            axes.broken_barh(
+                spans, (row[name] - _HALF, 2 * _HALF), facecolor=shade, edgecolor=shade,
+                linewidth=0.4, zorder=2,
+            )  # fmt: skip
+    for name, end in run.ends.items():
+        if end.source_node in row and end.destination_node in row:
+            ends = row[end.source_node], row[end.destination_node]
+            _draw_packets(axes, run, name, ends, (start_ns, length_ns))
+    plain(axes)
+    axes.set_yticks([row[name] for name in nodes], nodes)
+    axes.set_ylim(-0.6, len(nodes) - 0.4)
+    axes.set_xlim(0, length_ns / 1e6)
+    axes.set_xlabel("wall time / ms")
+    axes.grid(visible=False, axis="y")
+
+
+def _draw_packets(
+    axes: Any, run: PastRun, name: str, rows: tuple[int, int], window: tuple[int, int]
+) -> None:
+    from matplotlib.collections import LineCollection
+
+    sender, receiver = rows
+    if sender == receiver:
+        return
+    side = 1 if receiver > sender else -1
+    away, towards = sender + side * _HALF, receiver - side * _HALF
+    for times, segments, shade, dashes in (
+        (_flights(run, name, window), (away, towards), BLUE, "solid"),
+        (_answers(run, name, window), (towards, away), ORANGE, _DASHES),
+    ):
+        if times is not None:
+            is_crowd = len(times) > _CROWD
+            lines = LineCollection(
+                _segments(times, *segments), colors=shade, linestyles=[dashes], zorder=3,
+                linewidth=0.35 if is_crowd else 0.9, alpha=0.6 if is_crowd else 1,
+            )  # fmt: skip
+            axes.add_collection(lines)
+
+
+def _flights(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:
+    """Milliseconds of sending and of the start on it, for packets of the window, (n, 2)."""
+    latencies_ns = run.latencies_ns(name)
+    if latencies_ns is None or not len(latencies_ns):
+        return None
+    taken_ns = run.packets[name].taken_ns[: len(latencies_ns)]
+    return _within(np.column_stack([taken_ns - latencies_ns, taken_ns]), window)
+
+
+def _answers(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:
+    """Milliseconds of acknowledgements: from the start on a packet to when its sender knew.
+
+    They are cumulative: one is drawn from the last packet that it counts.
+    """
+    end = run.ends[name]
+    trace = run.traces.get(end.source_node)
+    if trace is None:
+        return None
+    credits = trace.credits[trace.credits[:, 0] == end.index]
+    taken, taken_ns = run.packets[name].taken, run.packets[name].taken_ns
+    places, first = np.unique(taken, return_index=True)
+    found = np.searchsorted(places, credits[:, 1])
+    is_known = found < len(places)
+    is_known[is_known] &= places[found[is_known]] == credits[is_known, 1]
+    times = np.column_stack([taken_ns[first[found[is_known]]], credits[is_known, 2]])
+    return _within(times, window)
+
+
+def _within(times_ns: Numbers, window: tuple[int, int]) -> Numbers:
+    start_ns, length_ns = window
+    is_here = (times_ns[:, 1] >= start_ns) & (times_ns[:, 0] < start_ns + length_ns)
+    found: Numbers = (times_ns[is_here][:_MOST_LINES] - start_ns) / 1e6
+    return found
+
+
+def _segments(times: Numbers, from_row: float, to_row: float) -> Any:
+    """Line segments, (n, 2, 2)."""
+    rows = np.broadcast_to(np.array([from_row, to_row]), times.shape)
+    return np.stack([times, rows], axis=2)
+
+
+def _legend(figure: Any, run: PastRun, colours: _Colours) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    kinds = {(n, hook): kind for n, trace in run.traces.items() for hook, kind in trace.hooks}
+    handles: list[Any] = [
+        Patch(color=shade, label=".".join(each))
+        for each, shade in colours.items()
+        if kinds[each] != "initialise"
+    ]
+    handles += [
+        Line2D([], [], color=BLUE, label="packet: sent, until a hook starts on it"),
+        Line2D([], [], color=ORANGE, linestyle=_DASHES, label="acknowledgement"),
+    ]
+    add_legend(figure, 3, handles=handles)

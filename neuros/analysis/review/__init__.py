@@ -1,1 +1,0 @@
-"""Review of runs: findings, figures, pages, comparisons."""

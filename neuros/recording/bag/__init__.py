@@ -1,1 +1,0 @@
-"""Reading of bags; :func:`neuros.bag.open` is the public function."""

@@ -1,0 +1,313 @@
+"""Plan of a recording: which packets it holds, and which node keeps each.
+
+The launcher makes the plan; as a file in the run folder it tells nodes and recorder what to record.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from neuros.errors import UsageError
+from neuros.ports import Way
+from neuros.project.model import Connection, Node, Project
+from neuros.project.names import INTERNAL, Names
+from neuros.project.qos import ASKED, DEPTH, OFFERED
+
+CLOCK = "/clock"
+PLAN_NAME = "recording.json"
+BAG_NAME = "bag"
+LISTENER = ".listener"
+"""Folder of the packets that no node sees; it is named like none can be."""
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of the bag.
+
+    Attributes:
+        name: as on the ROS graph.
+        type: in ROS notation.
+        is_reliable, depth, is_latched: of the quality of service that its sender offers.
+        connection: ``a.out -> b.in``, or ``None`` for an external topic.
+    """
+
+    name: str
+    type: str
+    is_reliable: bool = True
+    depth: int = 10
+    connection: str | None = None
+    is_latched: bool = False
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Packets that one node keeps: how they pass it (``neuros.ports.Way``), and the topics that
+    they belong to, by their places in the plan."""
+
+    way: str
+    name: str
+    topics: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """All that is recorded of a run.
+
+    Attributes:
+        streams: by node, in the order of the numbers that they have in its spool.
+        listen: topics that the recorder subscribes to itself.
+        wanted: those of them that were asked for by name.
+        time_owner: the one node that owns simulated time; ``None`` if none or several do.
+        custom: for the metadata of the bag.
+    """
+
+    storage: str
+    topics: tuple[Topic, ...]
+    streams: Mapping[str, tuple[Stream, ...]]
+    listen: tuple[str, ...] = ()
+    wanted: tuple[str, ...] = ()
+    time_owner: str | None = None
+    custom: Mapping[str, str] = field(default_factory=dict)
+
+    def save(self, run: Path) -> None:
+        """Write it into the run folder. Raises ``OSError``."""
+        content = {"version": _VERSION, **asdict(self)}
+        (run / PLAN_NAME).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+
+
+def load_plan(run: Path) -> RecordingPlan:
+    """The plan of a run.
+
+    Raises:
+        UsageError: if there is none, or this version of NeuROS cannot read it.
+    """
+    path = run / PLAN_NAME
+    try:
+        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        version = content.pop("version")
+        if version != _VERSION:
+            raise UsageError(
+                f"{path} is of version {version}, and this NeuROS reads version {_VERSION}"
+            )
+        content["topics"] = tuple(Topic(**topic) for topic in content["topics"])
+        content["streams"] = {
+            node: tuple(Stream(s["way"], s["name"], tuple(s["topics"])) for s in streams)
+            for node, streams in content["streams"].items()
+        }
+        for key in ("listen", "wanted"):
+            content[key] = tuple(content[key])
+        return RecordingPlan(**content)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise UsageError(_why_no_plan(run)) from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UsageError(f"{path} is damaged: {error}") from error
+
+
+def _why_no_plan(run: Path) -> str:
+    """Say why a path is no folder of a recorded run."""
+    if not run.exists():
+        return f"{run}: there is no such file or folder"
+    if not run.is_dir():
+        return f"{run} is a file: give the folder of a run, or of a bag (with metadata.yaml)"
+    if (run / "run.json").exists() or any(run.glob("*/node.json")):
+        return f"{run} was not recorded: launch the project with -r, or name topics with -t"
+    files = sorted(each.name for pattern in ("*.mcap", "*.db3") for each in run.glob(pattern))
+    if files:
+        return f"{run} has {files[0]}, but no metadata.yaml: `ros2 bag reindex` writes it anew"
+    return f"{run} is the folder of neither a run nor a bag: it has no run.json, no metadata.yaml"
+
+
+@dataclass(frozen=True)
+class Request:
+    """Topics to record, and the storage.
+
+    Attributes:
+        everything: all that the project's nodes send and hear, and ``/clock``.
+        topics: names and patterns of topics, connections or outputs; besides everything, or alone.
+        exclude: names and patterns that are left out in any case.
+        storage: ``mcap`` or ``sqlite3``.
+    """
+
+    everything: bool
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    storage: str = "mcap"
+
+
+class _Candidate(NamedTuple):
+    """Candidate to keep the packets of a topic: a node, and the way in which they pass it."""
+
+    node: str
+    way: Way
+    name: str
+    topic: Topic
+
+
+def plan_recording(
+    project: Project,
+    names: Collection[str],
+    request: Request,
+    *,
+    is_alone: bool,
+    custom: Mapping[str, str],
+) -> RecordingPlan:
+    """Plan the recording of a run of the nodes ``names``.
+
+    Args:
+        is_alone: only the run can publish in its domain, so there is no clock to hear.
+
+    Raises:
+        UsageError: if something is asked for that does not exist.
+    """
+    _check_excluded(request, project)
+    candidates = list(_candidates(project, names))
+    chosen = [each for each in candidates if _is_chosen(each.topic, request)]
+    known = {each.topic.name for each in candidates}
+    wanted = _asked_of_ros(request, known, project)
+    listen = list(wanted)
+    clock = project.names.resolve(CLOCK, "")
+    if request.everything and not is_alone and clock not in known:
+        listen.append(clock)
+    topics = list(dict.fromkeys(each.topic for each in chosen))
+    owners = [n.name for n in project.nodes if n.name in names and n.owns_time]
+    return RecordingPlan(
+        storage=request.storage,
+        topics=tuple(topics),
+        streams=_streams(chosen, topics),
+        listen=tuple(
+            name for name in dict.fromkeys(listen) if not is_named(name, None, request.exclude)
+        ),
+        wanted=wanted,
+        time_owner=owners[0] if len(owners) == 1 else None,
+        custom=custom,
+    )
+
+
+def _candidates(project: Project, names: Collection[str]) -> Iterator[_Candidate]:
+    """One for each topic and sender, in the order of the project."""
+    for connection in project.connections:
+        yield from _of_connection(project, connection, names)
+    nodes = [node for node in project.nodes if node.name in names]
+    seen: set[str] = set()
+    for node in nodes:
+        for candidate in _of_external_topics(project.names, node, is_output=True):
+            seen.add(candidate.topic.name)
+            yield candidate
+    for node in nodes:
+        for candidate in _of_external_topics(project.names, node, is_output=False):
+            if candidate.topic.name not in seen:
+                seen.add(candidate.topic.name)
+                yield candidate
+
+
+def _of_connection(
+    project: Project, connection: Connection, names: Collection[str]
+) -> Iterator[_Candidate]:
+    source, destination = connection.source_node, connection.destination_node
+    topic = Topic(
+        f"{connection.topic}/data",
+        project.node(source).output(connection.source_output).type,
+        connection.is_reliable,
+        connection.window,
+        str(connection),
+    )
+    if source in names and source == destination:
+        yield _Candidate(source, Way.TO_ITSELF, str(connection), topic)
+    elif source in names:
+        yield _Candidate(source, Way.SENT, connection.source_output, topic)
+    elif destination in names:
+        yield _Candidate(destination, Way.RECEIVED, str(connection), topic)
+
+
+def _of_external_topics(names: Names, node: Node, *, is_output: bool) -> Iterator[_Candidate]:
+    for port in node.outputs if is_output else node.inputs:
+        if port.external_topic is not None:
+            qos = port.qos or (OFFERED if is_output else ASKED)
+            topic = Topic(
+                names.resolve(port.external_topic, node.name),
+                port.type,
+                qos.reliability != "best_effort" if is_output else qos.reliability == "reliable",
+                qos.depth or DEPTH,
+                is_latched=qos.is_latched,
+            )
+            yield _Candidate(node.name, Way.SENT if is_output else Way.HEARD, port.name, topic)
+
+
+def _streams(
+    chosen: Sequence[_Candidate], topics: Sequence[Topic]
+) -> dict[str, tuple[Stream, ...]]:
+    """Packets that pass a node in one way are kept once, for all their topics."""
+    groups: dict[tuple[str, Way, str], list[int]] = {}
+    for node, way, name, topic in chosen:
+        groups.setdefault((node, way, name), []).append(topics.index(topic))
+    streams: dict[str, tuple[Stream, ...]] = {}
+    for (node, way, name), members in groups.items():
+        stream = Stream(way.value, name, tuple(members))
+        streams[node] = (*streams.get(node, ()), stream)
+    return streams
+
+
+def _is_chosen(topic: Topic, request: Request) -> bool:
+    if is_named(topic.name, topic.connection, request.exclude):
+        return False
+    return request.everything or is_named(topic.name, topic.connection, request.topics)
+
+
+def is_named(name: str, connection: str | None, patterns: Sequence[str]) -> bool:
+    """Whether one of the patterns fits a topic, its connection, or the output that feeds it."""
+    words = [name, name.removesuffix("/data")] if connection else [name]
+    if connection:
+        words += [connection, connection.partition(" -> ")[0]]
+    return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
+
+
+def _asked_of_ros(request: Request, known: Collection[str], project: Project) -> tuple[str, ...]:
+    """Topics that only the ROS graph can know.
+
+    Raises:
+        UsageError: for what can be neither on the graph nor in the project.
+    """
+    labels = {str(connection): f"{connection.topic}/data" for connection in project.connections}
+    found: dict[str, None] = {}
+    for text in request.topics:
+        is_in_project = any(fnmatchcase(name, text) for name in known) or any(
+            is_named(name, label, [text]) for label, name in labels.items() if name in known
+        )
+        if is_in_project:
+            continue
+        if not _may_be_on_graph(text, project) or set(text) & set("*?["):
+            raise _unknown("--topic", text, project)
+        found[text] = None
+    return tuple(found)
+
+
+def _check_excluded(request: Request, project: Project) -> None:
+    """Raise ``UsageError`` for what leaves nothing out, nor could on the ROS graph."""
+    topics = [each.topic for each in _candidates(project, [node.name for node in project.nodes])]
+    for text in request.exclude:
+        if not _may_be_on_graph(text, project) and not any(
+            is_named(topic.name, topic.connection, [text]) for topic in topics
+        ):
+            raise _unknown("--exclude", text, project)
+
+
+def _may_be_on_graph(text: str, project: Project) -> bool:
+    """Whether other programs may have a topic of that name."""
+    return text.startswith("/") and not text.startswith(project.names.namespace + INTERNAL)
+
+
+def _unknown(option: str, text: str, project: Project) -> UsageError:
+    outputs = dict.fromkeys(str(each).partition(" -> ")[0] for each in project.connections)
+    return UsageError(
+        f"{option} {text}: the project has no such topic, connection or output; outputs:"
+        f" {', '.join(outputs) or 'none'}"
+    )
