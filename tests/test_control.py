@@ -24,10 +24,8 @@ from neuros.control import (
     NodeStatus,
     Probed,
     Report,
-    decode,
-    encode,
-    kind_of,
 )
+from neuros.control.link import decode, encode, kind_of
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
