@@ -118,14 +118,26 @@ def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Mes
         raise ControlError(f"{peer} sent a control message of the unknown kind {_shown(kind)}")
     read: _Reader = _reader(message)  # type: ignore[arg-type]
     try:
-        found: Message = read(content, "")
+        found: Message = read(content)
     except _WrongField as error:
         raise ControlError(f"{peer} sent a wrong control message '{kind}': {error}") from None
     return found
 
 
 class _WrongField(Exception):
-    """A field that does not fit its class; its text says which."""
+    """A field that does not fit its class; the path to it grows from the inside."""
+
+    def __init__(self, problem: str, path: str = "") -> None:
+        self.problem = problem
+        self.path = path
+
+    def inside(self, step: str) -> _WrongField:
+        """The error, seen from what holds it."""
+        self.path = step + self.path
+        return self
+
+    def __str__(self) -> str:
+        return f"field {self.path.lstrip('.')} {self.problem}"
 
 
 def _plain(value: Any) -> Any:
@@ -137,8 +149,8 @@ def _shown(value: Any) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
-_Reader = Callable[[Any, str], Any]
-"""Makes a value of its declared type from JSON; gets the path of the field, too."""
+_Reader = Callable[[Any], Any]
+"""Makes a value of its declared type from JSON. Raises :class:`_WrongField`."""
 
 
 @functools.cache
@@ -146,60 +158,75 @@ def _reader(declared: Any) -> _Reader:
     """The reader of a declared type."""
     origin, arguments = get_origin(declared), get_args(declared)
     if declared is Any:
-        return lambda value, _: value
+        return lambda value: value
     if origin in (Union, types.UnionType):
         (some,) = (each for each in arguments if each is not types.NoneType)
         read_some = _reader(some)
-        return lambda value, path: None if value is None else read_some(value, path)
-    if origin is tuple and arguments[-1] is Ellipsis:
-        read = _reader(arguments[0])
-        return lambda value, path: tuple(
-            read(each, f"{path}[{place}]")
-            for place, each in enumerate(_checked(value, (list,), path, "a list"))
-        )
+        return lambda value: None if value is None else read_some(value)
     if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return functools.partial(_read_list, _reader(arguments[0]))
         return functools.partial(_read_tuple, tuple(map(_reader, arguments)))
     if is_typeddict(declared):
-        return lambda value, path: _checked(value, (dict,), path, "an object")
-    if origin in (dict, Mapping):
-        read_value = _reader(arguments[1])
-        return lambda value, path: {
-            key: read_value(each, f"{path}[{key!r}]")
-            for key, each in _checked(value, (dict,), path, "an object").items()
-        }
+        return _read_object
+    if origin is Mapping or origin is dict:
+        return functools.partial(_read_mapping, _reader(arguments[1]))
     if is_dataclass(declared):
-        return _object_reader(declared)
+        return _dataclass_reader(declared)
     if issubclass(declared, Enum):
         return functools.partial(_read_enum, declared)
-    kinds = (int, float) if declared is float else (declared,)
-    return lambda value, path: _checked(value, kinds, path, declared.__name__)
+    return functools.partial(_read_scalar, declared)
 
 
-def _checked(value: Any, kinds: tuple[type, ...], path: str, expected: str) -> Any:
-    """A value of one of these types; ``bool`` is no number."""
-    if type(value) not in kinds:
-        raise _WrongField(f"{path} is {_shown(value)}, and must be {expected}")
-    return value
+def _read_scalar(kind: type, value: Any) -> Any:
+    """A value of this type; ``bool`` is no number, and an ``int`` may stand for a ``float``."""
+    if type(value) is kind or (kind is float and type(value) is int):
+        return value
+    raise _must_be(kind.__name__, value)
 
 
-def _read_tuple(readers: Sequence[_Reader], value: Any, path: str) -> tuple[Any, ...]:
+def _read_object(value: Any) -> dict[str, Any]:
+    if type(value) is dict:
+        return value
+    raise _must_be("an object", value)
+
+
+def _read_list(read: _Reader, value: Any) -> tuple[Any, ...]:
+    if type(value) is not list:
+        raise _must_be("a list", value)
+    return _read_tuple([read] * len(value), value)
+
+
+def _read_tuple(readers: Sequence[_Reader], value: Any) -> tuple[Any, ...]:
     if type(value) is not list or len(value) != len(readers):
-        raise _WrongField(f"{path} is {_shown(value)}, and must be a list of {len(readers)}")
-    return tuple(
-        read(each, f"{path}[{place}]")
-        for place, (read, each) in enumerate(zip(readers, value, strict=True))
-    )
+        raise _must_be(f"a list of {len(readers)}", value)
+    found: list[Any] = []
+    try:
+        for read, each in zip(readers, value, strict=True):
+            found.append(read(each))
+    except _WrongField as error:
+        raise error.inside(f"[{len(found)}]") from None
+    return tuple(found)
 
 
-def _read_enum(kind: type[Enum], value: Any, path: str) -> Enum:
+def _read_mapping(read: _Reader, value: Any) -> dict[str, Any]:
+    found = {}
+    for key, each in _read_object(value).items():
+        try:
+            found[key] = read(each)
+        except _WrongField as error:
+            raise error.inside(f"[{key!r}]") from None
+    return found
+
+
+def _read_enum(kind: type[Enum], value: Any) -> Enum:
     try:
         return kind(value)
     except ValueError:
-        known = ", ".join(str(each.value) for each in kind)
-        raise _WrongField(f"{path} is {_shown(value)}, and must be one of {known}") from None
+        raise _must_be(f"one of {', '.join(str(each.value) for each in kind)}", value) from None
 
 
-def _object_reader(declared: Any) -> _Reader:
+def _dataclass_reader(declared: Any) -> _Reader:
     """Reads a dataclass; fields with a default may be missing."""
     hints = get_type_hints(declared)
     readers = {each.name: _reader(hints[each.name]) for each in fields(declared)}
@@ -209,13 +236,22 @@ def _object_reader(declared: Any) -> _Reader:
         if each.default is MISSING and each.default_factory is MISSING
     }
 
-    def read(value: Any, path: str) -> Any:
-        given = _checked(value, (dict,), path, "an object")
-        before = f"{path}." if path else ""
+    def read(value: Any) -> Any:
+        given = _read_object(value)
         if missing := required - given.keys():
-            raise _WrongField(f"its field {before}{min(missing)} is missing")
+            raise _WrongField("is missing", f".{min(missing)}")
         if unknown := given.keys() - readers.keys():
-            raise _WrongField(f"it has no field {before}{min(unknown)}")
-        return declared(**{k: readers[k](each, f"{before}{k}") for k, each in given.items()})
+            raise _WrongField("is unknown", f".{min(unknown)}")
+        found = {}
+        for name, each in given.items():
+            try:
+                found[name] = readers[name](each)
+            except _WrongField as error:
+                raise error.inside(f".{name}") from None
+        return declared(**found)
 
     return read
+
+
+def _must_be(expected: str, value: Any) -> _WrongField:
+    return _WrongField(f"is {_shown(value)}, and must be {expected}")

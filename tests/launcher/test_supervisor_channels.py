@@ -82,8 +82,7 @@ def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
         "a program that has not said what it is sent what is no control"
     )
     assert str(known) == (
-        "the process of a and b sent a wrong control message 'first_hook':"
-        " its field node is missing"
+        "the process of a and b sent a wrong control message 'first_hook': field node is missing"
     )
     channels.hang_up(link)
     node.socket.settimeout(5.0)
