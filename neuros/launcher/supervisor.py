@@ -317,7 +317,7 @@ class Supervisor:
             self.observers.part(self.outcome)
             self._channels.close()
             remove_stack_files([self._run_folder / file.node.name for file in self._files])
-            self.outcome.elsewhere = self._peers.books()
+            self.outcome.elsewhere = self._peers.counters()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
 
