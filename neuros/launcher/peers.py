@@ -90,7 +90,9 @@ def counters_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -
     }
 
 
-def count(counters: Counters, node: str, part: str, connection: Connection, what: str) -> int | None:
+def count(
+    counters: Counters, node: str, part: str, connection: Connection, what: str
+) -> int | None:
     """One counter, ``None`` where it is not known."""
     found = counters.get(node, {}).get(part, {}).get(str(connection), {}).get(what)
     return None if found is None else int(found)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -294,6 +294,7 @@ class Supervisor:
             lambda reason: self._shutdown.drain(reason, STOP_S),
         )
         self._signals = signals
+        self._refused: set[ControlLink] = set()
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
@@ -336,7 +337,9 @@ class Supervisor:
     def _refuse(self, link: ControlLink, error: ControlError) -> None:
         """A message was not understood: without it, nothing is known of a node for sure."""
         if self._channels.is_node(link):
-            self._shutdown.fail(f"control channel: {error}")
+            if link not in self._refused:
+                self._refused.add(link)
+                self._shutdown.fail(f"control channel: {error}")
         elif self._channels.has(link):
             self._channels.hang_up(link)
             self._output.log("WARN", f"control channel: hung up: {error}")
@@ -427,14 +430,16 @@ class Supervisor:
         self._shutdown.heed_peers()
         self._shutdown.look(now_s)
         self._keep_pause()
-        for severity, text in self._detector.remarks_on_hooks():
-            self._output.log(severity, text)
+        self._show(self._detector.remarks_on_hooks())
         if self._shutdown.phase in (Phase.RUNNING, Phase.DRAINING):
-            for severity, text in self._detector.remarks_on_silence(now_s, self._processes.killed):
-                self._output.log(severity, text)
+            self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
         self.observers.look_at(self._shutdown.phase)
         if self._shutdown.phase is Phase.RUNNING:
             self._look_at_run(now_s)
+
+    def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
+        for severity, text in remarks:
+            self._output.log(severity, text)
 
     def _keep_pause(self) -> None:
         """Note how long the run has stood still; nodes that are stopped meanwhile do not go on."""
@@ -458,8 +463,7 @@ class Supervisor:
             self._shutdown.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
         for source in (self._detector, self._backlog, self._peers):
-            for severity, text in source.remarks(now_s):
-                self._output.log(severity, text)
+            self._show(source.remarks(now_s))
         if self._detector.has_just_stalled(now_s):
             self._channels.send(control.Explain())
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
