@@ -133,6 +133,7 @@ class Outcome:
             self.exit_code, self.reason = exit_code, reason
 
 
+@dataclass
 class Processes:
     """Processes that the back end has started, judged by the reports of their nodes.
 
@@ -140,12 +141,11 @@ class Processes:
         killed: the names of all nodes whose processes were killed.
     """
 
-    def __init__(self, detector: StallDetector, outcome: Outcome) -> None:
-        self._detector = detector
-        self._outcome = outcome
-        self._running: list[RunningNode] = []
-        self._has_told_failure: set[str] = set()
-        self.killed: set[str] = set()
+    _detector: StallDetector
+    _outcome: Outcome
+    _running: list[RunningNode] = field(default_factory=list)
+    _has_told_failure: set[str] = field(default_factory=set)
+    killed: set[str] = field(default_factory=set)
 
     def add(self, started: Sequence[RunningNode]) -> None:
         """These run from now on."""
