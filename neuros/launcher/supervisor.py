@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from neuros import control
+import neuros.control as control
 from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
