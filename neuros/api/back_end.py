@@ -10,12 +10,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.docker.layout import as_here, inside
 from neuros.backends.placement import Cores
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.ports import Launcher
+from neuros.ports import ControlListener, Launcher
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.transport.dds_profile import as_asked
 
@@ -42,6 +43,10 @@ class BackEnd:
     def as_here(self, text: str, folders: Folders) -> str:
         """What a node has said, with the names that its paths have on this machine."""
         return as_here(text, folders) if self.containers else text
+
+    def control_listener(self, run_folder: Path) -> ControlListener:
+        """Where nodes and observers of a run connect to its supervisor."""
+        return UnixListener(run_folder)
 
     def record(self) -> dict[str, Any]:
         """What belongs into the record of a run: engine and images, where there are any."""

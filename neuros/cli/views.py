@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -164,8 +165,11 @@ def _open(url: str) -> None:
         webbrowser.open(url)
 
 
-def _run_view(options: argparse.Namespace) -> int:
+def _run_view(_: argparse.Namespace) -> int:
+    from neuros.backends.control_sockets import connect_by
     from neuros.backends.rerun import await_server
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
     from neuros.viewers.rerun_feed import RerunFeed
     from neuros.viewers.visual_types import VisualTypes, look_on
 
@@ -179,6 +183,7 @@ def _run_view(options: argparse.Namespace) -> int:
     feed = RerunFeed(
         told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
     )
-    look_on(Path(options.run), sources, feed.show)
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    look_on(link, sources, feed.show)
     feed.close()
     return 0

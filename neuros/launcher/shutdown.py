@@ -7,14 +7,23 @@ from __future__ import annotations
 
 import signal
 import time
+from dataclasses import dataclass
 
+from neuros.control import Drain, Leave, Stop
 from neuros.launcher.channels import Channels
 from neuros.launcher.declarations import Declarations
-from neuros.launcher.outcome import EXIT_CODES, SIGNAL_NAMES, Outcome, Output, Phase
+from neuros.launcher.outcome import (
+    EXIT_CODES,
+    SIGNAL_NAMES,
+    Outcome,
+    Output,
+    Phase,
+    Processes,
+    names_of,
+)
 from neuros.launcher.peers import Peers
-from neuros.launcher.processes import Processes, names_of
 from neuros.launcher.quiescence import Probing, Verdict
-from neuros.launcher.stall_detector import StallDetector, with_stack
+from neuros.launcher.stall_detector import SILENT_S, StallDetector, with_stack
 from neuros.ports import RunningNode
 
 STOP_S = 5.0
@@ -24,36 +33,25 @@ STOP_S = 5.0
 _CLOSING_S = 1.0
 
 
+@dataclass
 class Shutdown:
-    """The phase of a run.
+    """The phase of a run, and what leads to the next.
 
     Args:
-        signals: numbers of the signals that have arrived, appended to by a signal handler.
+        _signals: numbers of the signals that have arrived, appended to by a signal handler.
     """
 
-    def __init__(
-        self,
-        channels: Channels,
-        processes: Processes,
-        detector: StallDetector,
-        declarations: Declarations,
-        probing: Probing,
-        peers: Peers,
-        outcome: Outcome,
-        output: Output,
-        signals: list[int],
-    ) -> None:
-        self.phase = Phase.RUNNING
-        self._deadline_s = 0.0
-        self._channels = channels
-        self._processes = processes
-        self._detector = detector
-        self._declarations = declarations
-        self._probing = probing
-        self._peers = peers
-        self._outcome = outcome
-        self._output = output
-        self._signals = signals
+    _channels: Channels
+    _processes: Processes
+    _detector: StallDetector
+    _declarations: Declarations
+    _probing: Probing
+    _peers: Peers
+    _outcome: Outcome
+    _output: Output
+    _signals: list[int]
+    phase: Phase = Phase.RUNNING
+    _deadline_s: float = 0.0
 
     @property
     def is_hopeless(self) -> bool:
@@ -78,7 +76,7 @@ class Shutdown:
         for process in self._processes.not_loaded():
             self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
             self._processes.kill(process)
-        self._channels.send("drain", last_round=self._declarations.last_round(stopped))
+        self._channels.send(Drain(self._declarations.last_round(stopped)))
         self._probing.drain(self._processes.killed, now_s)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
@@ -135,29 +133,36 @@ class Shutdown:
     def _look_at_stopping(self, now_s: float) -> None:
         if now_s >= self._deadline_s:
             for process in self._processes:
-                self._fail_to_end(process)
+                self._fail_to_end(process, now_s)
             self._kill_all()
         elif self._peers.exist and self._processes.have_reported():
             may_go = self._peers.finish(self._outcome.reports, now_s)
             if may_go or self._deadline_s - now_s < _CLOSING_S:
-                self._channels.send("leave")
+                self._channels.send(Leave())
 
-    def _fail_to_end(self, process: RunningNode) -> None:
+    def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
         """Its nodes have had their time."""
         nodes = "node" if len(process.names) == 1 else "nodes"
-        unfinished, otherwise = [], "its process did not end"
-        for name in process.names:
-            if self._outcome.has_final_report(name):
-                continue
-            otherwise = "it did not come to its end"
-            hook = self._detector.executing(name)
-            if hook and not self._declarations.is_finalising(name):
-                unfinished.append(f"'{name}' was still executing '{hook}'")
-            unfinished += self._declarations.unfinished(name)
-        why = "; ".join(unfinished) or otherwise
+        late = [name for name in process.names if not self._outcome.has_final_report(name)]
+        unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
+        why = "; ".join(unfinished) or "its process did not end"
         self._outcome.fail(
             f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
         )
+
+    def _unfinished(self, name: str, now_s: float) -> list[str]:
+        """Clauses about a node that has not made its final report."""
+        hook, is_finalising = self._detector.executing(name), self._declarations.is_finalising(name)
+        clauses = self._declarations.unfinished(name)
+        if hook and not is_finalising:
+            clauses.insert(0, f"'{name}' was still executing '{hook}'")
+        if clauses:
+            return clauses
+        if is_finalising:
+            return [f"'{name}' had finalised, but did not make its final report"]
+        silent_s = self._detector.silent_s(name, now_s)
+        silence = f" and had not reported for {silent_s:.0f} s" if silent_s >= SILENT_S else ""
+        return [f"'{name}' did not begin to finalise{silence}"]
 
     def _stop_with(self, exit_code: int, reason: str) -> None:
         self._outcome.exit_code, self._outcome.reason = exit_code, reason
@@ -169,7 +174,7 @@ class Shutdown:
         self._outcome.begin_to_end(now_s)
         self._deadline_s = now_s + STOP_S
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
-        self._channels.send("stop")
+        self._channels.send(Stop())
         for process in self._processes.not_loaded():
             self._processes.kill(process)  # it has not come as far as anything worth finalising
 

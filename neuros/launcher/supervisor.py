@@ -10,21 +10,21 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from neuros.control import Lines
-from neuros.launcher.channels import Channels
+import neuros.control as control
+from neuros.control import Message, Report
+from neuros.control.link import ControlLink
+from neuros.errors import ControlError
+from neuros.launcher.channels import Channels, Observers, Overheard, PauseState
 from neuros.launcher.declarations import Declarations
-from neuros.launcher.observers import Observers, Overheard, Pause
-from neuros.launcher.outcome import Outcome, Output, Phase
+from neuros.launcher.outcome import Outcome, Output, Phase, Processes
 from neuros.launcher.peers import Peers
-from neuros.launcher.processes import Processes
 from neuros.launcher.quiescence import Probing, Verdict, connections_among
 from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
-from neuros.ports import Launcher
+from neuros.ports import ControlListener, Launcher
 from neuros.project.model import NodeFile
 from neuros.stacks import remove_stack_files
 
@@ -40,9 +40,10 @@ class Supervisor:
         files: the nodes to start; ``connections`` among them.
         launcher: the back end.
         environment: added to the environment of every node.
-        run_folder: the control socket is put there.
+        run_folder: with a folder for each node.
         output: for log records; its ``poll`` shows what nodes have logged.
         signals: numbers of the signals that have arrived, appended to by a signal handler.
+        listener: where nodes and observers connect to the control channel.
         wishes: reasons for which this program wants the run to end, drained; appended to by any
             thread.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
@@ -55,7 +56,7 @@ class Supervisor:
         observers: who watches it.
 
     Raises:
-        EnvironmentFault: if there can be no control socket in the run folder.
+        EnvironmentFault: if there can be no control channel.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Supervisor:
         output: Output,
         signals: list[int],
         *,
+        listener: ControlListener,
         wishes: Sequence[str] = (),
         duration_s: float | None = None,
         peers: Peers | None = None,
@@ -75,28 +77,24 @@ class Supervisor:
         self._files = files
         self._run_folder = run_folder
         self._launcher = launcher
-        self._environment = environment
-        self._output = output = Overheard(output, lambda *a, **k: self.observers.tell(*a, **k))
+        self._environment = {**environment, control.CONTROL_VARIABLE: listener.address}
+        self._output = output = Overheard(output, lambda message: self.observers.tell(message))
         self._wishes = wishes
         self._duration_s = duration_s
         self._paused_before_s = 0.0  # the first hook
         self._peers = peers or Peers("", (), files)
         names = [file.node.name for file in files]
-        self._channels = Channels(run_folder)
+        self._channels = Channels(listener)
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
         self._detector = StallDetector(names, time.monotonic(), run_folder)
         self._processes = Processes(self._detector, self.outcome)
-        self._peers.speak_through(lambda text: self._channels.send("say", text=text))
+        self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
         self._backlog = Backlog(connections)
-        self._probing = Probing(
-            names,
-            connections,
-            self._channels.send,
-            self._peers if self._peers.exist else None,
-        )
+        peers_to_ask = self._peers if self._peers.exist else None
+        self._probing = Probing(names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
         self._shutdown = Shutdown(
             self._channels,
@@ -109,28 +107,15 @@ class Supervisor:
             output,
             signals,
         )
-        self.pause = Pause(self._channels.send, time.monotonic)
+        self.pause = PauseState(self._channels.send, time.monotonic)
         self.observers = Observers(
             self._channels,
             self.pause,
             lambda: self._detector.is_driven,
             lambda reason: self._shutdown.drain(reason, STOP_S),
         )
-        self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
-            "hello": self._on_hello,
-            "report": self._on_report,
-            "hooks": lambda _, message: self._declarations.take(message),
-            "finalising": lambda _, message: self._declarations.note_finalising(
-                message["node"], message["hook"]
-            ),
-            "first_hook": self._on_first_hook,
-            "shutdown": self._on_shutdown,
-            "failed": self._on_failed,
-            "explanation": self._on_explanation,
-            "heard": self._on_heard,
-            **self.observers.handlers,
-            "signal": lambda *_: signals.append(signal.SIGINT),
-        }
+        self._signals = signals
+        self._refused: set[ControlLink] = set()
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
@@ -154,7 +139,7 @@ class Supervisor:
             self.observers.part(self.outcome)
             self._channels.close()
             remove_stack_files([self._run_folder / file.node.name for file in self._files])
-            self.outcome.elsewhere = self._peers.books()
+            self.outcome.elsewhere = self._peers.counters()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
 
@@ -163,50 +148,70 @@ class Supervisor:
     def _hear(self) -> None:
         messages = list(self._channels.receive())
         # Who ends the project may have been set going by a node whose report was read later.
-        messages.sort(key=lambda pair: pair[1]["kind"] in ("shutdown", "failed"))
-        for lines, message in messages:
-            self._handlers[message["kind"]](lines, message)
+        messages.sort(key=lambda pair: isinstance(pair[1], control.Shutdown | control.Failed))
+        for link, message in messages:
+            if isinstance(message, ControlError):
+                self._refuse(link, message)
+            else:
+                self._take(link, message)
 
-    def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
-        self._detector.greet(message["nodes"])
+    def _refuse(self, link: ControlLink, error: ControlError) -> None:
+        """A message was not understood: without it, nothing is known of a node for sure."""
+        if self._channels.is_node(link):
+            if link not in self._refused:
+                self._refused.add(link)
+                self._shutdown.fail(f"control channel: {error}")
+        elif self._channels.has(link):
+            self._channels.hang_up(link)
+            self._output.log("WARN", f"control channel: hung up: {error}")
+
+    def _take(self, link: ControlLink, message: Message) -> None:
+        match message:
+            case Report():
+                self._on_report(message)
+            case control.Hello(nodes):
+                self._on_hello(link, nodes)
+            case control.Hooks():
+                self._declarations.take(message)
+            case control.Finalising(node, hook):
+                self._declarations.note_finalising(node, hook)
+            case control.FirstHook():
+                if self.outcome.started_s is None:
+                    self.outcome.started_s = time.monotonic()
+                    self._paused_before_s = self.pause.total_s
+            case control.Shutdown(node, reason, drain_s):
+                because = f": {reason}" if reason else ""
+                self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
+            case control.Failed(node, text):
+                self._processes.note_failure(node)
+                first_line = (text.strip() or "no reason was given").splitlines()[0]
+                self._shutdown.fail(f"node '{node}' failed: {first_line}")
+            case control.Explanation(node, lines):
+                if self._shutdown.phase is Phase.RUNNING:
+                    self._output.log("WARN", f"{node} {'; '.join(lines)}")
+            case control.Heard(node, text):
+                self._peers.hear(node, text, time.monotonic())
+            case control.Interrupt():
+                self._signals.append(signal.SIGINT)
+            case _:
+                self.observers.take(link, message)
+
+    def _on_hello(self, link: ControlLink, nodes: Sequence[str]) -> None:
+        self._detector.greet(nodes)
         if self._peers.exist:
-            self._channels.send_to(lines, "say", text=self._peers.own_state)
+            self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
-            self._channels.send_to(lines, "pause")
+            self._channels.send_to(link, control.Pause())
         if self._shutdown.phase is not Phase.RUNNING:
-            self._channels.send_to(lines, "stop")
+            self._channels.send_to(link, control.Stop())
 
-    def _on_report(self, _: Lines, message: Mapping[str, Any]) -> None:
-        name, now_s = message["node"], time.monotonic()
-        self.outcome.take(name, message, now_s)
-        self._detector.report(name, message, now_s)
-        self._backlog.report(message, now_s)
-        self._probing.take(name, message)
-
-    def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self.outcome.started_s is None:
-            self.outcome.started_s = time.monotonic()
-            self._paused_before_s = self.pause.total_s
-
-    def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
-        reason = f": {message['reason']}" if message["reason"] else ""
-        self._shutdown.drain(
-            f"{message['node']} ended the project{reason}",
-            float(message["drain_s"]),
-            stopped=message["node"],
-        )
-
-    def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._processes.note_failure(message["node"])
-        first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
-        self._shutdown.fail(f"node '{message['node']}' failed: {first_line}")
-
-    def _on_heard(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._peers.hear(message["node"], message["text"], time.monotonic())
-
-    def _on_explanation(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self._shutdown.phase is Phase.RUNNING:
-            self._output.log("WARN", f"{message['node']} {'; '.join(message['lines'])}")
+    def _on_report(self, report: Report) -> None:
+        now_s = time.monotonic()
+        self.outcome.take(report, now_s)
+        self._detector.report(report, now_s)
+        self._backlog.report(report, now_s)
+        if isinstance(report, control.Probed):
+            self._probing.take(report)
 
     # ------------------------------------------------------------------ processes
 
@@ -246,14 +251,16 @@ class Supervisor:
         self._shutdown.heed_peers()
         self._shutdown.look(now_s)
         self._keep_pause()
-        for severity, text in self._detector.remarks_on_hooks():
-            self._output.log(severity, text)
+        self._show(self._detector.remarks_on_hooks())
         if self._shutdown.phase in (Phase.RUNNING, Phase.DRAINING):
-            for severity, text in self._detector.remarks_on_silence(now_s, self._processes.killed):
-                self._output.log(severity, text)
+            self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
         self.observers.look_at(self._shutdown.phase)
         if self._shutdown.phase is Phase.RUNNING:
             self._look_at_run(now_s)
+
+    def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
+        for severity, text in remarks:
+            self._output.log(severity, text)
 
     def _keep_pause(self) -> None:
         """Note how long the run has stood still; nodes that are stopped meanwhile do not go on."""
@@ -277,10 +284,9 @@ class Supervisor:
             self._shutdown.drain(f"{self._duration_s:g} s are over", STOP_S)
             return
         for source in (self._detector, self._backlog, self._peers):
-            for severity, text in source.remarks(now_s):
-                self._output.log(severity, text)
+            self._show(source.remarks(now_s))
         if self._detector.has_just_stalled(now_s):
-            self._channels.send("explain")
+            self._channels.send(control.Explain())
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
         if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:

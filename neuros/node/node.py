@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from neuros.control import Finalising, FirstHook, Message, Shutdown
 from neuros.engine.engine import Engine
 from neuros.engine.node_ports import PacketType
 from neuros.errors import NeurosError
@@ -34,7 +35,7 @@ class NodeRuntime:
     :class:`PluginServices` those of ``node``.
 
     Args:
-        tell: reports to the supervisor, ``tell(kind, **fields)``.
+        tell: sends to the supervisor.
         fail: called with an error that ends the project.
         recorder: where packets go that are recorded, ``None``: none are.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
@@ -56,7 +57,7 @@ class NodeRuntime:
         middleware: Middleware,
         contexts: ContextSwitch,
         *,
-        tell: Callable[..., object],
+        tell: Callable[[Message], object],
         fail: Callable[[str, NeurosError], None],
         recorder: PacketRecorder | None = None,
         log_file: Path | None,
@@ -91,7 +92,7 @@ class NodeRuntime:
             middleware.loop,
             self._time,
             self.failures,
-            partial(tell, "shutdown", node=self.name),
+            lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
@@ -110,11 +111,11 @@ class NodeRuntime:
             self._time,
             instruments,
             enter=self._enter,
-            on_first_hook=lambda: tell("first_hook", node=self.name),
+            on_first_hook=lambda: tell(FirstHook(self.name)),
             on_initialised=on_initialised,
         )
         self.reports = NodeReports(
-            file, middleware, self._transport, self._time, self._effects, sampler, clock
+            file, middleware, self._transport, self._time, sampler, clock
         )
         node, tap = file.node, self._effects.tap
         arrivals = {
@@ -202,13 +203,13 @@ class NodeRuntime:
         if self.engine is not None:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
-                    self._tell("finalising", node=self.name, hook=spec.name)
+                    self._tell(Finalising(self.name, spec.name))
                     self._guard(partial(self._effects.finalise, spec))
-        self._tell("finalising", node=self.name, hook="")
+        self._tell(Finalising(self.name, ""))
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
-        self._tell("finalising", node=self.name, hook=None)
+        self._tell(Finalising(self.name, None))
 
     # ------------------------------------------------------------------ inbox
 

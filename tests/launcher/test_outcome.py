@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
+from neuros.control import Report
 from neuros.launcher.outcome import Outcome
 
 
@@ -13,8 +15,8 @@ def outcome(sim_time: float, points: Sequence[tuple[float, float]], paused_s: fl
     """A simulator that has initialised after 10 s, a plot after 12 s; the end begins at 22 s."""
     ended = Outcome(ending_s=22.0, paused_s=paused_s)
     ended.reports = {
-        "robot": {"sim_time": sim_time, "running_since_s": 10.0 + paused_s},
-        "plot": {"sim_time": None, "running_since_s": 12.0 + paused_s},
+        "robot": Report(node="robot", sim_time=sim_time, running_since_s=10.0 + paused_s),
+        "plot": Report(node="plot", running_since_s=12.0 + paused_s),
     }
     ended.timelines = {"robot": [list(point) for point in points]}
     return ended
@@ -44,5 +46,5 @@ def test_a_pause_does_not_count() -> None:
 
 def test_without_simulated_time_there_is_none() -> None:
     ended = outcome(1.0, [])
-    ended.reports["robot"] = {**ended.reports["robot"], "sim_time": None}
+    ended.reports["robot"] = replace(ended.reports["robot"], sim_time=None)
     assert ended.real_time_factor is None

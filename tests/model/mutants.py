@@ -12,8 +12,7 @@ import neuros.launcher.quiescence as quiescence
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.input_queue import InputQueue, Subscription
-from neuros.engine.lifecycle import Lifecycle
-from neuros.engine.schedule import Schedule
+from neuros.engine.schedule import Lifecycle, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.project.model import Connection
 

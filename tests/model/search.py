@@ -12,10 +12,11 @@ import hashlib
 import types
 from collections import defaultdict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from typing import Any
 
+from neuros.control import Probed
 from neuros.errors import NeurosError
 from neuros.hooks import HookSpec
 from neuros.project.model import Connection
@@ -29,8 +30,8 @@ _WITHOUT_EFFECT = frozenset(
         *("execution_log", "executions", "taken", "longest_discard", "discards_in_a_row"),
         *("executing", "_cause", "rest", "_turn", "_first_turn", "_arrivals"),
         # There is one round of probes at a time.
-        *("world", "nodes", "project", "fingerprints", "_check"),
-        *("_asked_s", "_pause_s", "_number", "probe", "candidates", "connections", "_connections"),
+        "world",
+        *("_asked_s", "_pause_s", "_number", "candidates", "connections", "_connections"),
     }
 )
 
@@ -105,7 +106,9 @@ def fingerprint(world: World) -> bytes:
     for name, node in world.nodes.items():
         if name not in world.fingerprints:  # the others have done nothing since the last time
             world.fingerprints[name] = _digest(node)
-    return _digest(world) + b"".join(world.fingerprints.values())
+    between = [world.channels, world.probing, world.losses, world.ticks, world.has_crashed,
+               world.is_ending, world.is_drained]  # fmt: skip
+    return _digest(between) + b"".join(world.fingerprints.values())
 
 
 def _digest(value: Any) -> bytes:
@@ -163,6 +166,10 @@ def _plain(value: Any, seen: dict[int, int]) -> Any:
         return ("function", value.__qualname__, _plain(cells, seen))
     if isinstance(value, functools.partial):
         return ("partial", _plain(value.func, seen), _plain(value.args, seen))
+    if isinstance(value, World):  # what can change in it is a part of every fingerprint
+        return "world"
+    if isinstance(value, Probed):  # there is one round of probes at a time
+        value = replace(value, number=0)
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(_plain(getattr(value, f.name), seen) for f in fields(value)
                                         if f.name not in _WITHOUT_EFFECT))  # fmt: skip

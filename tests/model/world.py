@@ -16,12 +16,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from neuros.control import Message, Probe, Probed
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.snapshot import snapshot
 from neuros.hooks import HookSpec
 from neuros.launcher.quiescence import Probing, Verdict
-from neuros.project.model import Connection
+from neuros.project.model import Connection, Port
 from tests.engine.engine_bench import Clock, node_for
 
 Event = Callable[[], None]
@@ -115,16 +116,17 @@ class ModelNode:
                     self._judge(hook.name, port.name, packet.origin, packet.number)
         return hook.spec.function(self, *arguments)
 
-    def send(self, connections: Sequence[Connection], packet: Packet) -> None:
+    def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        assert port.external_topic is None
+        return functools.partial(self._send, connections)
+
+    def _send(self, connections: Sequence[Connection], packet: Packet) -> None:
         for c in connections:
             if self.world.nodes[c.destination_node].is_there:
                 self.world.put(("data", c), packet)
 
-    def acknowledge(self, connection: Connection, position: int) -> None:
-        self.world.put(("ack", connection), position)
-
-    def send_external(self, port: Any, packet: Any) -> None:
-        raise AssertionError("there are no external ports here")
+    def acknowledger(self, connection: Connection) -> Callable[[int], None]:
+        return functools.partial(self.world.put, ("ack", connection))
 
     def post(self, event: Event) -> None:
         self.events.append(event)
@@ -302,9 +304,9 @@ class World:
 
     # the launcher
 
-    def _to_all(self, kind: str, **fields: Any) -> None:
-        assert kind == "probe"
-        self._tell_all(_Question(fields["number"]))
+    def _to_all(self, message: Message) -> None:
+        assert isinstance(message, Probe)
+        self._tell_all(_Question(message.number))
 
     def _tell_all(self, message: Callable[[ModelNode], None]) -> None:
         for name in self.nodes:
@@ -330,9 +332,9 @@ class World:
             and not any(self.channels.get(("to node", name)) for name in self.nodes)
         )
 
-    def take_answer(self, name: str, answer: Mapping[str, Any]) -> None:
+    def take_answer(self, answer: Probed) -> None:
         """A node has answered a probe."""
-        self.probing.take(name, answer)
+        self.probing.take(answer)
         if self.probing.verdict is Verdict.DRAINED and not self.is_drained:
             self._end_drained()
 
@@ -377,21 +379,25 @@ class _Question:
 
     def __call__(self, node: ModelNode) -> None:
         # The launcher judges when it has all answers, in whichever order they come.
-        node.world.take_answer(node.name, _answer_of(node, self._number))
+        node.world.take_answer(_answer_of(node, self._number))
 
 
-def _answer_of(node: ModelNode, number: int) -> dict[str, Any]:
+def _answer_of(node: ModelNode, number: int) -> Probed:
     """What a node answers to a probe, without the figures that only people read."""
     metrics = snapshot(node.engine, 0)
-    counts = {
+    counts: Any = {
         side: {
             name: {key: row[key] for key in ("sent", "received", "acknowledged") if key in row}
             for name, row in metrics[side].items()
         }
         for side in ("outgoing", "incoming")
     }
-    return {
-        "probe": number,
-        "metrics": counts,
-        "is_startable": node.engine.has_startable_packet,
-    }
+    return Probed(
+        node=node.name,
+        metrics=counts,
+        number=number,
+        is_startable=node.engine.has_startable_packet,
+        is_wakeable=False,
+        is_running=True,
+        is_idle=True,
+    )
