@@ -9,10 +9,12 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from marking import Watch, mark
 from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
 LOADING = sys.getdlopenflags()
+WATCH = Watch()
 
 
 @pytest.fixture(autouse=True)
@@ -41,10 +43,26 @@ def pytest_make_collect_report() -> Iterator[None]:
 
 
 @pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give each test its markers, before ``-m`` chooses by them."""
+    for item in items:
+        mark(item)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """A unit test starts nothing outside its own process."""
+    if item.get_closest_marker("unit") is None:
+        return (yield)
+    with WATCH.nothing_leaves():
+        return (yield)
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What a test's marker ``needs`` names has to be there."""
-    for mark in item.iter_markers("needs"):
-        require(*mark.args)
+    for needs in item.iter_markers("needs"):
+        require(*needs.args)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
