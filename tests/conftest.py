@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from marking import Watch, mark
+from marking import Watch, longest_first, mark
 from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
@@ -43,10 +43,12 @@ def pytest_make_collect_report() -> Iterator[None]:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
     """Give each test its markers, before ``-m`` chooses by them."""
     for item in items:
         mark(item)
+    if hasattr(config, "workerinput"):  # no worker has much to do when the others are done
+        longest_first(items)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -38,6 +38,7 @@ THROUGH_NEUROS = {
         "api/test_python_api.py",
         "api/test_sweep.py",
         "benchmarks/test_reproduce_runs.py",
+        "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",
         "conformance/test_conformance.py::test_what_once",
         "integration/",
@@ -56,6 +57,7 @@ THROUGH_NEUROS = {
         "test_installation.py",
     ),
 }
+_LONGEST = ("docker", "ros", "process")
 _STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.exec", "os.system"}
 
 
@@ -79,6 +81,16 @@ def uses(item: pytest.Function) -> set[str]:
         found -= {"docker"}
     name = item.nodeid.removeprefix("tests/")
     return found | {kind for kind, names in THROUGH_NEUROS.items() if name.startswith(names)}
+
+
+def longest_first(items: list[pytest.Function]) -> None:
+    """Put the files first whose tests wait for containers, then those with runs."""
+    ranks: dict[Path, int] = {}
+    for item in items:
+        marked = {each.name for each in item.iter_markers()}
+        rank = next((rank for rank, kind in enumerate(_LONGEST) if kind in marked), len(_LONGEST))
+        ranks[item.path] = min(rank, ranks.get(item.path, rank))
+    items.sort(key=lambda item: ranks[item.path])
 
 
 @cache

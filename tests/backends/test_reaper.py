@@ -103,13 +103,17 @@ def _wait_until(condition: Callable[[], bool], deadline_s: float = 10.0) -> None
 
 
 def _start(run_id: str, program: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-S", "-c", program],
         env={**os.environ, RUN_ID: run_id},
         start_new_session=True,
         stdout=subprocess.PIPE,
         text=True,
     )
+    # Popen returns before the kernel shows the environment, by which a process of a run is known.
+    environment = Path(f"/proc/{process.pid}/environ")
+    _wait_until(lambda: process.poll() is not None or run_id.encode() in environment.read_bytes())
+    return process
 
 
 def _end(process: subprocess.Popen[str]) -> int:
