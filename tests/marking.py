@@ -75,7 +75,7 @@ def uses(item: pytest.Function) -> set[str]:
     """The kinds of things that a test can reach outside its own process."""
     definitions = item._fixtureinfo.name2fixturedefs.values()
     functions = [item.function, *(each.func for group in definitions for each in group)]
-    found = set().union(*map(_reached_from, functions))
+    found = set().union(*map(reached_from, functions))
     parameters = map(str, item.callspec.params.values()) if hasattr(item, "callspec") else ()
     if any(value.startswith(("process", "in-process")) for value in parameters):
         found -= {"docker"}
@@ -94,7 +94,8 @@ def longest_first(items: list[pytest.Function]) -> None:
 
 
 @cache
-def _reached_from(function: Callable[..., Any]) -> frozenset[str]:
+def reached_from(function: Callable[..., Any]) -> frozenset[str]:
+    """The kinds of things outside its own process that a function of a test leads to."""
     return frozenset(_reached(function, set()))
 
 
