@@ -9,12 +9,25 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, Phase, settings
 from marking import Watch, longest_first, mark
 from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
 LOADING = sys.getdlopenflags()
 WATCH = Watch()
+
+# How long examples take depends on what else the machine does.
+settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# For tests/mutation.py: the same examples each time, and none made smaller when one fails.
+settings.register_profile(
+    "mutation",
+    settings.get_profile("anywhere"),
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+)
+settings.load_profile("anywhere")
 
 
 @pytest.fixture(autouse=True)

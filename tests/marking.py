@@ -2,7 +2,7 @@
 
 A test reaches what its body, its fixtures and the helpers of ``tests`` that they use name. For what
 :data:`REACHED` knows among that it is marked ``ros``, ``docker``, ``browser`` or ``process``; where
-nothing is found, ``unit``. What is reached only through ``neuros`` is in :data:`THROUGH_NEUROS`: a
+nothing is found, ``unit``. What is reached only through ``neuros`` is in :data:`BY_NAME`: a
 unit test that starts a process, opens a ROS context or connects to a Docker engine fails.
 """
 
@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 HERE = Path(__file__).parent
-KINDS = ("ros", "docker", "browser", "process")
+KINDS = ("ros", "docker", "browser", "process", "slow")
 # By module, or by name in a module.
 REACHED = {
     "launching.start": "ros",
@@ -32,8 +32,8 @@ REACHED = {
     "neuros.backends.process_launchers.InProcessLauncher": "process",
     "neuros.backends.process_launchers.ProcessLauncher": "process",
 }
-# By the beginning of a test's path and name.
-THROUGH_NEUROS = {
+# By the beginning of a test's path and name: what is reached through neuros, and what takes long.
+BY_NAME = {
     "ros": (
         "api/test_python_api.py",
         "api/test_sweep.py",
@@ -54,7 +54,19 @@ THROUGH_NEUROS = {
         "cli/test_command_line.py::test_what_could_not_be_started",
         "cli/test_validate_command.py",
         "doctor/test_machine_checks.py::test_a_gpu_tool",
+        "simulators/test_mujoco_opengl.py::TestDoctor",
         "test_installation.py",
+        "testing/test_plugin_harness.py::test_what_is_not_looked_for",
+    ),
+    "slow": (
+        "cli/test_report_command.py",
+        "documentation/test_site_parts.py::TestReference",
+        "examples/test_whiskeye_network.py",
+        "examples/test_whiskeye_plugins.py",
+        "recording/test_bag.py",
+        "simulators/convert/test_sdf_kinematics.py",
+        "snn/test_nest_networks.py",
+        "transport/test_packet_values.py::TestEveryMessageClass",
     ),
 }
 _LONGEST = ("docker", "ros", "process")
@@ -62,17 +74,17 @@ _STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.exec",
 
 
 def mark(item: pytest.Function) -> None:
-    """Give a test the markers of what it uses, unless it says so itself."""
+    """Give a test the markers of what it uses, beside its own."""
     own = {each.name for each in item.iter_markers()}
-    found = own & {*KINDS} or uses(item)
+    found = own & {*KINDS} | uses(item)
     for kind in found:
         item.add_marker(kind)
-    if not found and not own & {"acceptance", "needs", "slow"}:
+    if not found and not own & {"acceptance", "needs"}:
         item.add_marker("unit")
 
 
 def uses(item: pytest.Function) -> set[str]:
-    """The kinds of things that a test can reach outside its own process."""
+    """The kinds of things that a test can reach outside its own process, or ``slow``."""
     definitions = item._fixtureinfo.name2fixturedefs.values()
     functions = [item.function, *(each.func for group in definitions for each in group)]
     found = set().union(*map(reached_from, functions))
@@ -80,7 +92,7 @@ def uses(item: pytest.Function) -> set[str]:
     if any(value.startswith(("process", "in-process")) for value in parameters):
         found -= {"docker"}
     name = item.nodeid.removeprefix("tests/")
-    return found | {kind for kind, names in THROUGH_NEUROS.items() if name.startswith(names)}
+    return found | {kind for kind, names in BY_NAME.items() if name.startswith(names)}
 
 
 def longest_first(items: list[pytest.Function]) -> None:
