@@ -199,7 +199,7 @@ def test_processes_that_end_within_the_grace_period_are_not_killed(
 def test_the_grace_period_ends_early_when_all_are_gone(reaper: Reaper) -> None:
     begin = time.monotonic()
     reaper.finish(grace_s=10)
-    assert time.monotonic() - begin < 5
+    assert time.monotonic() - begin < 9
 
 
 def test_processes_of_other_runs_are_left_alone(run_id: str, reaper: Reaper) -> None:
