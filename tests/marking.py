@@ -59,13 +59,16 @@ BY_NAME = {
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",
     ),
     "slow": (
+        "benchmarks/test_reproduce_tables.py",
         "cli/test_report_command.py",
         "documentation/test_site_parts.py::TestReference",
         "examples/test_whiskeye_network.py",
         "examples/test_whiskeye_plugins.py",
+        "project/test_project_split.py",
         "recording/test_bag.py",
         "simulators/convert/test_sdf_kinematics.py",
         "snn/test_nest_networks.py",
+        "testing/test_harness_values.py",
         "transport/test_packet_values.py::TestEveryMessageClass",
     ),
 }
