@@ -9,10 +9,25 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, Phase, settings
+from marking import Watch, longest_first, mark
 from needs import require, summary
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
 LOADING = sys.getdlopenflags()
+WATCH = Watch()
+
+# How long examples take depends on what else the machine does.
+settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# For tests/mutation.py: the same examples each time, and none made smaller when one fails.
+settings.register_profile(
+    "mutation",
+    settings.get_profile("anywhere"),
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+)
+settings.load_profile("anywhere")
 
 
 @pytest.fixture(autouse=True)
@@ -41,10 +56,28 @@ def pytest_make_collect_report() -> Iterator[None]:
 
 
 @pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
+    """Give each test its markers, before ``-m`` chooses by them."""
+    for item in items:
+        mark(item)
+    if hasattr(config, "workerinput"):  # no worker has much to do when the others are done
+        longest_first(items)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """A unit test starts nothing outside its own process."""
+    if item.get_closest_marker("unit") is None:
+        return (yield)
+    with WATCH.nothing_leaves():
+        return (yield)
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What a test's marker ``needs`` names has to be there."""
-    for mark in item.iter_markers("needs"):
-        require(*mark.args)
+    for needs in item.iter_markers("needs"):
+        require(*needs.args)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -10,13 +10,13 @@ import json
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from neuros.api.loading import load_with_messages
 from neuros.cli.main import parser
+from neuros.errors import NeurosError
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,8 +29,6 @@ PAGES = sorted(
         ROOT / "workspace" / "README.md",
     ]
 )
-NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
-pages = pytest.mark.parametrize("page", PAGES, ids=NAMES)
 
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
 _BLOCK = re.compile(r"^[ ]*```(\w*)\n(.*?)^[ ]*```", re.MULTILINE | re.DOTALL)
@@ -59,27 +57,32 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pages
-def test_every_link_leads_somewhere(page: Path) -> None:
+def named(page: Path) -> str:
+    """A page, as a message calls it."""
+    return str(page.relative_to(ROOT))
+
+
+def test_every_link_leads_somewhere() -> None:
     missing = []
-    for _, target in links(page):
-        path, _, anchor = target.partition("#")
-        file = (page.parent / path).resolve() if path else page
-        if not file.exists() or (anchor and anchor not in anchors(file)):
-            missing.append(target)
+    for page in PAGES:
+        for _, target in links(page):
+            path, _, anchor = target.partition("#")
+            file = (page.parent / path).resolve() if path else page
+            if not file.exists() or (anchor and anchor not in anchors(file)):
+                missing.append(f"{named(page)}: {target}")
     assert not missing
 
 
-@pages
-def test_every_function_is_in_the_file_that_its_link_leads_to(page: Path) -> None:
+def test_every_function_is_in_the_file_that_its_link_leads_to() -> None:
     missing = []
-    for text, target in links(page):
-        match = re.fullmatch(r"`([\w.]+)`", text)
-        if match and target.endswith(".py") and not match[1].endswith(".py"):
-            code = (page.parent / target).read_text("utf-8")
-            for name in match[1].split("."):
-                if not re.search(rf"^ *(?:def|class) {name}\b", code, re.MULTILINE):
-                    missing.append(f"{match[1]} in {target}")
+    for page in PAGES:
+        for text, target in links(page):
+            match = re.fullmatch(r"`([\w.]+)`", text)
+            if match and target.endswith(".py") and not match[1].endswith(".py"):
+                code = (page.parent / target).read_text("utf-8")
+                for name in match[1].split("."):
+                    if not re.search(rf"^ *(?:def|class) {name}\b", code, re.MULTILINE):
+                        missing.append(f"{named(page)}: {match[1]} in {target}")
     assert not missing
 
 
@@ -112,6 +115,7 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
                     continue
 
 
+@cache
 def options_of(command: str) -> set[str]:
     """The options of ``neuros <command>``, with those of its actions."""
     if not command:
@@ -134,16 +138,19 @@ def subparsers(of: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]
                 yield from subparsers(each)
 
 
-@pages
-def test_every_option_exists(page: Path) -> None:
+def test_every_option_exists() -> None:
     unknown = []
-    for program, words in commands(page):
-        command = "launch" if program == "launch.py" else ""
-        if program == "neuros" and words and not words[0].startswith("-"):
-            command = words.pop(0)
-        known = options_of(command)
-        given = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]
-        unknown += [f"{program} {command} {option}" for option in given if option not in known]
+    for page in PAGES:
+        for program, words in commands(page):
+            command = "launch" if program == "launch.py" else ""
+            if program == "neuros" and words and not words[0].startswith("-"):
+                command = words.pop(0)
+            given = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]
+            unknown += [
+                f"{named(page)}: {program} {command} {option}"
+                for option in given
+                if option not in options_of(command)
+            ]
     assert not unknown
 
 
@@ -185,27 +192,37 @@ def json_projects(page: Path) -> Iterator[dict[str, Any]]:
         yield {**project, "nodes": entries}
 
 
-@pages
-def test_every_project_shown_is_valid(page: Path, tmp_path: Path) -> None:
-    for project in json_projects(page):
+def test_every_project_shown_is_valid(tmp_path: Path) -> None:
+    wrong = []
+    shown = [(page, project) for page in PAGES for project in json_projects(page)]
+    for number, (page, project) in enumerate(shown):
+        folder = tmp_path / str(number)
+        folder.mkdir()
         for name in files_named_in(project):
-            (tmp_path / name).write_text("")
-        (tmp_path / "project.json").write_text(json.dumps(project))
-        load_with_messages(tmp_path, reads_plugins=False)
+            (folder / name).write_text("")
+        (folder / "project.json").write_text(json.dumps(project))
+        try:
+            load_with_messages(folder, reads_plugins=False)
+        except NeurosError as error:
+            wrong.append(f"{named(page)}: {error}")
+    assert not wrong
 
 
-@pages
-def test_every_code_block_says_its_language(page: Path) -> None:
+def test_every_code_block_says_its_language() -> None:
     """What does not is coloured as Python by the site."""
-    fences = re.findall(r"^ *```(.*)$", page.read_text("utf-8"), re.MULTILINE)
-    assert "" not in fences[::2]
+    fences = {
+        named(page): re.findall(r"^ *```(.*)$", page.read_text("utf-8"), re.MULTILINE)[::2]
+        for page in PAGES
+    }
+    assert not [page for page, languages in fences.items() if "" in languages]
 
 
-@pages
-def test_every_plugin_shown_is_python(page: Path) -> None:
-    for body in blocks(page, "python"):
-        indent = len(body) - len(body.lstrip(" "))
-        compile("".join(line[indent:] or "\n" for line in body.splitlines(True)), page.name, "exec")
+def test_every_plugin_shown_is_python() -> None:
+    for page in PAGES:
+        for body in blocks(page, "python"):
+            indent = len(body) - len(body.lstrip(" "))
+            lines = [line[indent:] or "\n" for line in body.splitlines(True)]
+            compile("".join(lines), named(page), "exec")
 
 
 def catalogue() -> list[str]:

@@ -34,7 +34,7 @@ def test_three():
 @pytest.fixture
 def tests(tmp_path: Path) -> Path:
     """A folder with tests that need what is not there, under this project's ``conftest.py``."""
-    for name in ("conftest.py", "needs.py"):
+    for name in ("conftest.py", "marking.py", "needs.py"):
         shutil.copy(Path(__file__).parent / name, tmp_path)
     (tmp_path / "needs.py").write_text(
         Path(needs.__file__).read_text().replace("__file__", repr(needs.__file__))
@@ -43,7 +43,7 @@ def tests(tmp_path: Path) -> Path:
         "os.geteuid = lambda: int(os.environ['USER_ID'])\n"
         "shutil.which = lambda name: name if name in os.environ['PROGRAMS'] else None\n"
     )
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = needs\npythonpath = .\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  needs\n  unit\npythonpath = .\n")
     (tmp_path / "test_it.py").write_text(PROJECT)
     return tmp_path
 

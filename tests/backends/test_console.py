@@ -273,7 +273,7 @@ def test_a_reader_that_does_not_read_holds_up_nobody_and_gets_all_in_the_end(pip
     start_s = time.monotonic()
     for _ in range(1000):
         pipe.writer.write(MUCH)
-    assert time.monotonic() - start_s < 1.0
+    assert time.monotonic() - start_s < 10.0
     got = 0
     while pipe.writer.is_behind:
         got += len(pipe.read())

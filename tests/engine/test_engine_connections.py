@@ -106,6 +106,12 @@ def test_outstanding_is_sent_minus_acknowledged():
     assert window.outstanding == 1
 
 
+def test_nothing_is_outstanding_where_nothing_is_acknowledged():
+    window = SendWindow(wire(OUT))
+    window.spend(0)
+    assert window.outstanding == 0
+
+
 # ---------------------------------------------------------{10} the input queue
 
 

@@ -52,6 +52,21 @@ def test_blocked_is_booked_per_connection():
     assert accounting(bench)["blocked"] == {OUT: 3.0, "node.o -> c.x": 4.0}
 
 
+def test_a_hook_that_may_start_makes_the_node_busy_with_scheduling_until_it_is_stopped():
+    bench = Bench(function("f", "x"), connections=[wire(IN)])
+    bench.is_taken_in = False
+    bench.packet(IN)
+    assert bench.engine.rest() == Rest(State.SCHEDULING)
+    bench.engine.stop_hooks()
+    assert bench.engine.rest() == Rest(State.IDLE)
+
+
+def test_a_node_that_is_stopped_still_names_the_input_that_it_lacks():
+    bench = Bench(function("f", "x"), connections=[wire(IN)])
+    bench.engine.stop_hooks()
+    assert bench.engine.rest() == Rest(State.WAITING, "x")
+
+
 def test_a_blocked_output_counts_before_a_missing_input():
     bench = Bench(
         function("f", "x"),
@@ -254,6 +269,7 @@ def test_what_nobody_takes_is_consumed():
 
 def test_the_longest_row_of_discards_is_kept():
     bench = Bench(function("f", ["x", "go"]), connections=[wire(IN, 9), wire("c.o -> node.go")])
+    assert snapshot(bench.engine, 0)["incoming"][IN]["longest_discard"] == 0
     for count in (3, 5, 2):
         for _ in range(count):
             bench.packet(IN)

@@ -40,3 +40,13 @@ def test_what_comes_after_the_first_ones_is_not_noted() -> None:
     assert log.is_full
     assert len(log.executions) == 3 * 2
     assert [*log.credits[1::3]] == [1]
+
+
+def test_a_log_of_nothing_is_full_and_one_of_one_execution_is_not() -> None:
+    assert ExecutionLog(most=0).is_full
+    bench = relay()
+    bench.engine.execution_log = log = ExecutionLog(most=1)
+    assert not log.is_full
+    bench.packet("before.out -> node.in", 1)
+    assert log.is_full
+    assert len(log.executions) == 3

@@ -238,7 +238,7 @@ def test_a_full_disk_leaves_nothing(project: Project) -> None:
         env={**os.environ, **project.environment},
         capture_output=True,
         text=True,
-        timeout=60.0,
+        timeout=180.0,
         check=False,
     )
     assert "is full: make room (df -h)" in done.stderr, done.stdout + done.stderr

@@ -113,7 +113,7 @@ def test_one_that_does_not_read_holds_up_nobody_and_misses_nothing(
     start_s = time.monotonic()
     for number in range(5000):
         channels.send(Probe(number))
-    assert time.monotonic() - start_s < 2.0
+    assert time.monotonic() - start_s < 10.0
     got: list[Any] = []
     node.socket.settimeout(5.0)
     while len(got) < 5000:

@@ -35,8 +35,8 @@ def test_a_project_of_twenty_problems_is_judged_in_well_under_half_a_second(
     node = f'{{"name": "n", "container": "neuros_python", "outputs": [{port}]}}'
     file = tmp_path / "project.json"
     file.write_text(f'{{"nodes": [{", ".join([node] * 20)}]}}')
-    start = time.perf_counter()
+    start_s = time.process_time()
     with pytest.raises(ProjectError) as error:
         load_project(file, workspace=tmp_path)
-    assert time.perf_counter() - start < 0.4
+    assert time.process_time() - start_s < 0.4
     assert len(error.value.problems) > 20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from analysis.recordings import NUMBER, number, plan, record, spool
+from recording.recordings import NUMBER, number, plan, record, spool
 from xxhash import xxh3_64_intdigest
 
 from neuros.analysis import difference

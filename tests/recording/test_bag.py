@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analysis.recordings import ANSWER, NUMBER, answer, number, plan, record, spool
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recording.recordings import ANSWER, NUMBER, answer, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

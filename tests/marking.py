@@ -1,0 +1,183 @@
+"""Which markers a test gets, from what it can reach; and that a unit test keeps to its own process.
+
+A test reaches what its body, its fixtures and the helpers of ``tests`` that they use name. For what
+:data:`REACHED` knows among that it is marked ``ros``, ``docker``, ``browser`` or ``process``; where
+nothing is found, ``unit``. What is reached only through ``neuros`` is in :data:`BY_NAME`: a
+unit test that starts a process, opens a ROS context or connects to a Docker engine fails.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parent
+KINDS = ("ros", "docker", "browser", "process", "slow")
+# By module, or by name in a module.
+REACHED = {
+    "launching.start": "ros",
+    "rclpy": "ros",
+    "rclpy.context": "ros",
+    "neuros.backends.docker.engine.connect": "docker",
+    "playwright.sync_api": "browser",
+    "subprocess": "process",
+    "multiprocessing": "process",
+    "neuros.backends.process_launchers.InProcessLauncher": "process",
+    "neuros.backends.process_launchers.ProcessLauncher": "process",
+}
+# By the beginning of a test's path and name: what is reached through neuros, and what takes long.
+BY_NAME = {
+    "ros": (
+        "api/test_python_api.py",
+        "api/test_sweep.py",
+        "benchmarks/test_reproduce_runs.py",
+        "conformance/test_conformance.py::test_further_random_projects",
+        "conformance/test_conformance.py::test_random_projects",
+        "conformance/test_conformance.py::test_what_once",
+        "integration/",
+    ),
+    "process": (
+        "recording/test_provenance.py",
+        "backends/environments/test_container_pythons.py",
+        "backends/test_placement.py",
+        "backends/test_reaper.py",
+        "backends/test_shared_memory.py::test_the_reaper",
+        "benchmarks/test_command.py",
+        "benchmarks/test_reproduce_command.py",
+        "cli/test_command_line.py::test_what_could_not_be_started",
+        "cli/test_validate_command.py",
+        "doctor/test_machine_checks.py::test_a_gpu_tool",
+        "simulators/test_mujoco_opengl.py::TestDoctor",
+        "test_installation.py",
+        "testing/test_plugin_harness.py::test_what_is_not_looked_for",
+    ),
+    "slow": (
+        "benchmarks/test_reproduce_tables.py",
+        "cli/test_report_command.py",
+        "documentation/test_site_parts.py::TestReference",
+        "examples/test_whiskeye_network.py",
+        "examples/test_whiskeye_plugins.py",
+        "project/test_project_split.py",
+        "recording/test_bag.py",
+        "simulators/convert/test_sdf_kinematics.py",
+        "snn/test_nest_networks.py",
+        "testing/test_harness_values.py",
+        "transport/test_packet_values.py::TestEveryMessageClass",
+    ),
+}
+_LONGEST = ("docker", "ros", "process")
+_STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.exec", "os.system"}
+
+
+def mark(item: pytest.Function) -> None:
+    """Give a test the markers of what it uses, beside its own."""
+    own = {each.name for each in item.iter_markers()}
+    found = own & {*KINDS} | uses(item)
+    for kind in found:
+        item.add_marker(kind)
+    if not found and not own & {"acceptance", "needs"}:
+        item.add_marker("unit")
+
+
+def uses(item: pytest.Function) -> set[str]:
+    """The kinds of things that a test can reach outside its own process, or ``slow``."""
+    definitions = item._fixtureinfo.name2fixturedefs.values()
+    functions = [item.function, *(each.func for group in definitions for each in group)]
+    found = set().union(*map(reached_from, functions))
+    parameters = map(str, item.callspec.params.values()) if hasattr(item, "callspec") else ()
+    if any(value.startswith(("process", "in-process")) for value in parameters):
+        found -= {"docker"}
+    name = item.nodeid.removeprefix("tests/")
+    return found | {kind for kind, names in BY_NAME.items() if name.startswith(names)}
+
+
+def longest_first(items: list[pytest.Function]) -> None:
+    """Put the files first whose tests wait for containers, then those with runs."""
+    ranks: dict[Path, int] = {}
+    for item in items:
+        marked = {each.name for each in item.iter_markers()}
+        rank = next((rank for rank, kind in enumerate(_LONGEST) if kind in marked), len(_LONGEST))
+        ranks[item.path] = min(rank, ranks.get(item.path, rank))
+    items.sort(key=lambda item: ranks[item.path])
+
+
+@cache
+def reached_from(function: Callable[..., Any]) -> frozenset[str]:
+    """The kinds of things outside its own process that a function of a test leads to."""
+    return frozenset(_reached(function, set()))
+
+
+def _reached(value: Any, seen: set[int]) -> set[str]:
+    """What an object of a test module leads to."""
+    value = getattr(value, "__wrapped__", value)
+    if id(value) in seen:
+        return set()
+    seen.add(id(value))
+    if isinstance(value, ModuleType):
+        return {REACHED[value.__name__]} if value.__name__ in REACHED else set()
+    if isinstance(value, FunctionType | type):
+        name = f"{value.__module__}.{value.__qualname__}."
+        if found := {kind for key, kind in REACHED.items() if name.startswith(f"{key}.")}:
+            return found
+        names = vars(sys.modules.get(value.__module__, sys))
+        if Path(names.get("__file__") or "/").is_relative_to(HERE):
+            if isinstance(value, type):
+                return set().union(*(_reached(each, seen) for each in vars(value).values()))
+            return _reached_by(value.__code__, value.__globals__, seen)
+    return set()
+
+
+def _reached_by(code: CodeType, names: Mapping[str, Any], seen: set[int]) -> set[str]:
+    found = {REACHED[name] for name in code.co_names if name in REACHED}  # imported within
+    found.update(*(_reached(names[name], seen) for name in code.co_names if name in names))
+    inner = (each for each in code.co_consts if isinstance(each, CodeType))
+    return found.union(*(_reached_by(each, names, seen) for each in inner))
+
+
+class Watch:
+    """Notes what leaves the process where nothing should."""
+
+    def __init__(self) -> None:
+        self._is_on = False
+        self._noted: list[str] = []
+        sys.addaudithook(self._note)
+
+    @contextmanager
+    def nothing_leaves(self) -> Iterator[None]:
+        """Fail the test that leaves the process within the block."""
+        from rclpy.context import Context
+
+        init = Context.init
+
+        def note_and_init(*of: Any, **given: Any) -> None:
+            self._noted.append("a ROS context")
+            init(*of, **given)
+
+        self._noted.clear()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Context, "init", note_and_init)
+            self._is_on = True
+            try:
+                yield
+            finally:
+                self._is_on = False
+        if self._noted:
+            pytest.fail(
+                f"a unit test must not leave its process: {', '.join(self._noted)};"
+                " let tests/marking.py know",
+                pytrace=False,
+            )
+
+    def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self._is_on:
+            if event in _STARTS_A_PROCESS:
+                self._noted.append(f"{event} of {arguments[:1]}")
+            elif event == "socket.connect" and "docker" in str(arguments[1]):
+                self._noted.append(f"a connection to {arguments[1]}")
