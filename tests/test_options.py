@@ -18,7 +18,7 @@ class Settings:
     is_placed: bool = option("--no-placement", default=True, help="ignore cores")
     bar: bool | None = option("--bar", is_negatable=True, help="show a bar", is_recorded=False)
     where: str | None = option("--where", variable="WHERE", default_help="here", help="a place")
-    folder: Path | None = option(help="for Python alone")
+    folder: object = option(help="for Python alone")
 
 
 def parsed(*words: str) -> Settings:
