@@ -77,8 +77,7 @@ def test_the_environment_comes_before_the_default_and_after_what_is_given() -> N
 
 
 def test_the_record_has_what_json_knows() -> None:
-    values = vars(Settings(nodes=("a",), folder=Path("x")))
-    assert recorded_values(options_of(Settings), values) == {
+    assert recorded_values(Settings(nodes=("a",), folder=Path("x"))) == {
         "speed": 1.0,
         "nodes": ["a"],
         "is_placed": True,

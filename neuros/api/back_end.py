@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.request import BACK_ENDS
 from neuros.backends.docker.layout import as_here, inside
 from neuros.backends.placement import Cores
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
@@ -22,8 +23,6 @@ from neuros.transport.dds_profile import as_asked
 if TYPE_CHECKING:
     from neuros.backends.docker.launcher import Containers
 
-BACK_ENDS = ("auto", "docker", "process", "in-process")
-_VARIABLE = "NEUROS_BACKEND"
 _COMMAND = (sys.executable, "-m", "neuros.cli", "node")
 
 
@@ -72,11 +71,6 @@ class BackEnd:
         if self.name == "in-process":
             return InProcessLauncher([*_COMMAND, *options, "--in-memory"], on_started, placement)
         return ProcessLauncher([*_COMMAND, *options], on_started, placement, pythons)
-
-
-def default_back_end(environ: Mapping[str, str]) -> str:
-    """The back end where no option names one."""
-    return environ.get(_VARIABLE) or "auto"
 
 
 def choose_back_end(wanted: str, project: Project, names: Collection[str]) -> BackEnd:

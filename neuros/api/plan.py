@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 from neuros.api.back_end import BackEnd, choose_back_end
-from neuros.api.request import Duration, Request
+from neuros.api.request import Request
 from neuros.backends.environments.pythons import Pythons, require_one_python
 from neuros.backends.node_command import without_mark
 from neuros.backends.placement import place, usable_cores
@@ -26,7 +26,6 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.recording.selection import Request as RecordingRequest
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,
@@ -104,17 +103,13 @@ def _address(host: str) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and for how long."""
+    """A project, which of its nodes to start, where, and how."""
 
     project: Project
     names: tuple[str, ...]
     back_end: BackEnd
-    duration: Duration
-    is_verbose: bool
-    is_placed: bool = True
+    request: Request
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
-    has_digests: bool = False
-    recording: RecordingRequest | None = None
     network: Network = THIS_MACHINE
     messages: Messages | None = None
 
@@ -152,16 +147,16 @@ class Plan:
         """The launcher of the back end; ``reaper`` hears of all it starts."""
         nodes = [self.project.node(name) for name in self.names]
         options: list[str] = []
-        if self.duration.sim_s is not None:
-            options += ["--duration-sim", repr(self.duration.sim_s)]
-        if self.is_verbose:
+        if self.request.end.sim_s is not None:
+            options += ["--duration-sim", repr(self.request.end.sim_s)]
+        if self.request.verbose:
             options.append("--debug")
-        if self.has_digests and self.backend == "in-process":  # elsewhere they are always kept
+        if self.request.digests and self.backend == "in-process":  # elsewhere always kept
             options.append("--digests")
-        if self.recording is not None:
+        if self.request.recording is not None:
             options.append("--record")
         return self.back_end.launcher(
-            options, place(nodes) if self.is_placed else {}, self.pythons.paths, reaper
+            options, place(nodes) if self.request.placement else {}, self.pythons.paths, reaper
         )
 
 
@@ -178,24 +173,13 @@ def make_plan(
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
     """
     network = chosen_network(request.network, request.peers)
-    names = _chosen_names(project, request.nodes, request.backend)
-    back_end = choose_back_end(request.backend, project, names)
+    wanted = request.backend or "auto"
+    names = _chosen_names(project, request.nodes, wanted)
+    back_end = choose_back_end(wanted, project, names)
     nodes = [project.node(name) for name in names]
     is_process = back_end.name == "process"
     pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
-    plan = Plan(
-        project,
-        names,
-        back_end,
-        request.duration,
-        request.is_verbose,
-        request.is_placed,
-        pythons,
-        has_digests=request.has_digests,
-        recording=request.recording,
-        network=network,
-        messages=messages,
-    )
+    plan = Plan(project, names, back_end, request, pythons, network, messages)
     if back_end.name == "in-process" and network.is_wide and plan.is_partial:
         raise UsageError(
             "--network with -n: the nodes of the in-process back end reach none elsewhere; use"
@@ -221,7 +205,7 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
             f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
             " install.py"
         )
-    if plan.is_placed:
+    if plan.request.placement:
         _check_cores(plan)
     if plan.backend == "in-process":
         nodes = [plan.project.node(name) for name in plan.names]
@@ -279,7 +263,7 @@ def _nest_problems(plan: Plan) -> Sequence[Problem]:
 
 
 def _time_problems(plan: Plan) -> Sequence[Problem]:
-    if plan.duration.sim_s is None:
+    if plan.request.end.sim_s is None:
         return ()
     nodes = plan.project.nodes
     owners = [node.name for node in nodes if node.owns_time and node.name in plan.names]
