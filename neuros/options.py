@@ -81,9 +81,9 @@ class Option:
     @property
     def full_help(self) -> str:
         """The help with what else there is to say: whether it is repeatable, its default."""
-        repeatable = " (repeatable)" if self.is_repeatable else ""
-        default = f" (default: {self.default_text})" if self.default_text else ""
-        return f"{self.help}{repeatable}{default}"
+        default = f"default: {self.default_text}" if self.default_text else ""
+        also = "; ".join(each for each in ("repeatable" * self.is_repeatable, default) if each)
+        return f"{self.help} ({also})" if also else self.help
 
     @property
     def default_text(self) -> str:

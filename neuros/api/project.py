@@ -43,7 +43,8 @@ class RunOptions(StartOptions):
     """The arguments of :meth:`Project.run`."""
 
     check: bool = option(
-        default=False, is_recorded=False, help="raise RunError unless the run ends normally")
+        default=False, is_recorded=False, help="raise RunError unless the run ends normally"
+    )
 
 
 class Project:

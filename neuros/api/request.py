@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 
 BACK_ENDS = ("auto", "docker", "process", "in-process")
-_RECORDING = "recording: NAME is a topic, an output (node.output), or a connection; * stands for any"
+_RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,6 +209,51 @@ class Request(ProjectOptions):
         from neuros.recording.selection import Request as RecordingRequest
 
         return RecordingRequest(everything, topics, tuple(self.exclude), self.storage)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaunchOptions(Request):
+    """Options of the command line alone, besides those of every run."""
+
+    dashboard: bool = option(
+        "--dashboard",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md",
+        help="serve a page on 127.0.0.1 that shows the run in a browser: live graph, fields over"
+        " time, images, logs, load; it can pause, step and stop the run; its address is printed",
+    )
+    dashboard_port: int | None = option(
+        "--dashboard-port",
+        parse=int,
+        metavar="PORT",
+        is_recorded=False,
+        default_help="any free one",
+        help="serve the dashboard on this port; implies --dashboard",
+    )
+    node_graph: bool = option(
+        "-g",
+        "--node-graph",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md#rqt_graph-rviz-and-rerun",
+        help="show the graph of the run: rqt_graph where it can run, else the dashboard",
+    )
+    visualisations: bool = option(
+        "-z",
+        "--visualisations",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md#rqt_graph-rviz-and-rerun",
+        help="show poses, images, scans and numbers: rviz2 where it can run, else Rerun in a"
+        " browser (pip install 'neuros[rerun]')",
+    )
+    dry_run: bool = option(
+        "--dry-run",
+        default=False,
+        is_recorded=False,
+        help="print what would be started, and start nothing",
+    )
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,9 @@ from neuros.project.model import Folders, NodeFile
 from neuros.project.split import node_file_to_json, project_to_json
 
 
-def run_folder_path(output: str | os.PathLike[str] | None, project_name: str, time: str | None = None) -> Path:
+def run_folder_path(
+    output: str | os.PathLike[str] | None, project_name: str, time: str | None = None
+) -> Path:
     """Where a run goes: ``output``, else a folder of the project and ``time`` (now, in UTC)."""
     if output is not None:
         return Path(output).absolute()

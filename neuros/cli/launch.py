@@ -1,4 +1,7 @@
-"""``neuros launch``: a run with its console, its signals, and its exit code."""
+"""``neuros launch``: a run with its console, its signals, and its exit code.
+
+What runs projects is imported late: ``--help`` and completion read this module, too.
+"""
 
 from __future__ import annotations
 
@@ -9,72 +12,53 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from neuros.api.execution import Execution, run_domain
-from neuros.api.plan import Plan, make_plan
-from neuros.api.recording import recording_of
-from neuros.api.request import Request, parse_duration
-from neuros.api.run_folder import folders_of, run_folder_path
-from neuros.cli.environments import make_shown_environments
-from neuros.cli.projects import load_with_messages
-from neuros.cli.views import Views
-from neuros.errors import UsageError
-from neuros.recording.selection import Request as RecordingRequest
+from neuros.api.request import LaunchOptions
+from neuros.cli import EXIT_CODES
+from neuros.cli.projects import add_project, load_with_messages
+from neuros.options import parsed_as
+
+if TYPE_CHECKING:
+    from neuros.api.plan import Plan
 
 
-def launch(options: argparse.Namespace) -> int:
+def add_launch(launch: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    launch.description = "Run a project: start its nodes, connect them, wait until all have ended."
+    launch.epilog = EXIT_CODES
+    add_project(launch, LaunchOptions)
+    launch.set_defaults(command=_launch)
+
+
+def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with _signals_noted() as (signals, waker):
-        request = _request(options)
-        project, messages = load_with_messages(options)
-        plan = make_plan(project, messages, request, is_tried=not options.dry_run)
+        from neuros.api.execution import Execution
+        from neuros.api.plan import make_plan
+        from neuros.cli.environments import make_shown_environments
+        from neuros.cli.views import Views
+
+        options = parsed_as(LaunchOptions, parsed)
+        project, messages = load_with_messages(parsed)
+        plan = make_plan(project, messages, options, is_tried=not options.dry_run)
         if options.dry_run:
-            return _dry_run(plan, request)
+            return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
         views = Views(options, plan)
-        run = Execution(plan, request, sys.stdout, signals, waker, views=views)
+        run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
 
 
-def _request(options: argparse.Namespace) -> Request:
-    """What the options ask for. Raises ``UsageError``."""
-    return Request(
-        backend=options.backend,
-        nodes=tuple(options.node),
-        duration=parse_duration(options.duration),
-        domain_id=options.domain_id,
-        network=options.network,
-        peers=options.peers,
-        output=options.output,
-        is_placed=not options.no_placement,
-        has_digests=options.digests,
-        monitors_load=options.monitor_system_load,
-        shows_progress=options.progress,
-        recording=_recording_request(options),
-        is_verbose=options.verbose,
-    )
+def _dry_run(plan: Plan) -> int:
+    from neuros.api.execution import run_domain
+    from neuros.api.recording import recording_of
+    from neuros.api.run_folder import folders_of, run_folder_path
 
-
-def _recording_request(options: argparse.Namespace) -> RecordingRequest | None:
-    """What the command line has recorded, ``None``: nothing. Raises ``UsageError``."""
-    if options.record or options.record_topics:
-        return RecordingRequest(
-            everything=options.record,
-            topics=tuple(options.record_topics),
-            exclude=tuple(options.exclude),
-            storage=options.storage,
-        )
-    if options.exclude or options.storage != "mcap":
-        name = "--exclude" if options.exclude else "--storage"
-        raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
-    return None
-
-
-def _dry_run(plan: Plan, request: Request) -> int:
-    recording = recording_of(plan, request, os.environ)
-    folder = run_folder_path(request.output, plan.project.name, "<utc time>")
-    with run_domain(plan, request, recording) as domain:
+    recording = recording_of(plan, os.environ)
+    folder = run_folder_path(plan.request.output, plan.project.name, "<utc time>")
+    with run_domain(plan, recording) as domain:
         print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
     messages = plan.messages.describe() if plan.messages else ()
     for line in (*plan.pythons.notices, *plan.pythons.describe(), *messages):
