@@ -18,7 +18,7 @@ from neuros.api.console import Console
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
-from neuros.api.run_folder import make_run_folder, write_node_files, write_record
+from neuros.api.run_folder import make_run_folder, write_node_files
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.progress import Progress
@@ -32,6 +32,7 @@ from neuros.launcher.supervisor import Supervisor
 from neuros.node.peer_link import ELSEWHERE_VARIABLE
 from neuros.options import recorded_values
 from neuros.recording.plan import RecordingPlan
+from neuros.recording.run_file import RUN_FILE, write_run_file
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
@@ -225,15 +226,15 @@ class Execution:
     def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
         """Write ``run.json``; where there is no room for it, among the temporary files."""
         try:
-            write_record(record, self.folder)
+            write_run_file(record, self.folder)
         except OSError as error:
             spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
-            problem = f"{self.folder / 'run.json'} cannot be written ({error.strerror})"
+            problem = f"{self.folder / RUN_FILE} cannot be written ({error.strerror})"
             outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
             record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             with contextlib.suppress(OSError):
                 spare.mkdir()
-                write_record(record, spare)
+                write_run_file(record, spare)
 
     def _observation(self) -> Observation:
         names = [file.node.name for file in self._files]

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 from collections.abc import Mapping
@@ -89,18 +88,6 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
     return files
-
-
-def write_record(record: Mapping[str, Any], run_folder: Path) -> None:
-    """Write ``run.json``, the whole of it or nothing. Raises ``OSError``."""
-    part = run_folder / ".run.json"
-    try:
-        part.write_text(_text(record), "utf-8")
-        part.replace(run_folder / "run.json")
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
 
 
 def _text(content: Mapping[str, Any]) -> str:

@@ -23,6 +23,7 @@ from neuros.api.run import Run, frame_of
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 from neuros.options import takes
+from neuros.recording.run_file import RUN_FILE
 
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
@@ -56,7 +57,7 @@ class Sweep:
     def runs(self) -> list[Run]:
         """The runs that have begun, in the order of the rows."""
         folders = [Path(row["folder"]) for row in self.rows]
-        return [Run(folder) for folder in folders if (folder / "run.json").exists()]
+        return [Run(folder) for folder in folders if (folder / RUN_FILE).exists()]
 
     def __str__(self) -> str:
         return _table_of(self.rows)

@@ -6,13 +6,13 @@ packet without a word. So one node sends images, the other answers with what it 
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from neuros.doctor.machine_checks import Finding, bad, good
+from neuros.recording.run_file import read_run_file
 
 PROJECT = Path(__file__).with_name("delivery")
 _TIMEOUT_S = 60.0
@@ -44,7 +44,7 @@ def prove_delivery(backend: str, project: Path = PROJECT) -> Finding:
                 raise
         if launcher.returncode:
             return bad(subject, f"{backend}: failed", _last(output))
-        return _judge(backend, json.loads((run / "run.json").read_text("utf-8")))
+        return _judge(backend, read_run_file(run))
 
 
 def _judge(backend: str, record: dict[str, object]) -> Finding:
