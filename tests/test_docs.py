@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from site_parts.command_line import add_option_tables
 
 from neuros.api.loading import load_with_messages
 from neuros.cli.main import parser
@@ -148,7 +149,9 @@ def test_every_option_exists(page: Path) -> None:
 
 
 def test_every_option_is_described() -> None:
-    text = (ROOT / "docs" / "command_line.md").read_text("utf-8")
+    source = [(ROOT / "docs" / "command_line.md").read_text("utf-8")]
+    add_option_tables(None, "docs/command_line", source)
+    (text,) = source
     wanted = {
         option
         for command in ("launch", "validate", "graph")
