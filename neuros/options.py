@@ -97,6 +97,13 @@ class Option:
         return not (self.is_negatable or isinstance(self.default, bool))
 
     @property
+    def value_text(self) -> str:
+        """What stands for its value in help texts."""
+        if self.choices is not None and not self.metavar:
+            return "{" + ",".join(self.choices() if callable(self.choices) else self.choices) + "}"
+        return self.metavar or self.name.upper()
+
+    @property
     def default_text(self) -> str:
         """Its default in words; empty where it is nothing, or a switch that is off."""
         has_default = not isinstance(self.default, bool) and self.default not in (None, ())

@@ -17,8 +17,10 @@ import pytest
 from site_parts.command_line import add_option_tables
 
 from neuros.api.loading import load_with_messages
+from neuros.api.request import LaunchOptions
 from neuros.cli.main import parser
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
+from neuros.options import Option, options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -159,6 +161,13 @@ def test_every_option_is_described() -> None:
         if option.startswith("--") and option != "--help"
     }
     assert not {option for option in wanted if f"{option}" not in text}
+
+
+@pytest.mark.parametrize("option", options_of(LaunchOptions), ids=lambda option: option.name)
+def test_the_page_that_says_more_on_an_option_exists(option: Option) -> None:
+    file, _, anchor = option.page.partition("#")
+    assert (ROOT / "docs" / file).exists()
+    assert not anchor or anchor in anchors(ROOT / "docs" / file)
 
 
 def files_named_in(value: Any, keys: tuple[str, ...] = ("plugin", "script")) -> Iterator[str]:

@@ -6,7 +6,7 @@ import argparse
 import posixpath
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,14 +73,16 @@ def _table(name: str, page: str) -> str:
     from neuros.api import request
     from neuros.options import options_of
 
-    rows = [_option_row(each, page) for each in options_of(getattr(request, name)) if each.flags]
-    return "\n".join(
-        ["| option | in Python | meaning | default |", "| --- | --- | --- | --- |", *rows]
-    )
+    declared_in = (request.Request, request.SweepOptions)
+    in_python = {each.name for cls in declared_in for each in options_of(cls)}
+    shown = [each for each in options_of(getattr(request, name)) if each.flags]
+    rows = [_option_row(each, page, in_python) for each in shown]
+    head = ["| option | in Python | meaning | default |", "| --- | --- | --- | --- |"]
+    return "\n".join([*head, *rows])
 
 
-def _option_row(option: Option, page: str) -> str:
-    value = f" {option.metavar or option.flags[-1].lstrip('-').upper()}" if option.has_value else ""
+def _option_row(option: Option, page: str, in_python: Collection[str]) -> str:
+    value = f" {option.value_text}" if option.has_value else ""
     flags = ", ".join(f"`{flag}{value}`" for flag in option.all_flags)
     meaning = as_text(option.help.replace("%%", "%"))
     meaning += "; repeatable" if option.is_repeatable else ""
@@ -88,5 +90,6 @@ def _option_row(option: Option, page: str) -> str:
         file, _, anchor = option.page.partition("#")
         target = posixpath.relpath(f"docs/{file}", str(Path(page).parent))
         meaning += f" ([more]({target}{'#' * bool(anchor)}{anchor}))"
-    cells = (flags, f"`{option.name}`", cell(meaning), cell(as_text(option.default_text)))
+    argument = f"`{option.name}`" if option.name in in_python else ""
+    cells = (flags, argument, cell(meaning), cell(as_text(option.default_text)))
     return f"| {' | '.join(cells)} |"
