@@ -20,7 +20,8 @@ from neuros.api.loading import load_with_messages
 from neuros.api.request import LaunchOptions
 from neuros.cli.main import parser
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
-from neuros.options import Option, options_of
+from neuros.options import Option
+from neuros.options import options_of as declared_options
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -163,7 +164,7 @@ def test_every_option_is_described() -> None:
     assert not {option for option in wanted if f"{option}" not in text}
 
 
-@pytest.mark.parametrize("option", options_of(LaunchOptions), ids=lambda option: option.name)
+@pytest.mark.parametrize("option", declared_options(LaunchOptions), ids=lambda option: option.name)
 def test_the_page_that_says_more_on_an_option_exists(option: Option) -> None:
     file, _, anchor = option.page.partition("#")
     assert (ROOT / "docs" / file).exists()
