@@ -110,8 +110,7 @@ class Execution:
         """The log files, by what is to be shown of their origin."""
         names = [file.node.name for file in self._files]
         logs = {name: self.folder / name / "node.log" for name in names}
-        if self._plan.backend == "in-process":
-            logs["host"] = self.folder / "host.log"
+        logs |= self._plan.deployment.logs(self.folder)
         if self._recording_plan is not None:
             logs["recorder"] = log_of(self.folder)
         return logs
@@ -142,7 +141,7 @@ class Execution:
         recording = None
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
-            for severity, notice in self._plan.back_end.notices:
+            for severity, notice in self._plan.notices:
                 self._console.log(severity, notice)
             recording = self._recording(reaper)
             supervisor = self._supervisor(reaper)
@@ -173,8 +172,9 @@ class Execution:
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
             record |= {
-                "backend": self._plan.backend,
-                **self._plan.back_end.record(),
+                "backend": self._plan.back_end.name,
+                "is_one_process": self._plan.back_end.is_one_process,
+                **self._plan.deployment.record(),
                 "domain_id": self._domain.id,
                 "namespace": self._plan.project.names.namespace,
                 "started": started,
@@ -239,31 +239,31 @@ class Execution:
 
     def _observation(self) -> Observation:
         names = [file.node.name for file in self._files]
-        is_one_process = self._plan.backend == "in-process"
         return Observation(
             self._run_id,
             self.folder,
             self._plan.project,
             names,
             monitors_load=self._monitors_load,
-            is_one_process=is_one_process,
+            is_one_process=self._plan.back_end.is_one_process,
         )
 
     def _as_here(self, text: str) -> str:
         """With the names that paths have on this machine."""
-        return self._plan.back_end.as_here(text, self._files[0].folders)
+        return self._plan.deployment.as_here(text, self._files[0].folders)
 
     def _session(self, started: float) -> Session:
         """What `neuros ps` shows of it."""
         return Session(
             self._run_id,
             self._plan.project.name,
-            self._plan.backend,
+            self._plan.back_end.name,
             tuple(file.node.name for file in self._files),
             str(self.folder),
             started,
             this_process(),
             self._plan.project.names.namespace,
+            self._plan.back_end.is_one_process,
         )
 
     def _supervisor(self, reaper: Reaper) -> Supervisor:

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros.api.back_end import default_back_end
 from neuros.api.live import LiveRun
 from neuros.api.loading import load_with_messages
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request, parse_duration
 from neuros.api.run import Run
 from neuros.api.validation import model_problems
+from neuros.backends.registered import AUTO
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.project.graph import graph_mermaid, graph_text
@@ -266,7 +266,7 @@ def _request(
     digests: bool,
 ) -> Request:
     return Request(
-        backend=backend or default_back_end(os.environ),
+        backend=backend or os.environ.get("NEUROS_BACKEND") or AUTO,
         nodes=tuple(nodes),
         duration=parse_duration(None if duration is None else str(duration)),
         domain_id=domain_id,

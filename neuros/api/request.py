@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
+from neuros.backends.registered import AUTO
 from neuros.errors import UsageError
 from neuros.recording.selection import Request as RecordingRequest
 
@@ -22,7 +25,8 @@ class Request:
     """How to run a project; the defaults are those of ``neuros launch``.
 
     Attributes:
-        backend: ``auto``, ``docker``, ``process`` or ``in-process``.
+        backend: the name of a back end, or ``auto``.
+        backend_options: values of its own options, by name.
         nodes: those to start, all if empty; the others may run elsewhere.
         duration: when to end it.
         domain_id: the ROS domain, chosen if ``None``.
@@ -36,7 +40,8 @@ class Request:
         is_verbose: whether DEBUG records are logged.
     """
 
-    backend: str = "auto"
+    backend: str = AUTO
+    backend_options: Mapping[str, Any] = field(default_factory=dict)
     nodes: tuple[str, ...] = ()
     duration: Duration = field(default_factory=Duration)
     domain_id: int | None = None

@@ -1,4 +1,4 @@
-"""Process back ends: one node process per node, or one for all nodes."""
+"""The back ends ``process`` and ``in-process``: a node process per node, or one for all."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from neuros.backends.child_processes import RunningProcess, end_now
 from neuros.backends.node_command import (
@@ -19,7 +20,64 @@ from neuros.backends.node_command import (
     with_messages,
 )
 from neuros.backends.placement import Cores, on_cores, thread_limits
-from neuros.project.model import NodeFile
+from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
+from neuros.project.model import Node, NodeFile, Project
+
+
+class Processes(BackEnd):
+    """A process per node; what ``auto`` takes where nothing better is usable."""
+
+    name = "process"
+    place = "a process"
+    rank = 0
+
+    def prepare(
+        self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
+    ) -> Deployment:
+        return _Processes(nodes)
+
+
+class OneProcess(BackEnd):
+    """One process for all nodes; it runs where somebody asks for it."""
+
+    name = "in-process"
+    place = "one process with all others"
+    is_one_process = True
+
+    def prepare(
+        self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
+    ) -> Deployment:
+        return _OneProcess(nodes)
+
+
+PROCESS_LOG = "host.log"
+"""What one process for all nodes prints that comes from none of them."""
+
+PROCESS = Processes()
+IN_PROCESS = OneProcess()
+
+
+class _Processes(Deployment):
+    """Processes of this machine, which keep to no limits."""
+
+    def __init__(self, nodes: Sequence[Node]) -> None:
+        limited = [node.name for node in nodes if any(vars(node.resources).values())]
+        if limited:
+            text = f"resources of {', '.join(limited)}: only --backend docker keeps to them"
+            self.notices = [("INFO", text)]
+
+    def launcher(self, program: NodeProgram) -> Launcher:
+        watch = program.reaper.watch if program.reaper else None
+        return ProcessLauncher(program.command, watch, program.cores, program.pythons)
+
+
+class _OneProcess(_Processes):
+    def launcher(self, program: NodeProgram) -> Launcher:
+        watch = program.reaper.watch if program.reaper else None
+        return InProcessLauncher(program.command, watch, program.cores)
+
+    def logs(self, run_folder: Path) -> Mapping[str, Path]:
+        return {"host": run_folder / PROCESS_LOG}
 
 
 class ProcessLauncher:
@@ -123,7 +181,7 @@ class InProcessLauncher:
         process = RunningProcess(
             [node.node.name for node in nodes],
             start_arguments(self._command, nodes),
-            log=process_log(nodes),
+            log=nodes[0].folders.run / PROCESS_LOG,
             folder=nodes[0].folders.run,
             environment=start_environment(
                 self._command,
@@ -149,9 +207,5 @@ class InProcessLauncher:
         names = ", ".join(node.node.name for node in nodes)
         command = shlex.join(node_command(self._command, nodes))
         where = on_cores(self._cores)
-        return [f"one process for {names}{where}: {command} (log: {process_log(nodes)})"]
-
-
-def process_log(nodes: Sequence[NodeFile]) -> Path:
-    """The file for the output of the process."""
-    return nodes[0].folders.run / "host.log"
+        log = nodes[0].folders.run / PROCESS_LOG
+        return [f"one process for {names}{where}: {command} (log: {log})"]

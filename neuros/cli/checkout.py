@@ -129,7 +129,6 @@ def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     )
     add(
         "--backend",
-        choices=("auto", "docker", "process", "in-process"),
         help="where nodes run, as for launch (default: NEUROS_BACKEND, else auto)",
     )
     add(

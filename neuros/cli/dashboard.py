@@ -75,7 +75,7 @@ def start_dashboard(
             "plan": shown_plan(plan.project, plan.names),
             "names": plan.names,
             "logs": {name: str(path) for name, path in logs.items()},
-            "is_one_process": plan.backend == "in-process",
+            "is_one_process": plan.back_end.is_one_process,
             "start_s": time.monotonic(),
         },
     )

@@ -75,11 +75,11 @@ def _dry_run(plan: Plan, request: Request) -> int:
     recording = recording_of(plan, request, os.environ)
     folder = run_folder_path(request.output, plan.project.name, "<utc time>")
     with run_domain(plan, request, recording) as domain:
-        print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
+        print(f"back end {plan.back_end.name}; {domain.reason}; run folder {folder}")
     messages = plan.messages.describe() if plan.messages else ()
     for line in (*plan.pythons.notices, *plan.pythons.describe(), *messages):
         print(line)
-    for _, notice in plan.back_end.notices:
+    for _, notice in plan.notices:
         print(notice)
     for line in plan.launcher().describe(plan.node_files(folders_of(plan, folder))):
         print(line)

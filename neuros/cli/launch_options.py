@@ -50,7 +50,6 @@ def add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     _add_network(launch)
     launch.add_argument(
         "--backend",
-        choices=("auto", "docker", "process", "in-process"),
         default=os.environ.get("NEUROS_BACKEND") or "auto",
         help="where nodes run: each in a container, each in a process, or all in one process"
         " (default: NEUROS_BACKEND, else auto: docker where an engine has the images, and else"

@@ -53,7 +53,6 @@ def add_sweep(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     add("--jobs", type=positive_number, default=1, metavar="N", help="runs at once (default: 1)")
     add(
         "--backend",
-        choices=("auto", "docker", "process", "in-process"),
         help="as for launch (default: NEUROS_BACKEND, else auto)",
     )
     add("--duration", metavar="SECONDS", help="of each run, as for launch: 30, or 30sim")

@@ -117,7 +117,7 @@ class Views:
         """Have a tool started later, or say in a few words why it cannot be."""
         from neuros.backends.tools import find_tool
 
-        if self._plan.backend == "in-process":
+        if self._plan.back_end.is_one_process:
             return "nodes of one process talk past ROS, where its tools see nothing"
         found = find_tool(program)
         if isinstance(found, str):

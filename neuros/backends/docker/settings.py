@@ -18,7 +18,7 @@ from typing import Any
 from neuros.backends.containers import PACKAGE
 from neuros.backends.docker.images import Image
 from neuros.backends.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
-from neuros.backends.leftover_containers import RUN_LABEL
+from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.node_command import (
     DEFAULTS,
     log_file,
