@@ -368,6 +368,7 @@ class NodeProgram:
         pythons: the Python of nodes that do not run on this one, by name of the node.
         reaper: is told of all that is started; ``None`` where nothing is.
         environ: the environment of the launcher.
+        program: the command without its options; paths of ``node.json`` files follow these.
     """
 
     options: Sequence[str] = ()
@@ -375,16 +376,11 @@ class NodeProgram:
     pythons: Mapping[str, Path] = field(default_factory=dict)
     reaper: Reaper | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
+    program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "node")
 
-    @property
-    def command(self) -> tuple[str, ...]:
-        """The program on this Python; paths of ``node.json`` files follow."""
-        return (sys.executable, *self.arguments)
-
-    @property
-    def arguments(self) -> tuple[str, ...]:
-        """The same, for any Python."""
-        return ("-m", "neuros.cli", "node", *self.options)
+    def command(self, python: Sequence[str] = ()) -> tuple[str, ...]:
+        """The command on this Python, or on the one that ``python`` starts."""
+        return (*(python or self.program[:1]), *self.program[1:], *self.options)
 
 
 Notice: TypeAlias = tuple[str, str]
@@ -491,7 +487,7 @@ class BackEnd(ABC):
         """Find what the nodes need to run here.
 
         Args:
-            options: values of :attr:`options`, by name; those that are not given are left out.
+            options: the value of each of :attr:`options`, by name.
 
         Raises:
             EnvironmentFault: with all that is missing, and what to do.

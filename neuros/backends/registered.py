@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.errors import EnvironmentFault, NeurosError
+from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.ports import BackEnd, Deployment, Notice
 from neuros.project.model import Node, Project
 from neuros.registry import Registry
@@ -29,18 +29,22 @@ def choose(
 ) -> Chosen:
     """Make a back end ready for nodes: the one of that name, or for ``auto`` the best usable one.
 
+    Args:
+        options: of the back end, by name; ``auto`` gives each of those that it tries its own.
+
     Raises:
-        UsageError: if there is none of that name.
+        UsageError: if there is none of that name, or it has no such option.
         EnvironmentFault: if it lacks something, or for ``auto``, if every one of them does.
     """
     if wanted != AUTO:
         back_end = BACK_ENDS.load(wanted)
-        return Chosen(back_end, back_end.prepare(project, nodes, options))
+        _check_names(back_end, options)
+        return Chosen(back_end, back_end.prepare(project, nodes, _values(back_end, options)))
     candidates, notices = _candidates()
     reasons: list[tuple[BackEnd, str]] = []
     for back_end in candidates:
         try:
-            deployment = back_end.prepare(project, nodes, options)
+            deployment = back_end.prepare(project, nodes, _values(back_end, options))
         except EnvironmentFault as fault:
             reasons.append((back_end, back_end.why_not(fault)))
             continue
@@ -50,6 +54,21 @@ def choose(
         ]
         return Chosen(back_end, deployment, notices)
     raise EnvironmentFault("\n".join(f"{other.name}: {reason}" for other, reason in reasons))
+
+
+def _check_names(back_end: BackEnd, options: Mapping[str, Any]) -> None:
+    known = [each.name for each in back_end.options]
+    for name in options:
+        if name not in known:
+            raise UsageError(
+                f"the back end {back_end.name} has no option '{name}':"
+                f" {', '.join(known) if known else 'it has none'}"
+            )
+
+
+def _values(back_end: BackEnd, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The value of each option of a back end: what is given, the environment's, the default."""
+    return {each.name: each.value(options.get(each.name)) for each in back_end.options}
 
 
 def _candidates() -> tuple[list[BackEnd], list[Notice]]:

@@ -16,6 +16,7 @@ from neuros.api.recording import recording_of
 from neuros.api.request import Request, parse_duration
 from neuros.api.run_folder import folders_of, run_folder_path
 from neuros.cli.environments import make_shown_environments
+from neuros.cli.launch_options import back_end_options
 from neuros.cli.projects import load_with_messages
 from neuros.cli.views import Views
 from neuros.errors import UsageError
@@ -41,6 +42,7 @@ def _request(options: argparse.Namespace) -> Request:
     """What the options ask for. Raises ``UsageError``."""
     return Request(
         backend=options.backend,
+        backend_options=back_end_options(options),
         nodes=tuple(options.node),
         duration=parse_duration(options.duration),
         domain_id=options.domain_id,

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from neuros.cli.dashboard import add_dashboard_options
 from neuros.cli.views import add_view_options
+from neuros.errors import NeurosError
 
 EXIT_CODES = """\
 exit codes:
@@ -21,8 +25,10 @@ exit codes:
 """
 
 
-def add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
+def add_launch(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], arguments: Sequence[str]
+) -> None:
+    """Add the command to the grammar, with the options of the back end in ``arguments``."""
     launch = commands.add_parser(
         "launch",
         help="run a project",
@@ -51,9 +57,10 @@ def add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     launch.add_argument(
         "--backend",
         default=os.environ.get("NEUROS_BACKEND") or "auto",
-        help="where nodes run: each in a container, each in a process, or all in one process"
-        " (default: NEUROS_BACKEND, else auto: docker where an engine has the images, and else"
-        " process)",
+        metavar="NAME",
+        help="where nodes run: the name of a back end, below, as process; each may have options of"
+        " its own (default: NEUROS_BACKEND, else auto: docker where an engine has the images, and"
+        " else process)",
     )
     launch.add_argument(
         "--duration",
@@ -83,7 +90,42 @@ def add_launch(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     launch.add_argument("--dry-run", action="store_true", help="print what would be started")
     launch.add_argument("-v", "--verbose", action="store_true", help="show DEBUG records, too")
+    if arguments[:1] == ["launch"]:
+        _add_back_ends(launch, arguments)
     launch.set_defaults(command=launch_project)
+
+
+def _add_back_ends(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
+    """Add what the back end that the command line names lets one choose; for help, of all."""
+    from neuros.backends.registered import AUTO, BACK_ENDS
+    from neuros.options import add_options
+
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--backend", nargs="?")
+    first.add_argument("-h", "--help", action="store_true")
+    asked, _ = first.parse_known_args(arguments)
+    named = asked.backend or os.environ.get("NEUROS_BACKEND") or AUTO
+    for name in BACK_ENDS if asked.help else {named} - {AUTO}:
+        try:
+            back_end = BACK_ENDS.load(name)
+        except NeurosError as error:
+            if not asked.help:
+                raise
+            launch.add_argument_group(f"back end {name}", str(error))
+            continue
+        group = launch.add_argument_group(f"back end {name}", f"each node in {back_end.place}")
+        add_options(group, [replace(each, group="") for each in back_end.options])
+
+
+def back_end_options(options: argparse.Namespace) -> dict[str, Any]:
+    """The options of the back end that were given."""
+    from neuros.backends.registered import AUTO, BACK_ENDS
+    from neuros.options import values_of
+
+    if options.backend == AUTO:
+        return {}
+    values = values_of(BACK_ENDS.load(options.backend).options, options)
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def add_project(command: argparse.ArgumentParser) -> None:

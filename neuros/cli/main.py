@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
         parser().print_help(sys.stderr)
         return EXIT_USAGE
     try:
-        options = parser().parse_args(arguments)
+        options = parser(arguments).parse_args(arguments)
         if options.command is not launch_project:  # that has Ctrl+C wait until it can heed it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
@@ -104,8 +104,8 @@ def main(arguments: Sequence[str]) -> int:
         return 0
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole grammar of the command line."""
+def parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The whole grammar of the command line; it depends on the back end in ``arguments``."""
     result: argparse.ArgumentParser = _Parser(
         prog="neuros",
         description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
@@ -114,7 +114,7 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--version", action="version", version=f"neuros {__version__}")
     commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    add_launch(commands)
+    add_launch(commands, arguments)
     _add_validate(commands)
     _add_graph(commands)
     add_build(commands)

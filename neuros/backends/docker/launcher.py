@@ -158,16 +158,15 @@ class DockerLauncher:
             file,
             self._images[file.node.container],
             user_for(file, self._program.environ, is_rootless=self._is_rootless),
-            self._program.options,
+            self._program,
             environment,
             others=[path for path in in_run_folder if path != node_folder(file)],
-            cores=self._program.cores.get(file.node.name),
             launcher_pid=os.getpid(),
         )
 
     def _description(self, file: NodeFile) -> str:
         node, image = file.node, self._images[file.node.container]
-        command = shlex.join([*image.start, *self._program.arguments])
+        command = shlex.join(self._program.command(image.start))
         facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
         where = on_cores(self._program.cores.get(node.name))
         return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
