@@ -18,12 +18,18 @@ Plugins that have no such dataclass, for instance back ends, list :class:`Option
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 _METADATA = "neuros option"
+_Arguments = ParamSpec("_Arguments")
+_Options = TypeVar("_Options")
+_Subject = TypeVar("_Subject")
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -75,9 +81,9 @@ class Option:
     @property
     def full_help(self) -> str:
         """The help with what else there is to say: whether it is repeatable, its default."""
-        repeatable = " (repeatable)" if self.is_repeatable else ""
-        default = f" (default: {self.default_text})" if self.default_text else ""
-        return f"{self.help}{repeatable}{default}"
+        default = f"default: {self.default_text}" if self.default_text else ""
+        also = "; ".join(each for each in ("repeatable" * self.is_repeatable, default) if each)
+        return f"{self.help} ({also})" if also else self.help
 
     @property
     def default_text(self) -> str:
@@ -102,22 +108,70 @@ class Option:
 
 
 def option(*flags: str, help: str, default: Any = None, **declared: Any) -> Any:
-    """A field of a dataclass that is an :class:`Option`, named after the field."""
+    """A field of a dataclass that is an :class:`Option`, named after the field.
+
+    The field is ``None`` by default where an environment variable holds the default.
+    """
     declaration = Option(flags, help, name="-", default=default, **declared)
-    return field(default=declaration.default, metadata={_METADATA: declaration})
+    is_late = declaration.variable is not None
+    return _field(declaration, None if is_late else declaration.default)
 
 
-def options_of(declared_in: type) -> tuple[Option, ...]:
+def like(declared_in: type, name: str, **changes: Any) -> Any:
+    """A field that is the option ``name`` of another dataclass, with ``changes`` to it."""
+    (found,) = (each for each in fields(declared_in) if each.name == name)
+    return _field(replace(found.metadata[_METADATA], **changes), found.default)
+
+
+def _field(declaration: Option, default: Any) -> Any:
+    return field(default=default, metadata={_METADATA: declaration})
+
+
+def options_of(declared_in: Any) -> tuple[Option, ...]:
     """The options that a dataclass declares, in its order."""
-    return tuple(
-        replace(each.metadata[_METADATA], name=each.name, default=_default(each.default))
-        for each in fields(declared_in)
-        if _METADATA in each.metadata
-    )
+    declared = ((each.name, each.metadata.get(_METADATA)) for each in fields(declared_in))
+    return tuple(replace(each, name=name) for name, each in declared if each is not None)
 
 
-def _default(value: Any) -> Any:
-    return None if value is MISSING else value
+def takes(
+    options: Callable[_Arguments, _Options],
+) -> Callable[
+    [Callable[[_Subject, _Options], _Result]],
+    Callable[Concatenate[_Subject, _Arguments], _Result],
+]:
+    """Let a function of a subject and ``options`` take their fields as keyword arguments::
+
+        @takes(LaunchOptions)
+        def launch(project: Project, options: LaunchOptions) -> Run: ...
+
+        launch(project, duration=30)
+
+    Type checkers, editors and ``help()`` see the fields with their types.
+    """
+
+    def decorate(
+        function: Callable[[_Subject, _Options], _Result],
+    ) -> Callable[Concatenate[_Subject, _Arguments], _Result]:
+        @wraps(function)
+        def call(
+            subject: _Subject, /, *arguments: _Arguments.args, **named: _Arguments.kwargs
+        ) -> _Result:
+            return function(subject, options(*arguments, **named))
+
+        first, *_ = inspect.signature(function).parameters.values()
+        taken = inspect.signature(options).parameters.values()
+        call.__dict__["__signature__"] = inspect.Signature([first, *taken])
+        described = [_argument_help(each) for each in options_of(options)]
+        text = "\n".join([f"{inspect.getdoc(function)}", "", "Args:", *described])
+        call.__doc__ = text.replace("%%", "%")  # argparse wants them doubled
+        return call
+
+    return decorate
+
+
+def _argument_help(option: Option) -> str:
+    flag = f" (``{option.flags[-1]}``)" if option.flags else ""
+    return f"    {option.name}{flag}: {option.full_help}."
 
 
 def add_options(
@@ -158,13 +212,15 @@ def values_of(options: Iterable[Option], parsed: argparse.Namespace) -> dict[str
     return {name: tuple(v) if isinstance(v, list) else v for name, v in found.items()}
 
 
-def recorded_values(options: Iterable[Option], values: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``run.json`` has of the values of options: all that JSON knows, the rest as text."""
-    return {
-        each.name: _as_json(values.get(each.name, each.default))
-        for each in options
-        if each.is_recorded
-    }
+def parsed_as(declared_in: Callable[..., _Options], parsed: argparse.Namespace) -> _Options:
+    """A dataclass with the values of its options that were parsed."""
+    return declared_in(**values_of(options_of(declared_in), parsed))
+
+
+def recorded_values(declared_in: Any) -> dict[str, Any]:
+    """What ``run.json`` has of a dataclass with options; what JSON does not know is text."""
+    recorded = (each.name for each in options_of(declared_in) if each.is_recorded)
+    return {name: _as_json(getattr(declared_in, name)) for name in recorded}
 
 
 def _as_json(value: Any) -> Any:
@@ -173,3 +229,11 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_as_json(each) for each in value]
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def positive_number(text: str) -> int:
+    """A value that counts something. Raises ``ValueError``, which argparse reports."""
+    number = int(text)
+    if number < 1:
+        raise ValueError(text)
+    return number

@@ -14,9 +14,7 @@ from neuros.errors import UsageError
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 from neuros.recording.load_table import load_table
-
-FORMAT = 2
-"""Of ``run.json``; grows when a reader of the old one could no longer read the new one."""
+from neuros.recording.run_file import FORMAT, RUN_FILE, read_run_file
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 
@@ -241,28 +239,11 @@ def open_run(folder: Path) -> PastRun:
     Raises:
         UsageError: if it is none, the run has not ended, or another version of NeuROS wrote it.
     """
-    file = folder / "run.json"
-    try:
-        record = json.loads(file.read_text("utf-8"))
-    except FileNotFoundError as error:
-        if any(folder.glob("*/node.json")):
-            why = "its run goes on, or its launcher was killed"
-        else:
-            why = "it is no folder that a run has left behind"
-        raise UsageError(f"{folder} has no run.json: {why}") from error
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
-    found = record.get("format", 1) if isinstance(record, dict) else None
-    if found != FORMAT:
-        raise UsageError(
-            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
-            " version that the run was made with, or run the project again"
-        )
-    run = PastRun(folder, record)
+    run = PastRun(folder, read_run_file(folder))
     try:
         _ = [run.connection(name) for name in run.connections]
     except (KeyError, TypeError, ValueError) as error:
-        raise UsageError(f"{file} is broken (its connections cannot be read: {error!r})") from error
+        raise UsageError(
+            f"{folder / RUN_FILE} is broken (its connections cannot be read: {error!r})"
+        ) from error
     return run

@@ -18,8 +18,7 @@ from neuros.api.console import Console
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
-from neuros.api.request import Request
-from neuros.api.run_folder import make_run_folder, write_node_files, write_record
+from neuros.api.run_folder import make_run_folder, write_node_files
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.progress import Progress
@@ -31,7 +30,9 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.node.peer_link import ELSEWHERE_VARIABLE
+from neuros.options import recorded_values
 from neuros.recording.plan import RecordingPlan
+from neuros.recording.run_file import RUN_FILE, write_run_file
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
@@ -59,7 +60,6 @@ class Execution:
     """One run of a plan.
 
     Args:
-        request: what it was planned from.
         stream: where to show what goes on, ``None``: nowhere.
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here whenever a signal does, or a wish.
@@ -74,7 +74,6 @@ class Execution:
     def __init__(
         self,
         plan: Plan,
-        request: Request,
         stream: TextIO | None,
         signals: list[int],
         waker: socket.socket,
@@ -82,17 +81,16 @@ class Execution:
         views: Views | None = None,
     ) -> None:
         self._plan = plan
-        self._monitors_load = request.monitors_load
         self._signals = signals
         self._waker = waker
         self._wishes = wishes
         self._views = views
         self._run_id = os.urandom(8).hex()
-        check_observation(monitors_load=request.monitors_load)
-        self._recording_plan = recording_of(plan, request, os.environ)
-        self._domain = run_domain(plan, request, self._recording_plan)
+        check_observation(monitors_load=plan.request.monitor_system_load)
+        self._recording_plan = recording_of(plan, os.environ)
+        self._domain = run_domain(plan, self._recording_plan)
         try:
-            self.folder = make_run_folder(request.output, plan.project.name)
+            self.folder = make_run_folder(plan.request.output, plan.project.name)
             self._files = write_node_files(plan, self.folder)
         except BaseException:
             self._domain.release()
@@ -103,7 +101,7 @@ class Execution:
             self._logs,
             lambda: bool(signals),
             self._as_here,
-            shows_progress=request.shows_progress,
+            shows_progress=plan.request.progress,
         )
 
     def _log_files(self) -> dict[str, Path]:
@@ -146,7 +144,7 @@ class Execution:
             recording = self._recording(reaper)
             supervisor = self._supervisor(reaper)
             outcome = supervisor.outcome
-            duration = self._plan.duration
+            duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             if self._views is not None:
                 shown = Shown(self._run_id, self.folder, self._beside(), self._logs)
@@ -178,6 +176,7 @@ class Execution:
                 "domain_id": self._domain.id,
                 "namespace": self._plan.project.names.namespace,
                 "started": started,
+                "options": recorded_values(self._plan.request),
                 **observed,
             }
             if recording is not None and recorded is not None:
@@ -227,15 +226,15 @@ class Execution:
     def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
         """Write ``run.json``; where there is no room for it, among the temporary files."""
         try:
-            write_record(record, self.folder)
+            write_run_file(record, self.folder)
         except OSError as error:
             spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
-            problem = f"{self.folder / 'run.json'} cannot be written ({error.strerror})"
+            problem = f"{self.folder / RUN_FILE} cannot be written ({error.strerror})"
             outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
             record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             with contextlib.suppress(OSError):
                 spare.mkdir()
-                write_record(record, spare)
+                write_run_file(record, spare)
 
     def _observation(self) -> Observation:
         names = [file.node.name for file in self._files]
@@ -244,7 +243,7 @@ class Execution:
             self.folder,
             self._plan.project,
             names,
-            monitors_load=self._monitors_load,
+            monitors_load=self._plan.request.monitor_system_load,
             is_one_process=self._plan.back_end.is_one_process,
         )
 
@@ -275,7 +274,7 @@ class Execution:
             self._console,
             self._signals,
             wishes=self._wishes,
-            duration_s=self._plan.duration.wall_s,
+            duration_s=self._plan.request.end.wall_s,
             peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
             waker=self._waker,
         )
@@ -307,7 +306,7 @@ def _without_notebook(environ: Mapping[str, str]) -> dict[str, str]:
     return {"MPLBACKEND": ""} if is_inline else {}
 
 
-def run_domain(plan: Plan, request: Request, recording: RecordingPlan | None) -> DomainLock:
+def run_domain(plan: Plan, recording: RecordingPlan | None) -> DomainLock:
     """The ROS domain of a run; released by closing it.
 
     Raises:
@@ -315,4 +314,4 @@ def run_domain(plan: Plan, request: Request, recording: RecordingPlan | None) ->
         EnvironmentFault: if none is free.
     """
     is_known = plan.needs_known_domain or bool(recording and recording.wanted)
-    return choose_domain(request.domain_id, os.environ, is_known)
+    return choose_domain(plan.request.domain_id, os.environ, is_known)

@@ -11,12 +11,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
-from neuros.api.request import Duration, Request
+from neuros.api.request import Request
 from neuros.backends.environments.pythons import Pythons, require_one_python
 from neuros.backends.node_command import without_mark
 from neuros.backends.placement import place, usable_cores
 from neuros.backends.reaper import Reaper
-from neuros.backends.registered import Chosen, choose
+from neuros.backends.registered import AUTO, Chosen, choose
 from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.installation.progress import Progress, Stream
@@ -26,7 +26,6 @@ from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.recording.selection import Request as RecordingRequest
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,
@@ -104,17 +103,13 @@ def _address(host: str) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and for how long."""
+    """A project, which of its nodes to start, where, and how."""
 
     project: Project
     names: tuple[str, ...]
     chosen: Chosen
-    duration: Duration
-    is_verbose: bool
-    is_placed: bool = True
+    request: Request
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
-    has_digests: bool = False
-    recording: RecordingRequest | None = None
     network: Network = THIS_MACHINE
     messages: Messages | None = None
 
@@ -165,19 +160,19 @@ class Plan:
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; ``reaper`` hears of all it starts."""
-        options: list[str] = ["--in-memory"] if self.back_end.is_one_process else []
-        if self.duration.sim_s is not None:
-            options += ["--duration-sim", repr(self.duration.sim_s)]
-        if self.is_verbose:
+        options = ["--in-memory"] if self.back_end.is_one_process else []
+        if self.request.end.sim_s is not None:
+            options += ["--duration-sim", repr(self.request.end.sim_s)]
+        if self.request.verbose:
             options.append("--debug")
-        if self.has_digests and self.back_end.is_one_process:  # elsewhere they are always kept
+        if self.request.digests and self.back_end.is_one_process:  # elsewhere always kept
             options.append("--digests")
-        if self.recording is not None:
+        if self.request.recording is not None:
             options.append("--record")
         return self.deployment.launcher(
             NodeProgram(
                 options,
-                place(self.nodes) if self.is_placed else {},
+                place(self.nodes) if self.request.placement else {},
                 self.pythons.paths,
                 reaper,
                 as_asked(os.environ),
@@ -200,25 +195,13 @@ def make_plan(
     network = chosen_network(request.network, request.peers)
     names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
-    chosen = choose(request.backend, project, nodes, request.backend_options)
+    chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
     back_end = chosen.back_end
     if back_end.is_one_process:
         _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
-    plan = Plan(
-        project,
-        names,
-        chosen,
-        request.duration,
-        request.is_verbose,
-        request.is_placed,
-        pythons,
-        has_digests=request.has_digests,
-        recording=request.recording,
-        network=network,
-        messages=messages,
-    )
+    plan = Plan(project, names, chosen, request, pythons, network, messages)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
             f"--network with -n: the nodes of the {back_end.name} back end reach none elsewhere;"
@@ -244,7 +227,7 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
             f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
             " install.py"
         )
-    if plan.is_placed:
+    if plan.request.placement:
         _check_cores(plan)
     is_one_process = plan.back_end.is_one_process
     if is_one_process:
@@ -304,7 +287,7 @@ def _nest_problems(plan: Plan) -> Sequence[Problem]:
 
 
 def _time_problems(plan: Plan) -> Sequence[Problem]:
-    if plan.duration.sim_s is None:
+    if plan.request.end.sim_s is None:
         return ()
     owners = [node.name for node in plan.nodes if node.owns_time]
     if len(owners) == 1:

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
 
 
-def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    replay = commands.add_parser(
-        "replay",
-        help="run one node of a run once more, or publish recorded topics",
-        description="With --node: run one node once more on exactly what it received, and compare"
+def add_replay(replay: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    replay.description = (
+        "With --node: run one node once more on exactly what it received, and compare"
         " what it sends, packet by packet. With --topic: publish recorded topics on the ROS graph,"
-        " spaced as they were sent.",
-        epilog="exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
-        " 4 the node needs what this machine does not have",
+        " spaced as they were sent."
+    )
+    replay.epilog = (
+        "exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
+        " 4 the node needs what this machine does not have"
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")
@@ -88,12 +88,10 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     add("-d", "--domain-id", type=int, metavar="ID", help="default: ROS_DOMAIN_ID, else 0")
     replay.set_defaults(command=_replay)
-    _add_replayed(commands)
 
 
-def _add_replayed(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """What ``replay --node`` becomes; it is not started by people."""
-    replayed = commands.add_parser("replayed", add_help=False)
+def add_replayed(replayed: argparse.ArgumentParser) -> None:
+    """Add the arguments of what ``replay --node`` becomes; people do not start it."""
     replayed.add_argument("node_file")
     replayed.add_argument("--run", required=True)
     replayed.add_argument("--pdb", action="store_true")

@@ -31,15 +31,15 @@ exit codes:
 """
 
 
-def add_build(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    build = commands.add_parser(
-        "build",
-        help="build message packages",
-        description="Build the ROS packages with messages, services and actions of a workspace"
-        " that are not built yet, and those of NeuROS's own. Launching a project does it, too.",
-        epilog="exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
-        " with its line, 4 no compiler, or it fails",
+def add_build(build: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    build.description = (
+        "Build the ROS packages with messages, services and actions of a workspace"
+        " that are not built yet, and those of NeuROS's own. Launching a project does it, too."
+    )
+    build.epilog = (
+        "exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
+        " with its line, 4 no compiler, or it fails"
     )
     build.add_argument("packages", nargs="*", metavar="PACKAGE", help="these only (default: all)")
     build.add_argument(
@@ -88,15 +88,10 @@ def _build(options: argparse.Namespace) -> int:
     return 0
 
 
-def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    containers = commands.add_parser(
-        "containers",
-        help="build, list and remove the images that nodes run in",
-        description="Build, list and remove the images that nodes run in.",
-        epilog=_CONTAINERS_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_containers(containers: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    containers.description = "Build, list and remove the images that nodes run in."
+    containers.epilog = _CONTAINERS_EPILOG
     actions = containers.add_subparsers(title="actions", metavar="ACTION", required=True)
     build = actions.add_parser("build", help="build what is missing or out of date")
     build.add_argument(
@@ -260,16 +255,13 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"
 
 
-def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    doctor = commands.add_parser(
-        "doctor",
-        help="check this machine, and prove that packets arrive",
-        description="Check what runs need of this machine, and prove with packets between two"
-        " nodes that they can talk, on each back end that there is.",
-        epilog=_DOCTOR_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_doctor(doctor: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    doctor.description = (
+        "Check what runs need of this machine, and prove with packets between two"
+        " nodes that they can talk, on each back end that there is."
     )
+    doctor.epilog = _DOCTOR_EPILOG
     doctor.add_argument(
         "--no-delivery", action="store_true", help="only look: start no nodes and no containers"
     )

@@ -7,7 +7,6 @@ images, the other answers with what it has read in them.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -26,6 +25,7 @@ from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
 from neuros.ports import BackEnd, Finding
+from neuros.recording.run_file import read_run_file
 
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")
@@ -205,7 +205,7 @@ def prove_delivery(backend: str, project: Path = PROJECT) -> Finding:
                 raise
         if launcher.returncode:
             return Finding.bad(subject, f"{backend}: failed", _last(output))
-        return _judge(backend, json.loads((run / "run.json").read_text("utf-8")))
+        return _judge(backend, read_run_file(run))
 
 
 def _judge(backend: str, record: dict[str, object]) -> Finding:

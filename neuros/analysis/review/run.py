@@ -1,4 +1,4 @@
-"""Run folder opened for review, also of a run that was cut off, or of an older version.
+"""Run folder opened for review, also of a run that was cut off.
 
 :mod:`neuros.analysis.run_record` refuses what it cannot rely on; a review shows what there is, and
 says what is missing.
@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from neuros.analysis.packets import FOLDER, Numbers, Packets, packet_figures, read_packets
-from neuros.analysis.run_record import FORMAT, connection_of
+from neuros.analysis.run_record import connection_of
 from neuros.backends.registered import ran_in_one_process
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection
 from neuros.recording.load_table import FILE_NAME
+from neuros.recording.run_file import RUN_FILE, read_run_file
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def open_for_review(folder: Path) -> Run:
     """Read what there is in a run folder.
 
     Raises:
-        UsageError: if no run has left it behind, the run goes on, or a newer version wrote it.
+        UsageError: if no run has left it behind, the run goes on, or another version wrote it.
     """
     try:
         record, missing = _read_record(folder)
@@ -105,23 +106,9 @@ def open_for_review(folder: Path) -> Run:
 
 
 def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    file = folder / "run.json"
-    try:
-        record = _json(file)
-    except FileNotFoundError:
+    if not (folder / RUN_FILE).exists():
         return _from_project(folder)
-    found = record.get("format", 1)
-    if not isinstance(found, int) or found > FORMAT:
-        raise UsageError(
-            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
-            " version that the run was made with"
-        )
-    if found == FORMAT:
-        return record, []
-    for index, each in enumerate(record.get("connections", ())):
-        each.setdefault("index", index)
-    why = f"run.json has format {found}: an older version of NeuROS wrote it, and kept less"
-    return record, [why]
+    return read_run_file(folder), []
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import sys
@@ -18,10 +17,11 @@ from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.bag.columns import Column, columns_of
 from neuros.recording.plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
+from neuros.recording.run_file import read_run_file
 from neuros.recording.stored import StoredTopics
 
 LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
@@ -242,9 +242,9 @@ def open_bag(run: str | os.PathLike[str]) -> Bag:
 def _recorded(run: Path) -> dict[str, int]:
     """By topic, the packets that were in the bag when the run ended, as far as is known."""
     try:
-        topics = json.loads((run / "run.json").read_text("utf-8"))["recording"]["topics"]
+        topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (UsageError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 
