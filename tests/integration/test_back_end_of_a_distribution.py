@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from neuros.cli.main import main
 from neuros.testing.back_ends import BackEndChecks, Launched, finish, launcher
 
 if sys.version_info >= (3, 11):
@@ -101,7 +100,7 @@ def test_a_name_that_is_none_is_refused_with_all_that_there_are() -> None:
 def test_what_is_broken_is_named_with_its_distribution(
     installed: Path, value: str, why: str
 ) -> None:
-    install(installed, "twin", {"process": "twin:X"})
+    install(installed, "bad", {"x": value})
     refused = neuros("launch", str(CLOCK), "--backend", "x")
     assert refused.returncode == 4
     assert f"back end 'x' of the distribution bad ({value}) {why}" in refused.stderr
@@ -132,11 +131,9 @@ def test_a_launch_by_name_asks_no_metadata() -> None:
     assert subprocess.run([sys.executable, "-S", "-c", program], check=False).returncode == 0
 
 
-def test_without_an_engine_it_is_still_only_taken_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_auto_takes_it_in_no_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no rank."""
     monkeypatch.setenv("DOCKER_HOST", f"unix://{tmp_path}/none.sock")
-    assert main(["launch", str(CLOCK), "--backend", "auto", "--dry-run"]) == 0
-    said = capsys.readouterr().out
+    said = neuros("launch", str(CLOCK), "--backend", "auto", "--dry-run").stdout
     assert said.startswith("back end process;")
     assert "each node runs in a process, not in a container: no Docker engine answers" in said
