@@ -302,6 +302,55 @@ class Simulator(Protocol):
         """Back to time zero and the initial state; unread packets are dropped."""
 
 
+class ControlStream(Protocol):
+    """Bytes between the supervisor and another process, in order, both ways.
+
+    A connected ``socket.socket`` is one.
+    """
+
+    def fileno(self) -> int:
+        """For selectors: readable when :meth:`recv` does not wait."""
+
+    def setblocking(self, flag: bool, /) -> None:
+        """Whether calls wait; else they raise ``BlockingIOError``."""
+
+    def recv(self, size: int, /) -> bytes:
+        """What has arrived; empty once the other end is gone. Raises ``OSError``."""
+
+    def send(self, data: bytes | bytearray, /) -> int:
+        """Send as much as can be; returns the number of bytes. Raises ``OSError``."""
+
+    def sendall(self, data: bytes, /) -> None:
+        """Send all. Raises ``OSError``."""
+
+    def close(self) -> None:
+        """Hang up."""
+
+
+class ControlListener(Protocol):
+    """The supervisor's end of the control channel, before others connect; from a back end."""
+
+    @property
+    def address(self) -> str:
+        """By which processes on this machine connect: ``unix:/runs/1/control.sock``."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """What remains where the launcher is killed."""
+
+    def open(self) -> None:
+        """Listen. Raises ``EnvironmentFault``."""
+
+    def fileno(self) -> int:
+        """For selectors: readable when somebody connects."""
+
+    def accept(self) -> ControlStream | None:
+        """The next connection; ``None`` if nobody waits."""
+
+    def close(self) -> None:
+        """Listen no more."""
+
+
 class RunningNode(Protocol):
     """A started process or container, and the nodes that live in it."""
 
@@ -406,6 +455,10 @@ class Deployment(ABC):
     def as_here(self, text: str, folders: Folders) -> str:
         """What a node has said, with the names that its paths have on this machine."""
         return text
+
+    def control_listener(self, run_folder: Path) -> ControlListener | None:
+        """Where node processes connect to the supervisor; ``None``: a socket in the run folder."""
+        return None
 
     def logs(self, run_folder: Path) -> Mapping[str, Path]:
         """Logs besides those of the nodes, by what is shown of their origin."""

@@ -13,11 +13,12 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any
 
+from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
-from neuros.control import connect
+from neuros.control import ControlLink, Interrupt
+from neuros.errors import EnvironmentFault
 
 _VARIABLE = "NEUROS_GUARDED_RUN"
 
@@ -34,6 +35,7 @@ class Session:
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
+        control: address of its control channel.
         user: number of the user whose run it is: that of its reaper, whatever that says.
     """
 
@@ -46,6 +48,7 @@ class Session:
     launcher: tuple[int, int]
     namespace: str = ""
     is_one_process: bool = False
+    control: str = ""
     user: int = field(default_factory=os.getuid)
 
     @property
@@ -71,19 +74,19 @@ class Session:
     def interrupt(self) -> None:
         """Ask its launcher to end it, as Ctrl+C does.
 
-        Over its control socket: where a Python program has started it, a signal would reach that
-        program, which may do something else meanwhile. A signal where that socket is not there yet.
+        Over its control channel: where a Python program has started it, a signal would reach that
+        program, which may do something else meanwhile. A signal where there is no channel yet.
         """
         if not self.is_led:
             return
         try:
-            lines = connect(Path(self.folder))
-        except OSError:
+            link = ControlLink(connect(self.control), (), "the supervisor")
+        except (OSError, EnvironmentFault):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
         else:
-            lines.send("signal")
-            lines.close()
+            link.send(Interrupt())
+            link.close()
 
 
 def reaper_environment(session: Session) -> dict[str, str]:

@@ -29,6 +29,7 @@ from neuros.backends.node_command import (
 )
 from neuros.backends.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.backends.run_processes import RUN_ID
+from neuros.control import CONTROL_VARIABLE
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import NodeFile
@@ -191,6 +192,8 @@ def _environment(
         **with_messages({"PYTHONPATH": str(LIBRARY)}, inside(file).messages),
         "ROS_LOG_DIR": str(FOLDERS.run),
     }
+    if address := added.get(CONTROL_VARIABLE):
+        environment[CONTROL_VARIABLE] = address.replace(str(file.folders.run), str(FOLDERS.run))
     if user.dds_settings:
         environment[DDS_SETTINGS] = str(DDS_FILE)
     if file.node.access.display and user.display:

@@ -19,12 +19,12 @@ from launching import EXAMPLES, Finished, Running, launch, start
 from virtual_display import virtual_display
 
 from containers import require_containers, wait_until
+from neuros.backends.control_sockets import SOCKET_NAME
 from neuros.backends.docker.engine import engine_socket
 from neuros.backends.docker.launcher import DockerLauncher, find_containers
 from neuros.backends.docker.settings import container_name, shared_memory
 from neuros.backends.run_processes import RUN_ID, environ_of
 from neuros.backends.sessions import Session, reaper_environment
-from neuros.control import SOCKET_NAME
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.load import load_project
