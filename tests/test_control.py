@@ -24,10 +24,8 @@ from neuros.control import (
     NodeStatus,
     Probed,
     Report,
-    decode,
-    encode,
-    kind_of,
 )
+from neuros.control.link import decode, encode, kind_of
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
@@ -97,12 +95,12 @@ def test_half_a_character_arrives_as_its_escape() -> None:
         (b'{"node": "a"}', "sent what is no control message"),
         (b'{"kind": "applaud"}', "sent a control message of the unknown kind 'applaud'"),
         (b'{"kind": ["stop"]}', "sent a control message of the unknown kind ['stop']"),
-        (b'{"kind": "probe"}', "sent a wrong control message 'probe': its field number is missing"),
-        (b'{"kind": "stop", "now": 1}', "wrong control message 'stop': it has no field now"),
-        (b'{"kind": "probe", "number": true}', "'probe': number is True, and must be int"),
-        (b'{"kind": "probe", "number": 1.5}', "'probe': number is 1.5, and must be int"),
-        (b'{"kind": "say", "text": null}', "'say': text is None, and must be str"),
-        (b'{"kind": "hello", "nodes": "ab"}', "'hello': nodes is 'ab', and must be a list"),
+        (b'{"kind": "probe"}', "sent a wrong control message 'probe': field number is missing"),
+        (b'{"kind": "stop", "now": 1}', "wrong control message 'stop': field now is unknown"),
+        (b'{"kind": "probe", "number": true}', "'probe': field number is True, and must be int"),
+        (b'{"kind": "probe", "number": 1.5}', "'probe': field number is 1.5, and must be int"),
+        (b'{"kind": "say", "text": null}', "'say': field text is None, and must be str"),
+        (b'{"kind": "hello", "nodes": "ab"}', "'hello': field nodes is 'ab', and must be a list"),
         (b'{"kind": "hello", "nodes": ["a", 2]}', "nodes[1] is 2, and must be str"),
         (
             b'{"kind": "report", "node": "a", "timeline": [[1]]}',
@@ -120,7 +118,7 @@ def test_half_a_character_arrives_as_its_escape() -> None:
         (
             b'{"kind": "ended", "exit_code": 0, "reason": "", "reports": {"a": {}},'
             b' "running_s": null}',
-            "its field reports['a'].node is missing",
+            "field reports['a'].node is missing",
         ),
     ],
 )

@@ -17,7 +17,8 @@ from typing import Any
 
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
-from neuros.control import ControlLink, Interrupt
+from neuros.control import Interrupt
+from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
 
 _VARIABLE = "NEUROS_GUARDED_RUN"

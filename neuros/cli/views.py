@@ -169,7 +169,8 @@ def add_view(view: argparse.ArgumentParser) -> None:
 def _run_view(_: argparse.Namespace) -> int:
     from neuros.backends.control_sockets import connect_by
     from neuros.backends.rerun import await_server
-    from neuros.control import TO_OBSERVERS, ControlLink
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
     from neuros.viewers.observer import look_on
     from neuros.viewers.rerun_feed import RerunFeed
     from neuros.viewers.visual_types import VisualTypes

@@ -14,11 +14,11 @@ import contextlib
 import selectors
 import socket
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
-    ControlLink,
     End,
     Ended,
     Hello,
@@ -33,8 +33,8 @@ from neuros.control import (
     Step,
     StepAll,
     Watch,
-    encode,
 )
+from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
 from neuros.launcher.outcome import Outcome, Output, Phase
 from neuros.ports import ControlListener
@@ -58,6 +58,7 @@ class Channels:
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
         self._unsent: dict[ControlLink, bytearray] = {}
+        self._nodes: dict[ControlLink, None] = {}  # in the order in which they said hello
         self._waker: socket.socket | None = None
 
     def wake_on(self, waker: socket.socket) -> None:
@@ -87,15 +88,15 @@ class Channels:
                 except BlockingIOError:
                     break
                 for line in lines or ():
-                    yield link, _message_in(line, link)
+                    yield link, self._message_in(line, link)
                 if lines is None:
                     self.hang_up(link)
                 if link not in self._unsent:
                     break
 
     def send(self, message: Message) -> None:
-        """Send to all."""
-        for link in tuple(self._unsent):
+        """Send to all node processes."""
+        for link in tuple(self._nodes):
             self.send_to(link, message)
 
     def send_to(self, link: ControlLink, message: Message) -> None:
@@ -103,6 +104,10 @@ class Channels:
         if link in self._unsent and len(self._unsent[link]) < _MOST_UNSENT_BYTES:
             self._unsent[link] += encode(message)
             self._flush(link)
+
+    def is_node(self, link: ControlLink) -> bool:
+        """Whether a node process is, or was, at the other end."""
+        return link in self._nodes
 
     def has(self, link: ControlLink) -> bool:
         """Whether that one is still connected."""
@@ -134,6 +139,19 @@ class Channels:
             self._unsent[link] = bytearray()
             self._selector.register(link, selectors.EVENT_READ)
 
+    def _message_in(self, line: bytes, link: ControlLink) -> Message | ControlError:
+        """The message, after which it is known who is at the other end; else why there is none."""
+        try:
+            message = link.decode(line)
+        except ControlError as error:
+            return error
+        if isinstance(message, Hello):
+            self._nodes[link] = None
+            link.peer = f"the process of {' and '.join(message.nodes)}"
+        elif isinstance(message, Watch):
+            link.peer = "an observer"
+        return message
+
     def _flush(self, link: ControlLink) -> None:
         unsent = self._unsent[link]
         # An error shows again, and is dealt with, when we read.
@@ -142,69 +160,51 @@ class Channels:
                 del unsent[: link.stream.send(unsent)]
 
 
-def _message_in(line: bytes, link: ControlLink) -> Message | ControlError:
-    """The message, after which it is known who is at the other end; else why there is none."""
-    try:
-        message = link.decode(line)
-    except ControlError as error:
-        return error
-    if isinstance(message, Hello):
-        link.peer = f"the process of {' and '.join(message.nodes)}"
-    elif isinstance(message, Watch):
-        link.peer = "an observer"
-    return message
-
-
+@dataclass
 class PauseState:
     """The pause of a run, and the time that it has been paused in all.
 
-    Args:
+    Attributes:
         send: to all nodes.
         clock: monotonic, seconds.
+        since_s: when the run was paused, on the clock; ``None`` while it is not.
     """
 
-    def __init__(self, send: Callable[[Message], object], clock: Callable[[], float]) -> None:
-        self._send = send
-        self._clock = clock
-        self._since_s: float | None = None
-        self._before_s = 0.0
+    send: Callable[[Message], object]
+    clock: Callable[[], float]
+    since_s: float | None = None
+    _before_s: float = 0.0
 
     @property
     def is_on(self) -> bool:
         """Whether the run is paused now."""
-        return self._since_s is not None
-
-    @property
-    def since_s(self) -> float | None:
-        """When it was paused, on the clock."""
-        return self._since_s
+        return self.since_s is not None
 
     @property
     def total_s(self) -> float:
         """Seconds of pause so far."""
-        since_s = self._since_s
-        return self._before_s + (0.0 if since_s is None else self._clock() - since_s)
+        return self._before_s + (0.0 if self.since_s is None else self.clock() - self.since_s)
 
     def begin(self) -> None:
         """Let no hook start."""
-        if self._since_s is None:
-            self._since_s = self._clock()
-            self._send(Pause())
+        if self.since_s is None:
+            self.since_s = self.clock()
+            self.send(Pause())
 
     def end(self) -> None:
         """Let the run go on."""
-        if self._since_s is not None:
+        if self.since_s is not None:
             self.forget()
-            self._send(Resume())
+            self.send(Resume())
 
     def forget(self) -> None:
         """The pause is over without a request: nodes that drain go on by themselves."""
-        self._before_s, self._since_s = self.total_s, None
+        self._before_s, self.since_s = self.total_s, None
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """Let a paused run do so many steps."""
-        if self._since_s is not None and count > 0:
-            self._send(Step(count, is_driven))
+        if self.since_s is not None and count > 0:
+            self.send(Step(count, is_driven))
 
 
 class Observers:
@@ -277,12 +277,12 @@ class Observers:
         self.tell(Ended(outcome.exit_code, outcome.reason, outcome.reports, outcome.running_s))
 
 
+@dataclass
 class Overheard:
     """An output for people whose records observers get, too."""
 
-    def __init__(self, output: Output, tell: Callable[[Message], object]) -> None:
-        self._output = output
-        self._tell = tell
+    _output: Output
+    _tell: Callable[[Message], object]
 
     def log(self, severity: str, text: str) -> None:
         self._output.log(severity, text)

@@ -11,10 +11,12 @@ import signal
 import socket
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from neuros import control
-from neuros.control import ControlLink, Message, Report
+from neuros.control import Message, Report
+from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, Overheard, PauseState
 from neuros.launcher.declarations import Declarations
@@ -44,38 +46,27 @@ _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
 
 
+@dataclass
 class Shutdown:
     """Shutdown of a run: its phases, and the events that end each of them.
 
     Running, then perhaps draining, then stopping, and at worst killed; never back.
 
     Args:
-        signals: numbers of the signals that have arrived, appended to by a signal handler.
+        _signals: numbers of the signals that have arrived, appended to by a signal handler.
     """
 
-    def __init__(
-        self,
-        channels: Channels,
-        processes: Processes,
-        detector: StallDetector,
-        declarations: Declarations,
-        probing: Probing,
-        peers: Peers,
-        outcome: Outcome,
-        output: Output,
-        signals: list[int],
-    ) -> None:
-        self.phase = Phase.RUNNING
-        self._deadline_s = 0.0
-        self._channels = channels
-        self._processes = processes
-        self._detector = detector
-        self._declarations = declarations
-        self._probing = probing
-        self._peers = peers
-        self._outcome = outcome
-        self._output = output
-        self._signals = signals
+    _channels: Channels
+    _processes: Processes
+    _detector: StallDetector
+    _declarations: Declarations
+    _probing: Probing
+    _peers: Peers
+    _outcome: Outcome
+    _output: Output
+    _signals: list[int]
+    phase: Phase = Phase.RUNNING
+    _deadline_s: float = 0.0
 
     @property
     def is_hopeless(self) -> bool:
@@ -281,12 +272,8 @@ class Supervisor:
         self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
         self._backlog = Backlog(connections)
-        self._probing = Probing(
-            names,
-            connections,
-            self._channels.send,
-            self._peers if self._peers.exist else None,
-        )
+        peers_to_ask = self._peers if self._peers.exist else None
+        self._probing = Probing(names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
         self._shutdown = Shutdown(
             self._channels,
@@ -307,7 +294,6 @@ class Supervisor:
             lambda reason: self._shutdown.drain(reason, STOP_S),
         )
         self._signals = signals
-        self._nodes: set[ControlLink] = set()
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
@@ -349,7 +335,7 @@ class Supervisor:
 
     def _refuse(self, link: ControlLink, error: ControlError) -> None:
         """A message was not understood: without it, nothing is known of a node for sure."""
-        if link in self._nodes:
+        if self._channels.is_node(link):
             self._shutdown.fail(f"control channel: {error}")
         elif self._channels.has(link):
             self._channels.hang_up(link)
@@ -387,7 +373,6 @@ class Supervisor:
                 self.observers.take(link, message)
 
     def _on_hello(self, link: ControlLink, nodes: Sequence[str]) -> None:
-        self._nodes.add(link)
         self._detector.greet(nodes)
         if self._peers.exist:
             self._channels.send_to(link, control.Say(self._peers.own_state))

@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from neuros import control
-from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, ControlLink, Message
+from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
+from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
 from neuros.errors import ControlError, NeurosError

@@ -6,15 +6,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
-from neuros.control import (
-    HookDeclaration,
-    Hooks,
-    LiveCounters,
-    Metrics,
-    NodeStatus,
-    Probed,
-    Report,
-)
+from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeStatus, Probed, Report
 from neuros.engine.engine import Engine
 from neuros.engine.explain import explain
 from neuros.engine.snapshot import snapshot, steadily

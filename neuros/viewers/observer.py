@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuros.control import ControlLink, LookAll, NodeStatus, Watch
+from neuros.control import LookAll, NodeStatus, Watch
+from neuros.control.link import ControlLink
 from neuros.viewers.visual_types import Mark, VisualTypes
 
 _PERIOD_S = 0.2

@@ -11,7 +11,8 @@ import pytest
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised
 
 from neuros.backends.control_sockets import UnixListener, connect, connect_by
-from neuros.control import CONTROL_VARIABLE, TO_NODES, ControlLink, Hello, Stop
+from neuros.control import CONTROL_VARIABLE, TO_NODES, Hello, Stop
+from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
 from neuros.launcher.channels import Channels
 

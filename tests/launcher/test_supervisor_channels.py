@@ -11,16 +11,8 @@ from typing import Any
 import pytest
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.control import (
-    TO_NODES,
-    ControlLink,
-    Explanation,
-    Failed,
-    Hello,
-    Probe,
-    Stop,
-    kind_of,
-)
+from neuros.control import TO_NODES, Explanation, Failed, Hello, Probe, Stop, Watch
+from neuros.control.link import ControlLink, kind_of
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels
 
@@ -90,27 +82,33 @@ def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
         "a program that has not said what it is sent what is no control"
     )
     assert str(known) == (
-        "the process of a and b sent a wrong control message 'first_hook':"
-        " its field node is missing"
+        "the process of a and b sent a wrong control message 'first_hook': field node is missing"
     )
     channels.hang_up(link)
     node.socket.settimeout(5.0)
     assert node.receive() is None
 
 
-def test_all_are_told(channels: Channels, node: Node, tmp_path: Path) -> None:
-    other = Node(tmp_path)
-    assert kinds(channels) == []
+def test_all_nodes_are_told(channels: Channels, node: Node, tmp_path: Path) -> None:
+    other, observer = Node(tmp_path), Node(tmp_path)
+    for lines in (node, other):
+        lines.send(Hello(("a",)))
+    observer.send(Watch())
+    assert sorted(kinds(channels)) == ["hello", "hello", "watch"]
     channels.send(Probe(3))
     for lines in (node, other):
         assert lines.receive() == [Probe(3)]
+    observer.socket.setblocking(False)
+    assert observer.receive() == [], "it is no node"
     other.close()
+    observer.close()
 
 
 def test_one_that_does_not_read_holds_up_nobody_and_misses_nothing(
     channels: Channels, node: Node
 ) -> None:
-    assert kinds(channels) == []
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
     node.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     start_s = time.monotonic()
     for number in range(5000):
@@ -125,7 +123,8 @@ def test_one_that_does_not_read_holds_up_nobody_and_misses_nothing(
 
 
 def test_one_that_has_gone_is_no_error(channels: Channels, node: Node) -> None:
-    assert kinds(channels) == []
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
     node.close()
     channels.send(Stop())
     assert kinds(channels) == []

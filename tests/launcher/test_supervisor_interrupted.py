@@ -220,10 +220,10 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
     ("message", "complaint"),
     [
         ("host.tell('applaud')", "sent a control message of the unknown kind 'applaud'"),
-        ("host.tell('failed')", "sent a wrong control message 'failed': its field text is missing"),
+        ("host.tell('failed')", "sent a wrong control message 'failed': field text is missing"),
         (
             "host.report(sim_time='noon')",
-            "sent a wrong control message 'report': sim_time is 'noon', and must be float",
+            "sent a wrong control message 'report': field sim_time is 'noon', and must be float",
         ),
     ],
 )

@@ -7,14 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.control import (
-    TO_OBSERVERS,
-    ControlLink,
-    LookAll,
-    NodeStatus,
-    PhaseChanged,
-    Watch,
-)
+from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, PhaseChanged, Watch
+from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels
 from neuros.viewers.observer import look_on
 from neuros.viewers.visual_types import Mark, Numbers, VisualTypes

@@ -15,7 +15,6 @@ from statistics import fmean
 from typing import Any
 
 from neuros.control import (
-    ControlLink,
     Ended,
     LogRecord,
     LookAll,
@@ -26,6 +25,7 @@ from neuros.control import (
     Report,
     Watch,
 )
+from neuros.control.link import ControlLink
 from neuros.engine.time_budget import time_budget_of
 from neuros.errors import ControlError
 from neuros.viewers.dashboard.pages import Pages, data_url
