@@ -1,4 +1,4 @@
-"""What a plugin imports: the decorators that mark its hooks, and the wrappers of its ports.
+"""Decorators that mark the hooks of a plugin, and wrappers of their ports.
 
 A decorator marks and does not wrap: it attaches a :class:`HookSpec` to the function and returns
 the function itself, which therefore stays callable in a unit test. The node collects the marks of

@@ -86,6 +86,24 @@ class Option:
         return f"{self.help} ({also})" if also else self.help
 
     @property
+    def all_flags(self) -> tuple[str, ...]:
+        """Its flags, with those that switch it off."""
+        negated = [f"--no-{flag[2:]}" for flag in self.flags if flag.startswith("--")]
+        return (*self.flags, *(negated if self.is_negatable else ()))
+
+    @property
+    def has_value(self) -> bool:
+        """Whether a value stands behind its flag."""
+        return not (self.is_negatable or isinstance(self.default, bool))
+
+    @property
+    def value_text(self) -> str:
+        """What stands for its value in help texts."""
+        if self.choices is not None and not self.metavar:
+            return "{" + ",".join(self.choices() if callable(self.choices) else self.choices) + "}"
+        return self.metavar or self.name.upper()
+
+    @property
     def default_text(self) -> str:
         """Its default in words; empty where it is nothing, or a switch that is off."""
         has_default = not isinstance(self.default, bool) and self.default not in (None, ())
@@ -194,7 +212,7 @@ def _keywords(option: Option) -> dict[str, Any]:
     """What else ``argparse`` is to know of an option."""
     if option.is_negatable:
         return {"action": argparse.BooleanOptionalAction, "default": option.default}
-    if isinstance(option.default, bool):
+    if not option.has_value:
         return {"action": "store_false" if option.default else "store_true"}
     keywords: dict[str, Any] = {"metavar": option.metavar, "type": option.parse}
     if option.choices is not None:

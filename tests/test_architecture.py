@@ -94,6 +94,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "messages.checking": {"rosidl_adapter"},
     "messages.generation": GENERATORS,
     "messages.compilation": {"numpy"},
+    "cli.main": {"argcomplete"},
     "cli.runs": {"tabulate"},
     "replay.debugging": {"debugpy"},
     "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},

@@ -99,7 +99,7 @@ def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
     model = _model(models[0], node, project)
     if model is None:
         return
-    from neuros.simulators.mujoco.timebase import Timebase
+    from neuros.simulators.mujoco.timing import Timebase
     from neuros.simulators.mujoco.world import timestep_of
 
     try:

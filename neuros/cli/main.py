@@ -106,12 +106,14 @@ def console_script() -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command; returns its exit code. Errors are written for the user."""
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what fits: this ends the process
+        _complete(os.environ.get("COMP_LINE", ""))
     _open_standard_streams()
     if not arguments:
         parser("").print_help(sys.stderr)
         return EXIT_USAGE
     try:
-        command = next((each for each in arguments if not each.startswith("-")), "")
+        command = _command_in(arguments)
         options = parser(command).parse_args(arguments)
         if command != "launch":  # that has Ctrl+C wait until it can heed it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -154,6 +156,27 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     for name, each in COMMANDS.items():
         each.add_to(commands, name, is_whole=command in (None, name))
     return result
+
+
+def _command_in(words: Sequence[str]) -> str:
+    return next((word for word in words if not word.startswith("-")), "")
+
+
+def _complete(line: str) -> None:
+    """Answer a shell that completes a command line of ``neuros`` or ``launch.py``."""
+    import argcomplete
+
+    program, *words = line.split() or [""]
+    is_launch = program.endswith("launch.py")
+    completed = parser("launch" if is_launch else _command_in(words))
+    if is_launch:
+        completed = next(
+            action.choices["launch"]
+            for action in completed._actions
+            if isinstance(action, argparse._SubParsersAction)
+        )
+    hidden = [name for name, command in COMMANDS.items() if not command.help]
+    argcomplete.autocomplete(completed, exclude=hidden)
 
 
 def _complain(text: str) -> None:

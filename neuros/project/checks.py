@@ -1,34 +1,52 @@
-"""Checks that a schema cannot express: the parts of a project fit together.
+"""Checks that a schema cannot express: the parts of a project, and its plugins, fit together.
 
-All of it works on files that violate the schema elsewhere: what has the wrong form is passed over
-here, as the schema has reported it, and what depends on it is not guessed.
+They also work on files that violate the schema elsewhere. They pass over what has the wrong form,
+which the schema reports, and guess nothing that depends on it. Plugins are read, not run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 
 from neuros.errors import Problem
-from neuros.project.gazebo import remarks_on_gazebo
 from neuros.project.message_types import normalised
-from neuros.project.names import INTERNAL, MOST_CHARACTERS, Names
-from neuros.project.parameters import parameter_mistakes
+from neuros.project.model import Connection, Node
+from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.source import Element
+from neuros.project.plugin_files import DeclaredHook, PluginFile, Remark, read_plugin
+from neuros.project.scanner import Element, display_name
 from neuros.project.suggest import did_you_mean
 
 Side = Literal["inputs", "outputs"]
+_SIDES: tuple[Side, ...] = ("inputs", "outputs")
 _LONGEST_PART = len("/data")
-
-
-@dataclass
-class _Ports:
-    """The ports of one node by side and name; a side that could not be read is incomplete."""
-
-    by_side: dict[Side, dict[str, Element]] = field(default_factory=dict)
-    incomplete: set[Side] = field(default_factory=set)
+_INT64 = 1 << 63
+# ROS declares these itself, and passes over what is neither true nor false.
+_TRUTH_VALUES = ("use_sim_time", "start_type_description_service")
+_STAND_INS: Mapping[str, str] = {"neuros_gazebo": "neuros_mujoco"}
+_GAZEBO_PREFIXES = ("GZ_", "IGN_", "GAZEBO_")
+_GAZEBO_FOLDERS = ("GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH")
+_MOST_FILES = 400
+_MOST_FOLDERS = 2000
+_VARIABLE = re.compile(r"[A-Za-z_]\w*")
+# A variable that is not named by a literal may be any.
+_COMPUTED = re.compile(
+    r"\benviron\b(?!\s*\[\s*[\"']|\.(?:get|setdefault|pop)\(\s*[\"']|\s*$)|\bgetenv\((?!\s*[\"'])",
+    re.MULTILINE,
+)
+# Read by Python, libraries, drivers, and ROS.
+_KNOWN_PREFIXES = (
+    *("PYTHON", "LD_", "LC_", "LANG", "TZ", "HOME", "PATH", "TMP", "XDG_", "DISPLAY", "QT_"),
+    *("OMP_", "OPENBLAS_", "MKL_", "KMP_", "GOMP_", "BLIS_", "NUMEXPR_", "VECLIB_", "MALLOC_"),
+    *("NUMBA_", "TF_", "XLA_", "JAX_", "CUDA", "NVIDIA_", "TORCH_", "PYTORCH_", "HF_", "KERAS_"),
+    *("MUJOCO_", "PYOPENGL_", "EGL_", "LIBGL_", "MESA_", "GALLIUM_", "VK_", "__GL", "DRI_"),
+    *("ROS_", "RMW_", "RCUTILS_", "RCL_", "FASTRTPS_", "FASTDDS_", "CYCLONEDDS_", "AMENT_"),
+    *("NEST_", "MPL", "MATPLOTLIB", "GZ_", "IGN_", "GAZEBO_", "SDF_", "HTTP", "NO_PROXY", "SSL_"),
+)
 
 
 def mistakes(parsed: ParsedProject) -> list[Problem]:
@@ -39,14 +57,24 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
         *_duplicate_connections(parsed),
         *_connection_ends(parsed),
         *_budget_mistakes(parsed),
-        *_ros_graph_mistakes(parsed),
-        *parameter_mistakes(parsed),
+        *_qos_of_connections(parsed),
+        *_rules_without_sense(parsed),
+        *_long_names(parsed),
+        *_parameter_mistakes(parsed),
     ]
 
 
 def remarks(parsed: ParsedProject) -> list[Problem]:
     """What is allowed, but may be a mistake. For a project without mistakes."""
-    return sorted([*remarks_on_gazebo(parsed), *_unconnected(parsed), *_ros_graph_remarks(parsed)])
+    return sorted([*_gazebo_remarks(parsed), *_unconnected(parsed), *_qos_without_effect(parsed)])
+
+
+def _all_ports(parsed: ParsedProject) -> Iterator[tuple[Element, Side, str]]:
+    """Every port with its side and the name of its node."""
+    for node in parsed.nodes:
+        for side in _SIDES:
+            for port in node.items(side):
+                yield port, side, node.string("name") or ""
 
 
 def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
@@ -59,7 +87,7 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
         if other is node:
             continue
         if other.source.file == node.source.file and other.pointer == node.pointer:
-            # One node file, used twice: the places of the names are the same.
+            # One node file, used twice: both names have one place.
             yield entry.problem(f"the node name '{name}' occurs twice", _where(other_entry))
             continue
         text = f"the node name '{name}' occurs twice"
@@ -70,7 +98,7 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
 
 def _duplicate_ports(parsed: ParsedProject) -> Iterator[Problem]:
     for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
+        for side in _SIDES:
             first: dict[str, Element] = {}
             for port in node.items(side):
                 name = port.string("name")
@@ -81,56 +109,60 @@ def _duplicate_ports(parsed: ParsedProject) -> Iterator[Problem]:
 
 
 def _duplicate_connections(parsed: ParsedProject) -> Iterator[Problem]:
-    first: dict[tuple[str | None, ...], Element] = {}
+    first: dict[str, Element] = {}
     for connection in parsed.connections:
-        ends = tuple(connection.string(end) for end in ENDS)
-        if None not in ends and first.setdefault(ends, connection) is not connection:
-            yield connection.problem(
-                f"the connection {_named(ends)} occurs twice", _where(first[ends])
-            )
+        name = _connection_name(connection)
+        if name is not None and first.setdefault(name, connection) is not connection:
+            yield connection.problem(f"the connection {name} occurs twice", _where(first[name]))
 
 
 def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
-    nodes = _ports_by_node(parsed)
+    nodes: dict[str, list[Element]] = {}
+    for node in parsed.nodes:
+        nodes.setdefault(node.string("name") or "", []).append(node)
     all_known = parsed.is_complete and all(node.string("name") for node in parsed.nodes)
     for connection in parsed.connections:
         found: list[Element] = []
-        sides: tuple[tuple[str, str, Side], ...] = (
+        for node_key, port_key, side in (
             ("source_node", "source_output", "outputs"),
             ("destination_node", "destination_input", "inputs"),
-        )
-        for node_key, port_key, side in sides:
-            node, port = connection.string(node_key), connection.string(port_key)
-            if node is None:
+        ):
+            name, port = connection.string(node_key), connection.string(port_key)
+            if name is None:
                 continue
-            if node not in nodes:
-                if all_known and node:
-                    hint = did_you_mean(node, nodes)
-                    yield connection.value[node_key].problem(f"there is no node '{node}'", hint)
+            if name not in nodes:
+                if all_known and name:
+                    hint = did_you_mean(name, nodes)
+                    yield connection.value[node_key].problem(f"there is no node '{name}'", hint)
                 continue
-            result = _port(nodes[node], node, port, side) if port else None
-            if isinstance(result, Element):
-                found.append(result)
-                if result.member("external_topic") is not None:
+            end = _port(nodes[name], name, port, side) if port else None
+            if isinstance(end, Element):
+                found.append(end)
+                if end.member("external_topic") is not None:
                     yield connection.value[port_key].problem(
-                        f"{side[:-1]} '{port}' of node '{node}' has an external topic, so it "
+                        f"{side[:-1]} '{port}' of node '{name}' has an external topic, so it "
                         "cannot be connected",
-                        _where(result, "external_topic"),
+                        _where(end, "external_topic"),
                     )
-            elif result is not None:
-                yield connection.value[port_key].problem(*result)
+            elif end is not None:
+                yield connection.value[port_key].problem(*end)
         yield from _different_types(connection, found)
 
 
-def _port(ports: _Ports, node: str, port: str, side: Side) -> Element | tuple[str, str] | None:
-    """The port, or what is wrong with it, or ``None`` if that cannot be known."""
-    if port in ports.by_side[side]:
-        return ports.by_side[side][port]
-    if side in ports.incomplete:
+def _port(
+    nodes: Sequence[Element], node: str, port: str, side: str
+) -> Element | tuple[str, str] | None:
+    """The port of the nodes of one name, or what is wrong with it; ``None`` if that is unknown."""
+    ports = [each for node_ in nodes for each in node_.items(side)]
+    names = [each.string("name") for each in ports]
+    if port in names:
+        return ports[names.index(port)]
+    members = [member for node_ in nodes if (member := node_.member(side))]
+    if None in names or not all(isinstance(member.value, list) for member in members):
         return None
-    other: Side = "outputs" if side == "inputs" else "inputs"
-    hint = did_you_mean(port, ports.by_side[side])
-    if port in ports.by_side[other]:
+    other = "outputs" if side == "inputs" else "inputs"
+    hint = did_you_mean(port, filter(None, names))
+    if any(each.string("name") == port for node_ in nodes for each in node_.items(other)):
         hint = f"it has an {other[:-1]} of that name"
     return f"node '{node}' has no {side[:-1]} '{port}'", hint
 
@@ -151,47 +183,12 @@ def _unconnected(parsed: ParsedProject) -> Iterator[Problem]:
         for connection in parsed.connections
         for side, node, port in (("outputs", *ENDS[:2]), ("inputs", *ENDS[2:]))
     }
-    for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
-            for port in node.items(side):
-                key = (side, node.string("name"), port.string("name"))
-                # A sensor may be read by the plugin alone, for a message of the user's own.
-                is_sensor = side == "outputs" and port.member("mujoco") is not None
-                if not (key in used or is_sensor or port.member("external_topic")):
-                    yield port.problem(
-                        f"{side[:-1]} '{key[2]}' of node '{key[1]}' is not connected"
-                    )
-
-
-def _ports_by_node(parsed: ParsedProject) -> dict[str, _Ports]:
-    nodes: dict[str, _Ports] = {}
-    for node in parsed.nodes:
-        ports = nodes.setdefault(node.string("name") or "", _Ports())
-        sides: tuple[Side, ...] = ("inputs", "outputs")
-        for side in sides:
-            named = ports.by_side.setdefault(side, {})
-            items = node.items(side)
-            for port in items:
-                named.setdefault(port.string("name") or "", port)
-            member = node.member(side)
-            is_list = member is None or isinstance(member.value, list)
-            if not is_list or any(port.string("name") is None for port in items):
-                ports.incomplete.add(side)
-    return nodes
-
-
-def _named(ends: tuple[str | None, ...]) -> str:
-    return f"{ends[0]}.{ends[1]} -> {ends[2]}.{ends[3]}"
-
-
-def _where(element: Element, key: str = "") -> str:
-    """Where the other one is, for a hint."""
-    place = element.value[key] if key else element
-    line, column = place.source.place(place.start)
-    return f"see {place.source.name}:{line}:{column}"
-
-
-# ---------------------------------------------------------------------- budgets
+    for port, side, node in _all_ports(parsed):
+        name = port.string("name")
+        # A sensor may be read by the plugin alone, for a message of the user's own.
+        is_sensor = side == "outputs" and port.member("mujoco") is not None
+        if not ((side, node, name) in used or is_sensor or port.member("external_topic")):
+            yield port.problem(f"{side[:-1]} '{name}' of node '{node}' is not connected")
 
 
 def _budget_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
@@ -216,31 +213,18 @@ def _connection_name(connection: Element) -> str | None:
     return f"{source}.{output} -> {destination}.{input_}"
 
 
+def _where(element: Element, key: str = "") -> str:
+    """Where the other one is, for a hint."""
+    place = element.value[key] if key else element
+    line, column = place.source.place(place.start)
+    return f"see {place.source.name}:{line}:{column}"
+
+
 # ---------------------------------------------------------------------- ROS graph
 
 
-def _ros_graph_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
-    """QoS where there is none to choose, rules for nothing, and names that are too long."""
-    names = names_of(parsed)
-    yield from _qos_of_connections(parsed)
-    yield from _rules_without_sense(parsed, names)
-    yield from _long_names(parsed, names)
-
-
-def _ros_graph_remarks(parsed: ParsedProject) -> Iterator[Problem]:
-    """QoS that does not do what it seems to."""
-    for port, _, _ in _all_ports(parsed):
-        qos = port.member("qos")
-        if qos is None or qos.string("durability") != "transient_local":
-            continue
-        if qos.string("reliability") == "best_effort":
-            yield qos.problem(
-                "transient_local has no effect with best_effort: who comes later gets nothing",
-                "make it reliable",
-            )
-
-
 def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
+    """QoS where there is none to choose."""
     for port, side, _ in _all_ports(parsed):
         qos = port.member("qos")
         if qos is not None and port.member("external_topic") is None:
@@ -250,9 +234,20 @@ def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
             )
 
 
-def _rules_without_sense(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
-    nodes = {node.string("name") or "": node for node in parsed.nodes}
-    remap = parsed.root.member("remap")
+def _qos_without_effect(parsed: ParsedProject) -> Iterator[Problem]:
+    for port, _, _ in _all_ports(parsed):
+        qos = port.member("qos")
+        policies = qos and (qos.string("reliability"), qos.string("durability"))
+        if qos is not None and policies == ("best_effort", "transient_local"):
+            yield qos.problem(
+                "transient_local has no effect with best_effort: who comes later gets nothing",
+                "make it reliable",
+            )
+
+
+def _rules_without_sense(parsed: ParsedProject) -> Iterator[Problem]:
+    names, remap = names_of(parsed), parsed.root.member("remap")
+    nodes = [node.string("name") or "" for node in parsed.nodes]
     for rule in rules_of(remap):
         assert remap is not None
         only, _, old = rule.rpartition(":")
@@ -267,7 +262,8 @@ def _rules_without_sense(parsed: ParsedProject, names: Names) -> Iterator[Proble
             )
 
 
-def _long_names(parsed: ParsedProject, names: Names) -> Iterator[Problem]:
+def _long_names(parsed: ParsedProject) -> Iterator[Problem]:
+    names = names_of(parsed)
     for port, _, node in _all_ports(parsed):
         topic = port.string("external_topic")
         if topic is not None:
@@ -287,9 +283,219 @@ def _too_long(topic: str) -> str:
     return f"the topic {topic} is longer than the {MOST_CHARACTERS} characters that ROS allows"
 
 
-def _all_ports(parsed: ParsedProject) -> Iterator[tuple[Element, str, str]]:
-    """Every port with its side and the name of its node."""
+# ---------------------------------------------------------------------- parameters of ROS
+
+
+def _parameter_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
+    """What ROS has no type for, and names that occur twice."""
     for node in parsed.nodes:
-        for side in ("inputs", "outputs"):
-            for port in node.items(side):
-                yield port, side, node.string("name") or ""
+        parameters = node.member("parameters")
+        if parameters is not None and isinstance(parameters.value, dict):
+            yield from _group_mistakes(parameters, "", {})
+
+
+def _group_mistakes(group: Element, prefix: str, seen: dict[str, Element]) -> Iterator[Problem]:
+    for name, member in group.value.items():
+        full = prefix + name
+        if isinstance(member.value, dict):
+            yield from _group_mistakes(member, f"{full}.", seen)
+            continue
+        if seen.setdefault(full, member) is not member:
+            yield member.key_problem(f"the parameter '{full}' occurs twice")
+        if full in _TRUTH_VALUES and not isinstance(member.value, bool):
+            yield member.problem("must be true or false, as ROS declares it")
+        values = member.value if isinstance(member.value, list) else [member]
+        kinds = {_ros_kind(each.value) for each in values}
+        if len(kinds) > 1:
+            yield member.problem(
+                f"the list has {' and '.join(sorted(kinds))}", "ROS has lists of one kind only"
+            )
+        for each in values:
+            if type(each.value) is int and not -_INT64 <= each.value < _INT64:
+                yield each.problem("is too large for an integer of ROS, which has 64 bits")
+
+
+def _ros_kind(value: object) -> str:
+    """What ROS tells apart."""
+    if isinstance(value, bool):
+        return "truth values"
+    if isinstance(value, int | float):
+        return "numbers"
+    return "texts" if isinstance(value, str) else "other values"
+
+
+# ---------------------------------------------------------------------- Gazebo, of NeuROS 1.0
+
+
+def container_in_place_of(name: str) -> str:
+    """The container that a node runs in; another one only where Gazebo's was asked for."""
+    return _STAND_INS.get(name, name)
+
+
+def is_for_gazebo(variable: str) -> bool:
+    """Whether an environment variable is one of Gazebo's, so that its path need not exist."""
+    return variable.startswith(_GAZEBO_PREFIXES)
+
+
+def _gazebo_remarks(parsed: ParsedProject) -> Iterator[Problem]:
+    """What has no meaning here, by node: its container, its environment, its ports."""
+    for node in parsed.nodes:
+        container = node.string("container") or ""
+        if container in _STAND_INS:
+            yield node.value["container"].problem(
+                f"Gazebo is not supported: the node runs in '{_STAND_INS[container]}' instead of"
+                f" '{container}'"
+            )
+        yield from _gazebo_variables(parsed, node)
+        yield from _gazebo_ports(node)
+
+
+def _gazebo_variables(parsed: ParsedProject, node: Element) -> Iterator[Problem]:
+    environment = node.member("environment")
+    if environment is None or not isinstance(environment.value, dict):
+        return
+    for name, member in environment.value.items():
+        if not is_for_gazebo(name):
+            continue
+        if name not in _GAZEBO_FOLDERS:
+            yield member.key_problem(f"'{name}' is for Gazebo and has no effect")
+        elif not parsed.roots.finds(member.value, member.source.folder):
+            yield member.problem(f"'{name}' is left out: there is no folder '{member.value}'")
+
+
+def _gazebo_ports(node: Element) -> Iterator[Problem]:
+    every = [*node.items("inputs"), *node.items("outputs")]
+    ports = [port for port in every if port.member("gazebo_type") is not None]
+    if not ports:
+        return
+    names = ", ".join(f"'{port.string('name')}'" for port in ports)
+    has = "port has" if len(ports) == 1 else "ports have"
+    bound = any(port.member("external_topic") is not None for port in ports)
+    topics = "; their external topics are plain ROS topics, without a bridge" if bound else ""
+    yield (
+        ports[0]
+        .value["gazebo_type"]
+        .key_problem(
+            f"Gazebo itself is not supported: {len(ports)} {has} a 'gazebo_type', which has no"
+            f" effect: {names}{topics}",
+            "MuJoCo stands in for it, see the key 'mujoco'",
+        )
+    )
+
+
+# ---------------------------------------------------------------------- plugins
+
+
+def plugin_problems(
+    parsed: ParsedProject, nodes: Sequence[Node], connections: Sequence[Connection] | None
+) -> tuple[list[Problem], list[Problem]]:
+    """What keeps plugins from running, and what may be a mistake in them.
+
+    Args:
+        nodes: made of the elements of the parsed project, in the same order.
+        connections: ``None`` where they are not all known.
+    """
+    problems, doubts = list[Problem](), list[Problem]()
+    for node, element in zip(nodes, parsed.nodes, strict=True):
+        plugin = read_plugin(node.plugin) if node.plugin != Path() else None
+        if plugin is None:
+            continue
+        problems += _located(plugin, plugin.mistakes)
+        doubts += _located(plugin, plugin.doubts)
+        lists = (getattr(element.member(side), "value", []) for side in ("inputs", "outputs"))
+        if all(isinstance(each, list) for each in lists):
+            for hook in plugin.hooks:
+                problems += _located(plugin, _misfits(hook, node, connections))
+    return problems, doubts
+
+
+def _misfits(
+    hook: DeclaredHook, node: Node, connections: Sequence[Connection] | None
+) -> Iterator[Remark]:
+    """The ports of a hook that its node does not have, and those that nothing is connected to."""
+    for side, declared, known, others in (
+        ("input", hook.inputs, node.inputs, node.outputs),
+        ("output", hook.outputs, node.outputs, node.inputs),
+    ):
+        names, other_names = {port.name for port in known}, {port.name for port in others}
+        for port in declared or ():
+            if port.name is None or "" in names:
+                continue
+            if port.name not in names:
+                hint = did_you_mean(port.name, names)
+                if port.name in other_names:
+                    hint = f"it has an {'output' if side == 'input' else 'input'} of that name"
+                hint = hint or f"it has {', '.join(sorted(names)) or 'none'}"
+                text = f"hook '{hook.name}': node '{node.name}' declares no {side} '{port.name}'"
+                yield Remark(port.line, port.column, text, hint)
+            elif (
+                side == "input"
+                and not port.is_optional
+                and not _is_fed(node, port.name, connections)
+            ):
+                text = (
+                    f"hook '{hook.name}': needs input '{port.name}', but nothing is connected to"
+                    f" {node.name}.{port.name}"
+                )
+                hint = "connect it, or declare it Optional"
+                yield Remark(port.line, port.column, text, hint)
+
+
+def _is_fed(node: Node, name: str, connections: Sequence[Connection] | None) -> bool:
+    """Whether something is connected to an input; so it seems where connections are unknown."""
+    if connections is None or node.input(name).external_topic is not None:
+        return True
+    return any((c.destination_node, c.destination_input) == (node.name, name) for c in connections)
+
+
+def _located(plugin: PluginFile, remarks: Iterable[Remark]) -> list[Problem]:
+    name = display_name(plugin.path)
+    return [Problem(name, r.line, r.column, "", r.text, r.hint) for r in remarks]
+
+
+def unread_variables(
+    parsed: ParsedProject, nodes: Sequence[Node], overrides: Sequence[str]
+) -> Iterator[Problem]:
+    """Variables that ``--set`` gives to nodes, and that nothing of the project reads."""
+    for text in overrides:
+        target, _, value = text.partition("=")
+        kind, *steps = target.split(".")
+        if kind != "nodes" or len(steps) < 3 or steps[1] != "environment" or not value:
+            continue
+        key = ".".join(steps[2:])
+        node = next((node for node in nodes if node.name == steps[0]), None)
+        if node is None or key.startswith(_KNOWN_PREFIXES) or _is_read_by_neuros(key):
+            continue
+        plugin, sources = read_plugin(node.plugin), _sources(node, parsed.roots.project)
+        if plugin is None or sources is None:
+            continue
+        word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)", re.IGNORECASE)
+        if any(word.search(source) or _COMPUTED.search(source) for source in sources):
+            continue
+        candidates = {text for text in plugin.texts if _VARIABLE.fullmatch(text)}
+        hint = did_you_mean(key, (candidates | {*node.environment}) - {key})
+        complaint = f"nothing in the plugin of node '{node.name}' reads {key}"
+        yield Problem(f"--set {text}", 1, 1, "", complaint, hint)
+
+
+def _is_read_by_neuros(key: str) -> bool:
+    package = Path(__file__).resolve().parents[1]
+    quoted = f'"{key}"'
+    return any(quoted in file.read_text("utf-8") for file in package.rglob("*.py"))
+
+
+def _sources(node: Node, project: Path) -> list[str] | None:
+    """The programs of a project; ``None`` where there are too many files to look at."""
+    seen = 0
+    files = {node.plugin, *([node.script] if node.script else [])}
+    for folder in {project, node.plugin.parent}:
+        for here, folders, names in os.walk(folder):
+            if "pyvenv.cfg" in names or "run.json" in names:
+                folders.clear()
+                continue
+            folders[:] = [name for name in folders if not name.startswith((".", "__"))]
+            files |= {Path(here, name) for name in names if name.endswith((".py", ".sh"))}
+            seen += 1
+            if len(files) > _MOST_FILES or seen > _MOST_FOLDERS:
+                return None
+    return [file.read_text("utf-8", "replace") for file in files if file.is_file()]

@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from neuros.errors import Problem, ProjectError
-from neuros.project.checks import mistakes, remarks
-from neuros.project.gazebo import container_in_place_of, is_for_gazebo
+from neuros.project.checks import (
+    container_in_place_of,
+    is_for_gazebo,
+    mistakes,
+    plugin_problems,
+    remarks,
+    unread_variables,
+)
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
-from neuros.project.model import Budgets, Connection, Node, Port, Project, Value
-from neuros.project.overrides import apply_namespace, apply_override, apply_remaps
-from neuros.project.parameters import parameters_of
-from neuros.project.parsed import ParsedProject, names_of, parse_project
+from neuros.project.model import Budgets, Connection, Node, Port, Project, parameters_of
+from neuros.project.parsed import (
+    ParsedProject,
+    apply_namespace,
+    apply_override,
+    apply_remaps,
+    names_of,
+    parse_project,
+)
 from neuros.project.paths import PathError, Roots
-from neuros.project.plugin_checks import plugin_problems, unread_variables
-from neuros.project.qos import Qos, qos_of
+from neuros.project.qos import qos_of
 from neuros.project.resources import Access, Resources, access_of, resources_of
-from neuros.project.scanner import SourceError, display_name
-from neuros.project.source import Element
+from neuros.project.scanner import Element, SourceError, display_name
 from neuros.project.suggest import did_you_mean
+from neuros.project.validate import violations
 
 STANDARD_CONTAINERS = frozenset(
     {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
 )
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
+_T = TypeVar("_T")
 
 
-class Builder:
-    """Builds nodes and connections, as far as they have the right form.
+class _Builder:
+    """Builds nodes, as far as they have the right form.
 
     Attributes:
         problems: what was found on the way: missing files, unknown types. What they concern is
@@ -53,11 +64,10 @@ class Builder:
                     member.value, member.source.folder
                 ):
                     continue
-                value, is_path = self._variable(member)
-                environment[name] = value
+                environment[name], is_path = self._variable(member)
                 if is_path:
                     paths.append(name)
-        resources, access = _resources_and_access(element)
+        keys, cores = element.plain, (core.value for core in element.items("affinity"))
         return Node(
             name=element.string("name") or "",
             container=container_in_place_of(element.string("container") or ""),
@@ -69,10 +79,10 @@ class Builder:
             file=element.source.file,
             pointer=element.pointer,
             environment_paths=tuple(sorted(paths)),
-            affinity=_affinity(element),
-            resources=resources,
-            access=access,
-            parameters=_parameters(element),
+            affinity=tuple(int(c) for c in cores if isinstance(c, int | float) and c % 1 == 0),
+            resources=_if_valid(lambda: resources_of(keys), Resources()),
+            access=_if_valid(lambda: access_of(keys), Access()),
+            parameters=_if_valid(lambda: parameters_of(keys.get("parameters", {})), {}),
         )
 
     def _file(self, element: Element, key: str) -> Path | None:
@@ -106,84 +116,42 @@ class Builder:
         container = container_in_place_of(node.string("container") or "").partition(":")[0]
         must_be_here = container in STANDARD_CONTAINERS
         return tuple(
-            self._port(port, side, must_be_here=must_be_here)
+            self._port(port, is_input=side == "inputs", must_be_here=must_be_here)
             for port in node.items(side)
             if isinstance(port.value, dict)
         )
 
-    def _port(self, element: Element, side: str, *, must_be_here: bool) -> Port:
-        written = element.string("type") or ""
+    def _port(self, element: Element, *, is_input: bool, must_be_here: bool) -> Port:
+        written, keys = element.string("type") or "", element.plain
         type_name = normalised(written)
         unknown = type_name and unknown_type(
             type_name, must_be_here=must_be_here, packages=self._roots.packages
         )
         if unknown:
             self.problems.append(element.value["type"].problem(*unknown))
-        mujoco = element.member("mujoco")
-        keys: dict[str, Any] = {} if mujoco is None else {"mujoco": mujoco.plain}
+        more = {"mujoco": keys["mujoco"]} if "mujoco" in keys else {}
+        if "qos" in keys:
+            more["qos"] = _if_valid(lambda: qos_of(keys["qos"], is_input=is_input), None)
         return Port(
             name=element.string("name") or "",
             type=type_name or written,
             external_topic=element.string("external_topic"),
             gazebo_type=element.string("gazebo_type"),
-            qos=_qos(element, is_input=side == "inputs"),
-            **keys,
+            **more,
         )
 
 
-def _qos(port: Element, *, is_input: bool) -> Qos | None:
-    """The QoS of a port; the schema has reported what is wrong with it."""
-    member = port.member("qos")
-    if member is None:
-        return None
+def _if_valid(read: Callable[[], _T], default: _T) -> _T:
+    """What ``read`` returns; ``default`` where the value is invalid, as the schema reports."""
     try:
-        return qos_of(member.plain, is_input=is_input)
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        return None
-
-
-def _parameters(node: Element) -> dict[str, Value]:
-    """The ROS parameters of a node; what is wrong with them has been reported."""
-    member = node.member("parameters")
-    try:
-        return {} if member is None else parameters_of(member.plain)
-    except (AttributeError, TypeError, ValueError, OverflowError):
-        return {}
-
-
-def _affinity(node: Element) -> tuple[int, ...]:
-    """The cores that a node asks for; the schema has reported what is no number of a core."""
-    cores = (core.value for core in node.items("affinity"))
-    return tuple(int(core) for core in cores if isinstance(core, int | float) and core % 1 == 0)
-
-
-def _resources_and_access(node: Element) -> tuple[Resources, Access]:
-    """What a node may use; the schema has reported what is wrong with it."""
-    try:
-        return resources_of(node.plain), access_of(node.plain)
+        return read()
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
-        return Resources(), Access()
-
-
-def connection(element: Element, index: int, namespace: str) -> Connection:
-    """The connection that a valid object describes."""
-    values = element.plain
-    limit = values.get("discard_limit")
-    return Connection(
-        source_node=values["source_node"],
-        source_output=values["source_output"],
-        destination_node=values["destination_node"],
-        destination_input=values["destination_input"],
-        discard_limit=None if limit is None else int(limit),
-        queue_size=int(values.get("queue_size", 1)),
-        index=index,
-        namespace=namespace,
-    )
+        return default
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A valid project, and what may be a mistake in it all the same."""
+    """A valid project, and warnings of possible mistakes in it."""
 
     project: Project
     warnings: tuple[Problem, ...] = ()
@@ -227,21 +195,20 @@ def load_project(
     if namespace is not None:
         apply_namespace(parsed, namespace)
     parsed.problems += apply_remaps(parsed, remap)
-    builder = Builder(parsed)
+    builder = _Builder(parsed)
     names = names_of(parsed)
     nodes = tuple(builder.node(element) for element in parsed.nodes)
-    problems = [*parsed.problems, *_judgements(parsed), *builder.problems]
-    connections = (
-        ()
-        if problems
-        else tuple(
-            connection(c, index, names.namespace) for index, c in enumerate(parsed.connections)
+    problems = [*parsed.problems, *violations(parsed), *mistakes(parsed), *builder.problems]
+    connections: tuple[Connection, ...] = ()
+    if not problems:
+        connections = tuple(
+            Connection.of(element.plain, index=index, namespace=names.namespace)
+            for index, element in enumerate(parsed.connections)
         )
-    )
     doubts: list[Problem] = []
     if reads_plugins:
-        mistakes, doubts = plugin_problems(parsed, nodes, None if problems else connections)
-        problems += mistakes
+        misfits, doubts = plugin_problems(parsed, nodes, None if problems else connections)
+        problems += misfits
     if problems:
         raise ProjectError(problems)
     if reads_plugins:
@@ -256,13 +223,6 @@ def load_project(
         names=names,
     )
     return Loaded(project, (*remarks(parsed), *doubts))
-
-
-def _judgements(parsed: ParsedProject) -> list[Problem]:
-    # Imported late: importing this module must not load jsonschema.
-    from neuros.project.validate import violations
-
-    return [*violations(parsed), *mistakes(parsed)]
 
 
 def _project_file(path: Path) -> Path:

@@ -7,7 +7,7 @@ Everything here is frozen. :mod:`neuros.project.load` reads it from files,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -130,6 +130,19 @@ class Connection:
             f"/{self.destination_node}/{self.destination_input}"
         )
 
+    @classmethod
+    def of(cls, keys: Mapping[str, Any], **more: Any) -> Connection:
+        """The connection that valid keys describe; JSON may write a whole number as ``2.0``."""
+        whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in keys.items()}
+        return cls(**whole, **more)
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """As a project file has it."""
+        values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
+        del values["index"], values["namespace"]
+        return {key: value for key, (value, default) in values.items() if value != default}
+
     def __hash__(self) -> int:
         # Looked up for every packet; the place in the project tells most connections apart.
         return hash(self.index)
@@ -207,6 +220,32 @@ class Project:
             if node.name == name:
                 return node
         raise KeyError(name)
+
+
+def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
+    """Values by full name (``gain.p``), from valid ones that may lie in each other.
+
+    Numbers of one list are of one kind: with a float among them, all are.
+    """
+    found: dict[str, Value] = {}
+    for name, value in written.items():
+        if isinstance(value, Mapping):
+            inner = parameters_of(value)
+            found |= {f"{name}.{part}": each for part, each in inner.items()}
+        elif isinstance(value, list | tuple):
+            has_floats = any(isinstance(item, float) for item in value)
+            found[name] = tuple(map(float, value)) if has_floats else tuple(value)
+        else:
+            found[name] = value
+    return found
+
+
+def parameters_to_json(parameters: Mapping[str, Value]) -> dict[str, Any]:
+    """As a project file has them."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in parameters.items()
+    }
 
 
 def _named(ports: tuple[Port, ...], name: str) -> Port:

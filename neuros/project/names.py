@@ -2,7 +2,7 @@
 
 As in ROS 2 (design.ros2.org, "Topic and Service name mapping to DDS" and "Remapping Names"): a
 relative name begins in the namespace, ``~`` stands for the node, an absolute name is left alone.
-A rule replaces a name if both are the same in full; the first rule that fits counts, once.
+A rule replaces a name if their full names are equal; the first rule that fits counts, once.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Names:
 
 
 def normalised_namespace(written: str) -> str:
-    """``/left`` for ``left`` and ``/left``; empty for ``/``, where everybody is."""
+    """``/left`` for ``left`` and ``/left``; empty for ``/``, the global one."""
     stripped = written.strip("/")
     return f"/{stripped}" if stripped else ""
 

@@ -1,18 +1,50 @@
-"""Parsed project: the JSON of its files, node files merged in, before validation."""
+"""Parsed project: the JSON of its files, node files merged in, before validation.
+
+``--set``, ``--namespace`` and ``--remap`` replace values in it. The form of ``--set``::
+
+    nodes.NAME.KEY...=VALUE
+    connections.SRC.OUT.DST.IN.KEY=VALUE
+    budgets.KEY=VALUE                     budgets.lost_packets.SRC.OUT -> DST.IN=VALUE
+
+``VALUE`` is JSON if it parses and a text otherwise; in ``environment`` it is always a text. Without
+a value the key is removed. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
+other lists an index.
+"""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from neuros.errors import Problem
 from neuros.project.names import Names, names_from
 from neuros.project.paths import PathError, Roots
-from neuros.project.scanner import SourceError, display_name, read_file
-from neuros.project.source import Element
+from neuros.project.scanner import (
+    Element,
+    Source,
+    SourceError,
+    display_name,
+    escape,
+    parse,
+    read_file,
+)
+from neuros.project.suggest import did_you_mean
 
 ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 """The keys of a connection that name its ends."""
+_FORMS = {
+    "nodes": "nodes.NAME.KEY=VALUE",
+    "connections": "connections.SRC.OUT.DST.IN.KEY=VALUE",
+    "budgets": "budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE",
+}
+_REMAP_FORM = "write --remap FROM:=TO, as in --remap /scan:=/left/scan"
+_SPECIAL_NAMES = {
+    "__ns": "use --namespace",
+    "__node": "a node keeps the name that the project gives it",
+    "__name": "a node keeps the name that the project gives it",
+}
 
 
 @dataclass
@@ -101,3 +133,116 @@ def rules_of(remap: Element | None) -> dict[str, str]:
     if remap is None or not isinstance(remap.value, dict):
         return {}
     return {old: new.value for old, new in remap.value.items() if isinstance(new.value, str)}
+
+
+# ---- overrides
+
+
+def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
+    """Apply one ``--set`` to a parsed project; what is wrong with the text itself is returned."""
+    source = Source(f"--set {text}", parsed.roots.project, text)
+    target, equals, value = text.partition("=")
+    kind, *steps = target.split(".")
+    if kind not in _FORMS:
+        hint = did_you_mean(kind, _FORMS)
+        text = "must begin with 'nodes.', 'connections.' or 'budgets.'"
+        return [source.problem(0, "", text, hint)]
+    ends = {"nodes": ("name",), "connections": ENDS, "budgets": ()}[kind]
+    names = len(ends)
+    needed = steps if kind == "budgets" else steps[: names + 1]
+    if not equals or len(steps) <= names or not all(needed):
+        return [source.problem(0, "", "is not of the form", _FORMS[kind])]
+    name, parent = ".".join(steps[:names]), parsed.root
+    if kind != "budgets":
+        elements = parsed.nodes if kind == "nodes" else parsed.connections
+        known = [".".join(each.string(end) or "" for end in ends) for each in elements]
+        if name not in known:
+            text, hint = f"there is no {kind[:-1]} '{name}'", did_you_mean(name, known)
+            return [source.problem(0, "", text, hint)] if parsed.is_complete else []
+        parent = elements[known.index(name)]
+    keys = [kind, *steps] if kind == "budgets" else steps[names:]
+    # Names of connections and of variables may contain dots.
+    single = 2 if kind == "budgets" else 1 if keys[0] == "environment" else len(keys)
+    keys = [*keys[:single], *([".".join(keys[single:])] if keys[single:] else [])]
+    try:
+        return _set(parent, keys, source, len(target) + 1, removes=not value)
+    except SourceError as error:
+        return [error.problem]
+
+
+def _set(
+    parent: Element, keys: list[str], source: Source, start: int, *, removes: bool
+) -> list[Problem]:
+    """Set or remove the value at the end of ``keys``; ``start`` is its place in the source."""
+    end, is_text = len(source.text), keys[0] == "environment" and len(keys) > 1
+    for step in keys[:-1]:
+        key = _key(parent, step, source)
+        if key == step and parent.member(step) is None:
+            if removes:
+                return []
+            pointer = f"{parent.pointer}/{escape(step)}"
+            parent.value[step] = Element({}, source, start, end, pointer)
+        parent = parent.value[key]
+    key = _key(parent, keys[-1], source)
+    if removes:
+        if isinstance(key, int) or key in parent.value:
+            del parent.value[key]
+        return []
+    pointer = f"{parent.pointer}/{escape(str(key))}"
+    problems: list[Problem] = []
+    element = Element(source.text[start:], source, start, end, pointer)
+    if not is_text:
+        with contextlib.suppress(SourceError):
+            element, problems = parse(source, start, pointer)
+            element.key_start = start
+    parent.value[key] = element
+    return problems
+
+
+def _key(parent: Element, step: str, source: Source) -> str | int:
+    """The key or index behind a step; a key need not exist yet. Raises :class:`SourceError`."""
+    if isinstance(parent.value, dict):
+        return step
+    text, hint = f"'{step}' leads nowhere: there is no object around it", ""
+    if isinstance(parent.value, list):
+        names = [item.string("name") or "" for item in parent.value]
+        if step in names:
+            return names.index(step)
+        if step.isascii() and step.isdigit() and int(step) < len(names):
+            return int(step)
+        text, hint = f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names)
+    raise SourceError(source.problem(0, "", text, hint))
+
+
+def apply_namespace(parsed: ParsedProject, text: str) -> None:
+    """Apply ``--namespace`` to a parsed project, in the place of the project's own."""
+    if isinstance(parsed.root.value, dict):
+        source = Source(f"--namespace {text}", parsed.roots.project, text)
+        parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
+
+
+def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
+    """Apply each ``--remap`` to a parsed project; they go before the rules of the project."""
+    problems: list[Problem] = []
+    rules: dict[str, Element] = {}
+    for text in texts:
+        source = Source(f"--remap {text}", parsed.roots.project, text)
+        old, sign, new = text.partition(":=")
+        if not (sign and old and new):
+            problems.append(source.problem(0, "/remap", "is no rule", _REMAP_FORM))
+        elif old.rpartition(":")[2] in _SPECIAL_NAMES:
+            hint = _SPECIAL_NAMES[old.rpartition(":")[2]]
+            problems.append(source.problem(0, "/remap", f"'{old}' is not remapped", hint))
+        else:
+            start = len(old) + len(sign)
+            pointer = f"/remap/{escape(old)}"
+            rule = Element(new, source, start, len(text), pointer, key_start=0)
+            rules.setdefault(old, rule)  # the first one counts
+    if rules and isinstance(parsed.root.value, dict):
+        remap = parsed.root.member("remap")
+        if remap is None:
+            source = next(iter(rules.values())).source
+            parsed.root.value["remap"] = Element(rules, source, 0, len(source.text), "/remap")
+        elif isinstance(remap.value, dict):
+            remap.value = {**rules, **{k: v for k, v in remap.value.items() if k not in rules}}
+    return problems

@@ -148,7 +148,7 @@ def _may_be_newer(error: SyntaxError, source: bytes) -> bool:
 class _Reader:
     """Reads one plugin.
 
-    A name means what it is bound to where all its bindings, wherever they are, are the same.
+    A name has a meaning where all its bindings, in all scopes, are equal.
     """
 
     def __init__(self, plugin: PluginFile, tree: ast.Module) -> None:
@@ -275,7 +275,7 @@ class _Reader:
                 yield self._value(given[0]) if given else ast.Constant(None)
 
     def _value(self, expression: ast.expr) -> ast.expr:
-        """What a name is bound to, once and for all; anything else as it is."""
+        """The value of a name that is bound once; any other expression unchanged."""
         if isinstance(expression, ast.Name):
             name = expression.id
             made = [each for each in self._nodes if getattr(each, "targets", None)]

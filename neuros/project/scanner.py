@@ -1,11 +1,10 @@
-"""Reads JSON and remembers where everything stands.
+"""JSON values with their positions in the file.
 
 Python's ``json`` keeps neither the positions of keys and values nor duplicate keys (the last one
 wins silently), and both are needed to tell a user what is wrong where. Of the libraries that keep
-positions, json-source-map returns a dictionary with one entry per pointer, so that duplicates
-are lost again, and has had no release for years; json5 reports no positions. So this is a scanner
-of its own for objects and arrays, around the standard library's decoder for everything else: what
-is valid, and what it means, stays the standard library's decision.
+positions, json-source-map loses duplicates and has had no release for years; json5 reports no
+positions. So this scanner reads objects and arrays, and leaves scalars to the standard library's
+decoder.
 """
 
 from __future__ import annotations
@@ -13,16 +12,118 @@ from __future__ import annotations
 import json
 import os
 import re
+from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
 from neuros.errors import Problem
-from neuros.project.source import Element, Source, escape
 
 _MAX_DEPTH = 100
 _SPACE = re.compile(r"[ \t\n\r]*")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A text with JSON in it.
+
+    Attributes:
+        name: what messages call it.
+        folder: where relative paths in it start.
+        file: the file that it was read from, if it was.
+    """
+
+    name: str
+    folder: Path
+    text: str
+    file: Path = Path()
+
+    @cached_property
+    def _line_starts(self) -> list[int]:
+        return [0, *(match.end() for match in re.finditer("\n", self.text))]
+
+    def place(self, position: int) -> tuple[int, int]:
+        """Line and column of a position, both from 1."""
+        line = bisect_right(self._line_starts, position)
+        return line, position - self._line_starts[line - 1] + 1
+
+    def problem(self, position: int, pointer: str, text: str, hint: str = "") -> Problem:
+        """A problem at a position; the whole document is shown as ``/``."""
+        line, column = self.place(position)
+        return Problem(self.name, line, column, pointer or "/", text, hint)
+
+
+@dataclass
+class Element:
+    """A JSON value and its place.
+
+    Attributes:
+        value: a ``dict`` or ``list`` of elements, or what ``json.loads`` makes of a scalar.
+        start: position of the first character; ``end`` is behind the last one.
+        key_start: position of the key in front of it, ``start`` where there is none.
+        pointer: its JSON pointer in the file.
+    """
+
+    value: Any
+    source: Source
+    start: int
+    end: int
+    pointer: str = ""
+    key_start: int = -1
+
+    def __post_init__(self) -> None:
+        if self.key_start < 0:
+            self.key_start = self.start
+
+    @property
+    def text(self) -> str:
+        """The JSON text of the value."""
+        return self.source.text[self.start : self.end]
+
+    @property
+    def plain(self) -> Any:
+        """The value as ``json.loads`` would return it."""
+        if isinstance(self.value, dict):
+            return {key: member.plain for key, member in self.value.items()}
+        if isinstance(self.value, list):
+            return [item.plain for item in self.value]
+        return self.value
+
+    def member(self, key: str) -> Element | None:
+        """The member of that key, ``None`` if this is no object or has none."""
+        return self.value.get(key) if isinstance(self.value, dict) else None
+
+    def string(self, key: str) -> str | None:
+        """The member of that key if it is a string."""
+        member = self.member(key)
+        return member.value if member is not None and isinstance(member.value, str) else None
+
+    def items(self, key: str) -> list[Element]:
+        """The items of the array under that key, nothing if there is none."""
+        member = self.member(key)
+        return member.value if member is not None and isinstance(member.value, list) else []
+
+    def at(self, path: Iterable[str | int]) -> Element:
+        """The element at the end of a path of keys and indices."""
+        element = self
+        for step in path:
+            element = element.value[step]
+        return element
+
+    def problem(self, text: str, hint: str = "") -> Problem:
+        """A problem with the value."""
+        return self.source.problem(self.start, self.pointer, text, hint)
+
+    def key_problem(self, text: str, hint: str = "") -> Problem:
+        """A problem with the key."""
+        return self.source.problem(self.key_start, self.pointer, text, hint)
+
+
+def escape(key: str) -> str:
+    """A key as a part of a JSON pointer (RFC 6901)."""
+    return key.replace("~", "~0").replace("/", "~1")
 
 
 class SourceError(Exception):

@@ -11,14 +11,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neuros.project.model import Budgets, Connection, Folders, Node, NodeFile, Port, Project
+from neuros.project.model import (
+    Budgets,
+    Connection,
+    Folders,
+    Node,
+    NodeFile,
+    Port,
+    Project,
+    parameters_of,
+    parameters_to_json,
+)
 from neuros.project.names import Names, names_from, names_to_json
-from neuros.project.parameters import parameters_of, parameters_to_json
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
 
 _NO_BUDGETS = Budgets()
-_ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 
 
 def _unchanged(path: Path) -> Path:
@@ -34,8 +42,8 @@ def split(
 
     Args:
         folders_for: the folders of a node, as that node sees them.
-        translate: from a path on this machine to the path of the same thing for the nodes. The
-            file that a node is described in is not translated: it is for messages to the user.
+        translate: from a path on this machine to that for the nodes. The file that describes a
+            node is not translated: it is for messages to the user.
     """
     return tuple(
         NodeFile(
@@ -77,18 +85,13 @@ def merge(
 
 def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
     """The content of ``node.json``."""
-    node, folders = node_file.node, node_file.folders
+    node = node_file.node
     return {
         "node": {**_node_keys(node), "environment": dict(node.environment)},
         "connections": [
-            {**_connection_keys(connection), "index": connection.index}
-            for connection in node_file.connections
+            {**connection.keys, "index": connection.index} for connection in node_file.connections
         ],
-        "folders": {
-            "project": str(folders.project),
-            "workspace": str(folders.workspace),
-            "run": str(folders.run),
-        },
+        "folders": {name: str(folder) for name, folder in vars(node_file.folders).items()},
         "messages": [str(path) for path in node_file.messages],
         "index": node_file.index,
         "file": str(node.file),
@@ -121,8 +124,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             parameters=parameters_of(node.get("parameters", {})),
         ),
         connections=tuple(
-            Connection(**connection, namespace=names.namespace)
-            for connection in content["connections"]
+            Connection.of(keys, namespace=names.namespace) for keys in content["connections"]
         ),
         folders=Folders(**{key: Path(path) for key, path in content["folders"].items()}),
         index=content["index"],
@@ -152,11 +154,16 @@ def project_to_json(project: Project) -> dict[str, Any]:
     """
     content: dict[str, Any] = {"description": project.description} if project.description else {}
     content["nodes"] = [
-        {**_node_keys(node), "environment": _environment(node)} for node in project.nodes
+        {
+            **_node_keys(node),
+            "environment": {k: _written(node, k, value) for k, value in node.environment.items()},
+        }
+        for node in project.nodes
     ]
-    content["connections"] = [_connection_keys(c) for c in project.connections]
+    content["connections"] = [connection.keys for connection in project.connections]
     content |= names_to_json(project.names)
-    if budgets := _budgets_to_json(project.budgets):
+    budgets = {**vars(project.budgets), "lost_packets": dict(project.budgets.lost_packets)}
+    if budgets := {key: value for key, value in budgets.items() if value not in (None, {})}:
         content["budgets"] = budgets
     return content
 
@@ -210,31 +217,8 @@ def _port_keys(port: Port) -> dict[str, Any]:
     return keys
 
 
-def _connection_keys(connection: Connection) -> dict[str, Any]:
-    keys: dict[str, Any] = {end: getattr(connection, end) for end in _ENDS}
-    if connection.discard_limit is not None:
-        keys["discard_limit"] = connection.discard_limit
-    if connection.queue_size != 1:
-        keys["queue_size"] = connection.queue_size
-    return keys
-
-
-def _environment(node: Node) -> dict[str, str]:
-    """The environment as a project file writes it."""
-    return {key: _written(node, key, value) for key, value in node.environment.items()}
-
-
 def _written(node: Node, key: str, value: str) -> str:
+    """A variable of the environment as a project file writes it."""
     if key in node.environment_paths:
         return f"#{value}"
     return value[0] + value if value[:1] in ("#", "@") else value
-
-
-def _budgets_to_json(budgets: Budgets) -> dict[str, Any]:
-    """As a project file has them; only those that there are."""
-    content = {
-        "lost_packets": dict(budgets.lost_packets),
-        "real_time_factor": budgets.real_time_factor,
-        "tick_error_ms": budgets.tick_error_ms,
-    }
-    return {key: value for key, value in content.items() if value not in (None, {})}

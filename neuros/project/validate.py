@@ -16,8 +16,7 @@ from typing import Any
 from neuros.errors import Problem
 from neuros.project.model import Project
 from neuros.project.parsed import ParsedProject
-from neuros.project.scanner import display_name, place_of
-from neuros.project.source import Element
+from neuros.project.scanner import Element, display_name, place_of
 from neuros.project.suggest import did_you_mean, listed
 
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"

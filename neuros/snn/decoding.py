@@ -1,8 +1,7 @@
 """From spikes to rates, without a simulator: filters that keep state from one step to the next.
 
-All are exact in time: a filter decays by ``exp(-dt / tau)``, whatever the step, so that steps may
-be of any lengths and their number changes nothing but rounding. What a filter has seen it is
-told by absolute times, in simulated seconds, which do not add up errors as sums of steps do.
+All are exact in time: a filter decays by ``exp(-dt / tau)`` for any step, so the lengths of steps
+change nothing but rounding. Times are absolute simulated seconds: errors of steps do not add up.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ def import_nest() -> ModuleType:
     """NEST, quiet, with the number of OpenMP's threads fixed first.
 
     Without ``OMP_NUM_THREADS`` in the environment NEST crashes or hangs where one thread imports it
-    and another one simulates: it is set to 1 unless it is there, as it is in every node. Import and
-    simulate in one thread all the same; hooks are.
+    and another one simulates: it is set to 1 unless it is there. Import and simulate in one thread,
+    as hooks do.
 
     Raises:
         EnvironmentFault: NEST is not installed in the node's Python.
@@ -51,9 +51,8 @@ def import_nest() -> ModuleType:
 def derive_seed(seed: int, *names: str | int) -> int:
     """A seed of its own for a part of a run, 1 to 2**32 - 1: of a node, of a population, of noise.
 
-    ``derive_seed(seed, node.name)`` lets one number seed a whole project, without two nodes that
-    draw the same numbers, as they would with ``seed`` itself, or with ``seed + 1`` for the one and
-    ``seed`` of the next run for the other. The same arguments give the same seed on every machine.
+    ``derive_seed(seed, node.name)`` lets one number seed a whole project; no two nodes draw equal
+    numbers, in one run or in the next. Equal arguments give equal seeds on every machine.
 
     Source: ``numpy.random.SeedSequence`` mixes; after O'Neill, PCG, seed_seq_fe (2015).
     """
@@ -71,7 +70,7 @@ def _words(name: str | int) -> list[int]:
 
 
 def threads_of_node() -> int:
-    """So many threads as NeuROS has given this node cores: ``OMP_NUM_THREADS``, 1 without it.
+    """Number of cores that NeuROS has given this node: ``OMP_NUM_THREADS``, 1 without it.
 
     A node with ``"affinity": [2, 3]`` has 2. See docs/placement.md.
     """
@@ -86,8 +85,8 @@ def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> 
 
     The spikes are a function of the network, the steps (see :class:`~neuros.snn.stepper.Stepper`),
     ``seed`` **and** ``threads``: every *virtual process* (without MPI there are ``threads`` of
-    them) draws from a stream of its own, for the neurons that it has been given. So the same seed
-    with another number of threads gives other spikes.
+    them) draws from a stream of its own, for its neurons. So one seed gives other spikes with
+    another number of threads.
 
     Args:
         seed: 1 to 2**32 - 1; :func:`derive_seed` makes one.

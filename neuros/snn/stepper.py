@@ -108,7 +108,7 @@ class Stepper:
 
     NEST stays prepared from step to step (``Prepare``, ``Run``, ``Run``, ...). What it refuses
     meanwhile is possible with :meth:`clear` (recorders) and after :meth:`release` (create, connect,
-    ``Simulate``); the next step prepares it again, and the spikes are the same.
+    ``Simulate``); the next step prepares it again, without a change of spikes.
 
     Args:
         strict: refuse steps that are no whole number of ``min_delay``.

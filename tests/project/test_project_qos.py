@@ -10,7 +10,7 @@ import pytest
 from rclpy.qos import QoSPresetProfiles
 
 from neuros.project.load import Loaded, load_project
-from neuros.project.parameters import parameters_of
+from neuros.project.model import parameters_of
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos, qos_of, qos_to_json
 from neuros.transport.ros_graph import qos_profile
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.project.scanner import SourceError, parse, place_of, read_file
-from neuros.project.source import Element, Source
+from neuros.project.scanner import Element, Source, SourceError, parse, place_of, read_file
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)

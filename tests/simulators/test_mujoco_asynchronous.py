@@ -9,8 +9,8 @@ from simulated_node import DEADLINE_S, WORLD, SimulatedNode, imu, stamp_ns
 
 from neuros.errors import ModelError
 from neuros.simulators.mujoco import MuJoCo
-from neuros.simulators.mujoco.free_run import Pacer, StepLock
-from neuros.simulators.mujoco.viewer import Viewer
+from neuros.simulators.mujoco.simulator import Viewer
+from neuros.simulators.mujoco.timing import Pacer, StepLock
 
 CLOCK = ("rosgraph_msgs/msg/Clock", {"sensor": "clock", "rate": 25})
 
@@ -377,7 +377,7 @@ def test_a_pause_in_the_viewer_holds_the_plugins_steps_until_the_user_resumes(mo
         windows.append(ImpatientWindow(*arguments, **keywords))
         return windows[-1]
 
-    monkeypatch.setattr("neuros.simulators.mujoco.viewer.find_launcher", lambda node: launch)
+    monkeypatch.setattr("neuros.simulators.mujoco.simulator.find_launcher", lambda node: launch)
     node = SimulatedNode(environment={"NEUROS_GUI": "1"})
     sim = MuJoCo(node, WORLD)
     sim.step_synchronous()

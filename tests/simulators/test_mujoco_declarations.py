@@ -11,8 +11,8 @@ from neuros.errors import ModelError
 from neuros.project.model import Node, Port
 from neuros.project.validate import schema
 from neuros.simulators.mujoco import MuJoCo
-from neuros.simulators.mujoco.declarations import Problems
-from neuros.simulators.mujoco.sensors import SENSOR_KINDS, read_sensors
+from neuros.simulators.mujoco.lookup import Problems
+from neuros.simulators.mujoco.sensors import SENSORS, read_sensors, with_sensors
 
 IMU, CLOCK = "sensor_msgs/msg/Imu", "rosgraph_msgs/msg/Clock"
 STRING, FLOAT = "std_msgs/msg/String", "std_msgs/msg/Float64"
@@ -111,7 +111,7 @@ def test_faulty_actuators(type_, keys, says):
 
 def declarations():
     """Every kind of sensor with every message type, with no element, one, and a list."""
-    for kind, sensor in SENSOR_KINDS.items():
+    for kind, sensor in SENSORS.items():
         for type_ in sensor.types:
             for element in ({}, {"element": "box"}, {"element": ["box", "arm"]}):
                 yield type_, {"sensor": kind, "rate": 50, **element}
@@ -125,7 +125,7 @@ def is_accepted(type_, keys):
     return bool(read_sensors(node, problems))
 
 
-@pytest.mark.parametrize("kind", SENSOR_KINDS)
+@pytest.mark.parametrize("kind", SENSORS)
 def test_the_schema_takes_what_the_simulator_takes_for_some_type(kind):
     validator = Draft202012Validator(schema("node")["$defs"]["mujoco_sensor"])
     verdicts = {}
@@ -135,6 +135,11 @@ def test_the_schema_takes_what_the_simulator_takes_for_some_type(kind):
             verdict[1] |= is_accepted(type_, keys)
     for keys, is_taken in verdicts.values():
         assert validator.is_valid(keys) == is_taken, keys
+
+
+def test_the_schema_has_the_sensors_of_the_simulator():
+    written = "from neuros.simulators.mujoco.sensors import write_schema; write_schema()"
+    assert with_sensors(schema("node")) == schema("node"), f'run: python -c "{written}"'
 
 
 def test_all_problems_come_at_once():

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.simulators.mujoco.timebase import Schedule, Timebase
+from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 HOUR_S = 3600
 

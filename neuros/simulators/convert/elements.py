@@ -1,19 +1,130 @@
-"""XML elements with their file and line, and a mark once they have been read."""
+"""XML elements of a description: their values and places, and the report of those never read."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from neuros.errors import Problem
+from neuros.errors import DescriptionError, Problem
 from neuros.project.scanner import display_name
+
+_UNKNOWN = "the converter does not know this element"
+_EXTENSION = "an extension of its author's own"
+_TAGS_BY_REASON: Mapping[str, str] = {
+    "code that runs inside Gazebo; a NeuROS plugin takes its place": "plugin",
+    "has to do with how Gazebo draws; MuJoCo draws in its own way": (
+        "gui scene cast_shadows visibility_flags meta lighting ambient specular emissive shader"
+        " render_order double_sided shininess light_map visualize"
+    ),
+    "a setting of another physics engine": "ode bullet simbody dart physics joint_physics",
+    "the node file says when and where packets go (`rate`, connections)": (
+        "update_rate topic always_on enable_metrics optical_frame_id frame_id"
+    ),
+    "how stiff limits and contacts are is another number in MuJoCo (solref)": (
+        "stiffness dissipation"
+    ),
+    "MuJoCo simulates no such environment": "wind atmosphere enable_wind fluid_added_mass",
+    "MuJoCo has no animated actors": "actor",
+    "MuJoCo has no populations: include the models one by one": "population",
+    "MuJoCo has no roads": "road",
+    "MuJoCo has no sound": "audio audio_sink audio_source",
+    "MuJoCo has no place on Earth": "spherical_coordinates",
+    "a saved state; the model starts in its initial one": "state",
+    "how fast it runs is up to the plugin (`run_asynchronous`)": (
+        "real_time_factor real_time_update_rate"
+    ),
+    "MuJoCo limits no number of contacts per geom": "max_contacts",
+    "MuJoCo puts bodies to sleep by an option of the whole world": "allow_auto_disable",
+    "MuJoCo has damping in joints, not in links": "velocity_decay",
+    "every link is a body of its own": "must_be_base_link",
+    "MuJoCo moves every body by forces, or by the plugin (mocap)": "kinematic",
+    "MuJoCo does not limit the velocity of a joint": "velocity",
+    "MuJoCo's contacts bounce by their damping (solref), not by a coefficient": "bounce",
+    "MuJoCo has no soft bodies of that kind": "soft_contact",
+    "MuJoCo's torsional friction is a length, not a coefficient": "torsional",
+    "a friction model of another engine": "friction",
+    "MuJoCo's friction has no direction of its own": "fdir1",
+    "MuJoCo has no force-dependent slip": "slip1 slip2",
+    "MuJoCo's rangefinders measure distances only": "laser_retro",
+    "textures and surfaces of Gazebo's renderer": "pbr",
+    "MuJoCo has no projectors": "projector",
+    "MuJoCo has no batteries": "battery",
+    "MuJoCo has no particles": "particle_emitter",
+    "a gripper grips by its contacts": "gripper",
+    "MuJoCo has one near and one far plane for all cameras (`visual/map`)": "clip",
+    "MuJoCo's cameras are pinhole cameras": "distortion lens",
+    "record with `launch -r`": "save",
+    "MuJoCo adds no noise": "noise",
+    "images are rgb8": "format",
+    "see `fine_rendering` of neuros.simulators.mujoco.MuJoCo": "anti_aliasing",
+    "the orientation is that in the world": "orientation_reference_frame",
+    "the orientation is always sent": "enable_orientation",
+    "MuJoCo's cameras show colours": "depth_camera",
+    "MuJoCo takes a mesh as a whole": "submesh",
+}
+_REASONS = {tag: reason for reason, tags in _TAGS_BY_REASON.items() for tag in tags.split()}
+
+
+@dataclass(frozen=True)
+class NotTaken:
+    """Something in a description that the result does not have, or has otherwise.
+
+    Attributes:
+        place: ``file:line`` of the first one.
+        path: its path in the document.
+        why: the reason, in words.
+        count: how many of its kind there are, for this reason.
+    """
+
+    place: str
+    path: str
+    why: str
+    count: int = 1
+
+    def __str__(self) -> str:
+        more = f" (and {self.count - 1} more)" if self.count > 1 else ""
+        return f"{self.place}: {self.path}: {self.why}{more}"
+
+
+class Report:
+    """Problems and notes of one conversion; the elements of all its documents add to it."""
+
+    def __init__(self) -> None:
+        self.problems: list[Problem] = []
+        self.notes: list[tuple[Element, str]] = []
+
+    def note_unread(self, roots: Iterable[Element]) -> None:
+        """Note the topmost elements that were not read."""
+        for root in roots:
+            for child in root.children:
+                if not child.taken:
+                    is_extension = ":" in child.tag
+                    child.note(_EXTENSION if is_extension else _REASONS.get(child.tag, _UNKNOWN))
+            self.note_unread(root.children)
+
+    def raise_any(self) -> None:
+        """Raise ``DescriptionError`` with all problems, if there are any."""
+        if self.problems:
+            raise DescriptionError(self.problems)
+
+    def not_taken(self) -> Sequence[NotTaken]:
+        """The notes in the order of their places; equal ones of one kind are one."""
+        notes = sorted(self.notes, key=lambda note: (str(note[0].file), note[0].line))
+        groups: dict[tuple[str, str, str], list[Element]] = {}
+        for element, why in notes:
+            groups.setdefault((str(element.file), element.kind, why), []).append(element)
+        return [
+            NotTaken(elements[0].place, elements[0].path, why, len(elements))
+            for (_, _, why), elements in groups.items()
+        ]
 
 
 @dataclass(eq=False)
 class Element:
-    """An XML element and its place.
+    """An XML element.
 
     Attributes:
         text: what stands in it, without the white space around.
@@ -25,36 +136,36 @@ class Element:
     file: Path
     line: int
     column: int
+    report: Report
     parent: Element | None = None
     text: str = ""
     children: list[Element] = field(default_factory=list)
     taken: bool = False
 
     @property
+    def name(self) -> str:
+        return self.attributes.get("name", "")
+
+    @property
+    def type(self) -> str:
+        return self.attributes.get("type", "")
+
+    @property
     def path(self) -> str:
         """Its place in the document, as ``model[arm]/link[base]/inertial``."""
-        names = [element.step for element in reversed(list(self.and_ancestors()))]
-        return "/".join(names[1:] or names)
+        steps = [e.tag + (f"[{e.name}]" if e.name else "") for e in self.and_ancestors()][::-1]
+        return "/".join(steps[1:] or steps)
 
     @property
     def kind(self) -> str:
-        """Its path without names: what all elements of its kind have in common."""
-        tags = [element.tag for element in reversed(list(self.and_ancestors()))]
+        """Its path without names."""
+        tags = [element.tag for element in self.and_ancestors()][::-1]
         return "/".join(tags[1:] or tags)
-
-    @property
-    def step(self) -> str:
-        name = self.attributes.get("name")
-        return f"{self.tag}[{name}]" if name else self.tag
 
     @property
     def place(self) -> str:
         """``file:line``."""
         return f"{display_name(self.file)}:{self.line}"
-
-    @property
-    def name(self) -> str:
-        return self.attributes.get("name", "")
 
     def and_ancestors(self) -> Iterator[Element]:
         element: Element | None = self
@@ -62,8 +173,14 @@ class Element:
             yield element
             element = element.parent
 
+    def made(self, tag: str, **attributes: str) -> Element:
+        """A new element at the place of this one, without a parent."""
+        return Element(tag, attributes, self.file, self.line, self.column, self.report)
+
+    # ---- children: what is asked for counts as read
+
     def child(self, *tags: str) -> Element | None:
-        """The first child with that tag (or at the end of a path of tags), now read."""
+        """The first child with that tag (or at the end of a path of tags)."""
         element: Element | None = self
         for tag in tags:
             element = next((c for c in element.children if c.tag == tag), None) if element else None
@@ -72,7 +189,7 @@ class Element:
         return element
 
     def each(self, tag: str) -> list[Element]:
-        """All children with that tag, now read."""
+        """All children with that tag."""
         found = [child for child in self.children if child.tag == tag]
         for child in found:
             child.taken = True
@@ -84,17 +201,92 @@ class Element:
         for child in self.children:
             child.take_all()
 
-    def problem(self, text: str, hint: str = "") -> Problem:
-        """Something wrong with it."""
-        return Problem(display_name(self.file), self.line, self.column, self.path, text, hint)
+    # ---- values; after a problem the default holds
+
+    def numbers(self, default: Sequence[float]) -> tuple[float, ...]:
+        """The numbers in it, as many as ``default`` has; they may be infinite."""
+        count, values = len(default), list[float]()
+        for word in self.text.split():
+            try:
+                values.append(float(word))
+            except ValueError:
+                self.problem(f"'{word}' is not a number")
+                return tuple(default)
+        if len(values) != count:
+            what = "a number" if count == 1 else f"{count} numbers"
+            self.problem(f"{what} must stand here, not {len(values)}")
+            return tuple(default)
+        if any(map(math.isnan, values)):
+            self.problem("every number must be one, not nan")
+            return tuple(default)
+        return tuple(values)
+
+    def vector(self, tag: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """The finite numbers in the child ``tag``, as many as ``default`` has."""
+        element = self.child(tag)
+        if element is None or not element.text:
+            return default
+        values = element.numbers(default)
+        if all(map(math.isfinite, values)):
+            return values
+        element.problem("every number must be finite")
+        return default
+
+    def number(self, tag: str, default: float, *, positive: bool = False) -> float:
+        """The number in the child ``tag``; it may be infinite, unless it must be ``positive``."""
+        element = self.child(tag)
+        if element is None or not element.text:
+            return default
+        (value,) = element.numbers((default,))
+        if positive and not 0 < value < math.inf:
+            element.problem(f"must be a positive number, not {value:g}")
+            return default
+        return value
+
+    def is_true(self, tag: str, *, default: bool = False) -> bool:
+        """The truth value in the child ``tag``."""
+        element = self.child(tag)
+        if element is None:
+            return default
+        word = element.text.lower()
+        if word not in ("true", "1", "false", "0"):
+            element.problem(f"'{element.text}' is neither true nor false")
+            return default
+        return word in ("true", "1")
+
+    def has(self, attribute: str) -> bool:
+        """Whether a truth value among its attributes is true."""
+        return self.attributes.get(attribute) in ("true", "1")
+
+    def text_of(self, tag: str) -> str:
+        """The text of the child ``tag``; empty without it."""
+        element = self.child(tag)
+        return "" if element is None else element.text
+
+    # ---- report
+
+    def problem(self, text: str, hint: str = "") -> None:
+        """Report what makes a conversion impossible."""
+        name = display_name(self.file)
+        self.report.problems.append(Problem(name, self.line, self.column, self.path, text, hint))
+
+    def note(self, why: str) -> None:
+        """Report that it is not taken over, or otherwise; all in it counts as read."""
+        self.take_all()
+        self.report.notes.append((self, why))
+
+    def remark(self, why: str) -> None:
+        """Note it, while its children are still to be read."""
+        self.taken = True
+        self.report.notes.append((self, why))
 
 
 class _Builder:
     """Makes elements of what expat reports."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, report: Report) -> None:
         self.root: Element | None = None
-        self._file, self._open = file, list[Element]()
+        self._file, self._report, self._open = file, report, list[Element]()
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
         self.parser.StartElementHandler = self._start
@@ -104,7 +296,7 @@ class _Builder:
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         parent = self._open[-1] if self._open else None
         line, column = self.parser.CurrentLineNumber, self.parser.CurrentColumnNumber + 1
-        element = Element(tag, attributes, self._file, line, column, parent)
+        element = Element(tag, attributes, self._file, line, column, self._report, parent)
         if parent is None:
             self.root = element
         else:
@@ -120,19 +312,20 @@ class _Builder:
             self._open[-1].text += text
 
 
-def parse(file: Path) -> Element | Problem:
+def parse(file: Path, report: Report) -> Element | Problem:
     """The root of an XML file, or why it cannot be read."""
-    name = display_name(file)
-    builder = _Builder(file)
+    line, column = 1, 1
+    builder = _Builder(file, report)
     try:
         builder.parser.Parse(file.read_bytes(), True)
     except OSError as error:
-        return Problem(name, 1, 1, "/", f"cannot be read: {error.strerror}")
-    except (expat.ExpatError, ValueError) as error:
-        line = getattr(error, "lineno", 1)
-        column = getattr(error, "offset", 0) + 1
-        text = expat.ErrorString(error.code) if isinstance(error, expat.ExpatError) else str(error)
-        return Problem(name, line, column, "/", f"this is no XML: {text}")
-    if builder.root is None:  # expat reports an empty document itself
-        return Problem(name, 1, 1, "/", "this is no XML: no element found")
-    return builder.root
+        text = f"cannot be read: {error.strerror}"
+    except expat.ExpatError as error:
+        line, column = error.lineno, error.offset + 1
+        text = f"this is no XML: {expat.ErrorString(error.code)}"
+    except ValueError as error:
+        text = f"this is no XML: {error}"
+    else:
+        assert builder.root is not None, "expat reports an empty document itself"
+        return builder.root
+    return Problem(display_name(file), line, column, "/", text)

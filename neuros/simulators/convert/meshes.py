@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from neuros.simulators.convert.elements import Element
 from neuros.simulators.convert.find import Finder, NotFound
-from neuros.simulators.convert.report import Report
-from neuros.simulators.convert.values import Pose, Vector, from_quaternion
+from neuros.simulators.convert.poses import Pose, Vector, from_quaternion
 
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
@@ -44,7 +43,6 @@ class Meshes:
 
     spec: Any
     finder: Finder
-    report: Report
     made: dict[str, Triangles] = field(default_factory=dict)
     _names: dict[tuple[Path, tuple[float, ...], bool], str | None] = field(default_factory=dict)
     _places: dict[str, Element] = field(default_factory=dict)
@@ -61,15 +59,15 @@ class Meshes:
             file = self.finder.find_file(uri.text, uri.file.parent)
         except NotFound as error:
             if is_needed:
-                self.report.problem(uri, str(error), error.hint)
+                uri.problem(str(error), error.hint)
             else:
-                self.report.note(uri, f"{error} ({error.hint})" if error.hint else str(error))
+                uri.note(f"{error} ({error.hint})" if error.hint else str(error))
             return None
         key = (file, scale, is_solid)
         if key not in self._names:
             self._names[key] = self._new(uri, file, scale, is_solid)
         elif self._names[key] is None:
-            self.report.note(uri, why_unread(file))
+            uri.note(why_unread(file))
         return self._names[key]
 
     def blame(self) -> None:
@@ -78,8 +76,7 @@ class Meshes:
             try:
                 _compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
-                text = " ".join(str(error).removeprefix("Error: ").split())
-                self.report.problem(self._places[mesh.name], f"MuJoCo cannot use the mesh: {text}")
+                self._places[mesh.name].problem(f"MuJoCo cannot use the mesh: {said_by(error)}")
 
     def _new(
         self, uri: Element, file: Path, scale: tuple[float, ...], is_solid: bool
@@ -88,7 +85,7 @@ class Meshes:
         if needs_conversion(file):
             triangles = triangles_of(file)
             if triangles is None:
-                self.report.note(uri, why_unread(file))
+                uri.note(why_unread(file))
                 return None
         name, number = file.stem, 1
         while name in self._places:
@@ -104,6 +101,11 @@ class Meshes:
             fill(mesh, triangles)
             self.made[name] = triangles
         return name
+
+
+def said_by(error: Exception) -> str:
+    """What MuJoCo says of a model that it cannot compile, in one line."""
+    return " ".join(str(error).removeprefix("Error: ").split())
 
 
 def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
@@ -185,19 +187,38 @@ class Slab:
         return f"MuJoCo cannot collide a flat mesh: a box of {size} m stands in its place{outline}"
 
 
-def has_flat_meshes(model: Any) -> bool:
+def compile_boxed(
+    spec: Any, made: dict[str, Triangles], heard: list[Any]
+) -> tuple[Any, list[tuple[Any, Slab]]]:
+    """Compile a copy of a spec that was never compiled, with boxes for flat meshes that collide.
+
+    Args:
+        made: triangles of meshes that have no file.
+        heard: warnings; those of a first try are dropped.
+
+    Returns:
+        The ``MjModel``, and the geoms that became boxes. Raises what MuJoCo does.
+    """
+    try:
+        model = spec.copy().compile()  # MuJoCo 3 forgets no mesh of a geom
+        if not _has_flat_meshes(model):
+            return model, []
+    except ValueError:
+        pass  # perhaps for a flat mesh; if not, it is raised again below
+    heard.clear()
+    boxed = _box_flat_meshes(spec, made)
+    return spec.copy().compile(), boxed
+
+
+def _has_flat_meshes(model: Any) -> bool:
     """Whether a mesh collides that is flat but for rounding: it compiles, and holds nothing."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
     sizes = model.geom_size[is_mesh & ((model.geom_contype | model.geom_conaffinity) != 0)]
     return bool(np.any(sizes.min(axis=1) <= _FLAT * sizes.max(axis=1)))
 
 
-def box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
-    """Turn the colliding geoms of flat meshes into boxes, in a spec that was never compiled.
-
-    ``made`` are the triangles of meshes that have no file. Returns the geoms; those that only show
-    a flat mesh stay unchanged.
-    """
+def _box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
+    """Turn colliding geoms of flat meshes into boxes; those that only show one stay unchanged."""
     boxed = []
     for mesh in list(spec.meshes):
         slab = _slab_of(mesh, made.get(mesh.name))

@@ -4,16 +4,20 @@ A frame is a link, a joint, a nested model or a ``<frame>``; each is placed rela
 of its scope, or of a scope within (``arm::hand``). A scope places them relative to its own frame,
 which is called ``__model__`` (in a world: ``world``). See http://sdformat.org, "Pose frame
 semantics".
+
+Joints make a tree of the links (:func:`grow`). MuJoCo hangs every body on one other; SDF joins any
+two links. The tree begins with what hangs on the world, then with links that are no joint's child;
+a joint that it reaches from its child is turned round. Joints that close a loop are left over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.report import Report
-from neuros.simulators.convert.values import Pose, is_true, read_pose, text_of
+from neuros.simulators.convert.poses import Pose, read_pose
 
 _OWN = ("", "__model__", "world")
 _KINDS = ("link", "joint", "frame", "model")
@@ -55,7 +59,6 @@ class Scope:
     """
 
     element: Element
-    report: Report
     parent: Scope | None = None
     prefix: str = ""
     pose: Pose = field(default_factory=Pose)
@@ -92,7 +95,7 @@ class Scope:
         if rest:
             if head in self.models:
                 return self.place(head, asking) @ self.models[head].place(rest, asking)
-            self.report.problem(asking, f"there is no model '{head}' for '{name}'")
+            asking.problem(f"there is no model '{head}' for '{name}'")
             return Pose()
         if head in _OWN and (head != "world" or self.is_world):
             return Pose()
@@ -104,7 +107,7 @@ class Scope:
             self._places[head] = self._placed(head)
         place = self._places[head]
         if place is None:
-            self.report.problem(asking, f"'{name}' is placed relative to itself")
+            asking.problem(f"'{name}' is placed relative to itself")
             return Pose()
         return place
 
@@ -125,7 +128,7 @@ class Scope:
         base = relative_to(owner)
         if base:
             default = self.pose @ self.place(base, owner)
-        return default @ read_pose(owner, self.report)
+        return default @ read_pose(owner)
 
     def body(self, name: str, asking: Element) -> Link | None:
         """The link that a frame is attached to; ``None`` is the world. Problems are reported."""
@@ -149,7 +152,7 @@ class Scope:
             else:
                 scope._unknown(name, asking)
                 return None
-        self.report.problem(asking, f"'{name or self.element.name}' is attached to no link")
+        asking.problem(f"'{name or self.element.name}' is attached to no link")
         return None
 
     def canonical(self) -> str:
@@ -167,13 +170,13 @@ class Scope:
         if element.tag == "model":
             return self.models[name], "__model__"
         if element.tag == "joint":
-            return self, text_of(element, "child")
+            return self, element.text_of("child")
         return self, element.attributes.get("attached_to") or "__model__"
 
     def _unknown(self, name: str, asking: Element) -> None:
         names = ", ".join(sorted(self.frames)[:8])
         hint = f"there are: {names}" if names else ""
-        self.report.problem(asking, f"there is no link, joint, frame or model '{name}'", hint)
+        asking.problem(f"there is no link, joint, frame or model '{name}'", hint)
 
 
 def relative_to(owner: Element) -> str:
@@ -185,25 +188,23 @@ def relative_to(owner: Element) -> str:
     return pose.attributes.get("relative_to") or pose.attributes.get("frame") or ""
 
 
-def read_scope(
-    element: Element, report: Report, *, parent: Scope | None, prefix: str = ""
-) -> Scope:
+def read_scope(element: Element, parent: Scope | None = None, prefix: str = "") -> Scope:
     """A world or model with all that is in it, poses in the world still unknown."""
-    scope = Scope(element, report, parent, prefix)
+    scope = Scope(element, parent, prefix)
     placement = element.child("placement_frame")
     if placement is not None:
         element.attributes["placement_frame"] = placement.text
-    if not scope.is_world:
-        is_static = is_true(element, "static", report, default=False)
-        scope.is_static = is_static or (parent is not None and parent.is_static)
-        scope.self_collides = is_true(element, "self_collide", report, default=False)
+    if parent is not None:
+        scope.is_static = element.is_true("static") or parent.is_static
+        scope.self_collides = element.is_true("self_collide")
     for kind in _KINDS:
         for child in element.each(kind):
             _add_frame(scope, child)
     for child in element.each("model"):
         if child.name and child.name not in scope.models:
-            inner = f"{prefix}{child.name}/" if _needs_prefix(scope) else ""
-            scope.models[child.name] = read_scope(child, report, parent=scope, prefix=inner)
+            # A model that stands alone in its file needs no prefix.
+            inner = "" if scope.is_world and element.tag != "world" else f"{prefix}{child.name}/"
+            scope.models[child.name] = read_scope(child, scope, inner)
     return scope
 
 
@@ -218,28 +219,104 @@ def place_all(scope: Scope) -> None:
         link.pose = scope.pose @ scope.place(name, link.element)
 
 
-def _needs_prefix(scope: Scope) -> bool:
-    """A model that stands alone in its file needs none."""
-    return not scope.is_world or scope.element.tag == "world"
-
-
 def _add_frame(scope: Scope, element: Element) -> None:
     if not element.name:
-        scope.report.problem(element, f"the <{element.tag}> has no name")
+        element.problem(f"the <{element.tag}> has no name")
         return
     if element.name in scope.frames:
         first = scope.frames[element.name].element
-        scope.report.problem(
-            element, f"the name '{element.name}' occurs twice", f"see {first.place}"
-        )
+        element.problem(f"the name '{element.name}' occurs twice", f"see {first.place}")
         return
     default = ""
     if element.tag == "joint":
-        default = text_of(element, "child")
+        default = element.text_of("child")
     elif element.tag == "frame":
         default = element.attributes.get("attached_to", "")
     base = relative_to(element) or default
-    scope.frames[element.name] = Frame(element, base, read_pose(element, scope.report))
+    scope.frames[element.name] = Frame(element, base, read_pose(element))
     if element.tag == "link":
         name = scope.prefix + element.name
         scope.links[element.name] = Link(name, element, scope, Pose(), scope.is_static)
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint between two links, ``None`` being the world."""
+
+    element: Element
+    scope: Scope
+    parent: Link | None
+    child: Link | None
+
+    @property
+    def name(self) -> str:
+        return self.scope.prefix + self.element.name
+
+    @property
+    def type(self) -> str:
+        return self.element.type
+
+    @property
+    def anchor(self) -> Pose:
+        """Its pose in the world."""
+        return self.scope.pose @ self.scope.place(self.element.name, self.element)
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A link and what it hangs on: a joint to ``parent`` (``None``: the world), or nothing."""
+
+    link: Link
+    parent: Link | None = None
+    joint: Joint | None = None
+    is_turned: bool = False
+
+
+@dataclass
+class Tree:
+    """Branches in an order in which a parent comes before what hangs on it."""
+
+    branches: list[Branch] = field(default_factory=list)
+    loops: list[Joint] = field(default_factory=list)
+
+
+def grow(links: Sequence[Link], joints: Sequence[Joint]) -> Tree:
+    """The tree of all links. Those of static models hang on the world, without a joint."""
+    tree, used = Tree(), set[int]()
+    seen = {id(link) for link in links if link.is_static}
+    tree.branches += [Branch(link) for link in links if link.is_static]
+    at: dict[int | None, list[Joint]] = {}
+    for joint in joints:
+        for end in {_key(joint.parent), _key(joint.child)}:
+            at.setdefault(end, []).append(joint)
+
+    def spread(start: Link | None) -> None:
+        waiting = deque([start])
+        while waiting:
+            link = waiting.popleft()
+            for joint in at.get(_key(link), ()):
+                if id(joint) in used:
+                    continue
+                used.add(id(joint))
+                is_turned = _key(joint.parent) != _key(link)
+                other = joint.parent if is_turned else joint.child
+                if other is None or other.is_static or id(other) in seen:
+                    tree.loops.append(joint)
+                    continue
+                seen.add(id(other))
+                tree.branches.append(Branch(other, link, joint, is_turned))
+                waiting.append(other)
+
+    spread(None)
+    children = {_key(joint.child) for joint in joints}
+    for link in sorted(links, key=lambda link: id(link) in children):
+        if id(link) not in seen:
+            seen.add(id(link))
+            tree.branches.append(Branch(link))
+            spread(link)
+    return tree
+
+
+def _key(link: Link | None) -> int | None:
+    """The key of a link; one that never moves counts as the world."""
+    return None if link is None or link.is_static else id(link)

@@ -14,25 +14,25 @@ from typing import Any
 import mujoco
 
 from neuros.errors import Problem
-from neuros.simulators.convert.elements import Element, parse
+from neuros.simulators.convert.elements import Element, Report, parse
 from neuros.simulators.convert.find import Finder, NotFound
 from neuros.simulators.convert.joints import follow_joint
 from neuros.simulators.convert.meshes import (
     Triangles,
-    box_flat_meshes,
+    compile_boxed,
     fill,
-    has_flat_meshes,
     needs_conversion,
+    said_by,
     triangles_of,
     why_unread,
 )
 from neuros.simulators.convert.output import Converted
-from neuros.simulators.convert.report import Report
 
+_DRIVES = "declare drives in the node file: `joint` and `drive`"
 _UNSUPPORTED_ELEMENTS = {
     "gazebo": "an extension for Gazebo",
-    "transmission": "declare drives in the node file: `joint` and `drive`",
-    "ros2_control": "declare drives in the node file: `joint` and `drive`",
+    "transmission": _DRIVES,
+    "ros2_control": _DRIVES,
     "safety_controller": "MuJoCo has no such limits",
     "calibration": "nothing to calibrate in a simulation",
 }
@@ -46,61 +46,54 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
         DescriptionError: with every mesh that cannot be found, or what MuJoCo says of the rest.
     """
     report = Report()
-    root = parse(file)
+    root = parse(file, report)
     if isinstance(root, Problem):
         report.problems.append(root)
         report.raise_any()
     assert isinstance(root, Element)
     if root.tag != "robot":
-        report.problem(root, f"a URDF file begins with <robot>, not with <{root.tag}>")
-    tree = ElementTree.ElementTree(_copy(root))
-    converted = _resolve_meshes(tree, root, finder, report)
+        root.problem(f"a URDF file begins with <robot>, not with <{root.tag}>")
+    robot = _copy(root)
+    unread = _resolve_meshes(robot, root, finder)
     report.raise_any()
-    _keep_names(tree)
-    spec, made = _spec(tree, root, converted, report)
+    _keep_names(robot)
+    spec, made = _spec(robot, root, unread)
     for element in _all(root):
         if element.tag in _UNSUPPORTED_ELEMENTS:
-            report.note(element, _UNSUPPORTED_ELEMENTS[element.tag])
+            element.note(_UNSUPPORTED_ELEMENTS[element.tag])
         elif element.tag == "mimic" and element.parent is not None:
-            _mimic(spec, element, report)
+            _mimic(spec, element, element.parent)
     model = spec.copy().compile()
     return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
 
 
-def _resolve_meshes(
-    tree: ElementTree.ElementTree[Any], root: Element, finder: Finder, report: Report
-) -> dict[str, Path]:
-    """Give every mesh an absolute path; those that MuJoCo does not read are returned."""
-    converted: dict[str, Path] = {}
-    folder = _mesh_folder(root)
-    for element, twin in zip(_all(root), tree.getroot().iter(), strict=True):
+def _resolve_meshes(robot: ElementTree.Element, root: Element, finder: Finder) -> set[str]:
+    """Give every mesh in ``robot`` an absolute path; returns those that MuJoCo does not read."""
+    unread: set[str] = set()
+    here, compiler = root.file.parent, root.child("mujoco", "compiler")
+    folder = Path("" if compiler is None else compiler.attributes.get("meshdir", ""))
+    for element, twin in zip(_all(root), robot.iter(), strict=True):
         if element.tag != "mesh" or "filename" not in element.attributes:
             continue
         uri = element.attributes["filename"]
         try:
             try:
-                path = finder.find_file(uri, root.file.parent)
+                path = finder.find_file(uri, here)
             except NotFound:
-                path = finder.find_file(str(folder / Path(uri).name), root.file.parent)
+                path = finder.find_file(str(folder / Path(uri).name), here)
         except NotFound:
             hint = "name the folder of the package with -I, or in ROS_PACKAGE_PATH"
-            report.problem(element, f"'{uri}' cannot be found", hint)
+            element.problem(f"'{uri}' cannot be found", hint)
             continue
         twin.set("filename", str(path))
         if needs_conversion(path):
             if triangles_of(path) is None:
-                report.problem(element, why_unread(path))
-            converted[str(path)] = path
-    return converted
+                element.problem(why_unread(path))
+            unread.add(str(path))
+    return unread
 
 
-def _mesh_folder(root: Element) -> Path:
-    compiler = root.child("mujoco", "compiler")
-    return Path("" if compiler is None else compiler.attributes.get("meshdir", ""))
-
-
-def _keep_names(tree: ElementTree.ElementTree[Any]) -> None:
-    robot = tree.getroot()
+def _keep_names(robot: ElementTree.Element) -> None:
     block = robot.find("mujoco")
     if block is None:
         block = ElementTree.SubElement(robot, "mujoco")
@@ -114,50 +107,36 @@ def _keep_names(tree: ElementTree.ElementTree[Any]) -> None:
 
 
 def _spec(
-    tree: ElementTree.ElementTree[Any], root: Element, converted: dict[str, Path], report: Report
+    robot: ElementTree.Element, root: Element, unread: set[str]
 ) -> tuple[Any, dict[str, Triangles]]:
     made: dict[str, Triangles] = {}
     try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(tree.getroot(), "unicode"))
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, "unicode"))
         for mesh in spec.meshes:
-            triangles = triangles_of(converted[mesh.file]) if mesh.file in converted else None
+            triangles = triangles_of(Path(mesh.file)) if mesh.file in unread else None
             if triangles is not None:
                 mesh.file = ""
                 fill(mesh, triangles)
                 made[mesh.name] = triangles
-        _compile(spec, made, root, report)
+        _, boxed = compile_boxed(spec, made, [])
     except (ValueError, mujoco.FatalError) as error:
-        text = " ".join(str(error).removeprefix("Error: ").split())
-        report.problem(root, f"MuJoCo cannot compile it: {text}")
-        report.raise_any()
+        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
+        root.report.raise_any()
         raise
+    links = {element.name: element for element in _all(root) if element.tag == "link"}
+    for geom, slab in boxed:
+        links.get(geom.parent.name, root).remark(str(slab))
     return spec, made
 
 
-def _compile(spec: Any, made: dict[str, Triangles], root: Element, report: Report) -> None:
-    """Compile a copy, with boxes for flat meshes; raises what MuJoCo does."""
-    try:
-        if not has_flat_meshes(spec.copy().compile()):
-            return
-    except ValueError:
-        pass  # perhaps for a flat mesh; if not, it is raised again below
-    links = {element.name: element for element in _all(root) if element.tag == "link"}
-    for geom, slab in box_flat_meshes(spec, made):
-        report.remark(links.get(geom.parent.name, root), str(slab))
-    spec.copy().compile()
-
-
-def _mimic(spec: Any, mimic: Element, report: Report) -> None:
+def _mimic(spec: Any, mimic: Element, joint: Element) -> None:
     """MuJoCo's reader passes over ``<mimic>``: the joint follows another one."""
-    joint, leader = mimic.parent, mimic.attributes.get("joint", "")
-    assert joint is not None
+    leader = mimic.attributes.get("joint", "")
     if spec.joint(joint.name) is None or spec.joint(leader) is None:
-        report.note(mimic, f"one of '{joint.name}' and '{leader}' does not move in MuJoCo")
+        mimic.note(f"one of '{joint.name}' and '{leader}' does not move in MuJoCo")
         return
-    offset, ratio = (
-        float(mimic.attributes.get(key, default))
-        for key, default in (("offset", 0.0), ("multiplier", 1.0))
-    )
+    offset = float(mimic.attributes.get("offset", 0.0))
+    ratio = float(mimic.attributes.get("multiplier", 1.0))
     follow_joint(spec, joint.name, leader, offset, ratio)
 
 

@@ -1,32 +1,8 @@
 """Commands: actuators that inputs drive, declared in the node file, and their ROS messages.
 
-===============================  ===========================================================
-message type                     what it drives
-===============================  ===========================================================
-``std_msgs/Float64``             one actuator
-``std_msgs/Float64MultiArray``   any number, in the order of ``actuators``
-``sensor_msgs/JointState``       those of ``actuators`` that it names, by joint or actuator:
-                                 position servos take ``position``, velocity servos
-                                 ``velocity``, all others ``effort``
-``geometry_msgs/Twist``          two actuators: linear.x, angular.z; three: linear.x,
-                                 linear.y, angular.z; six: all. They are passed on, not
-                                 turned into another frame
-===============================  ===========================================================
-
-MuJoCo clamps a control to the ``ctrlrange`` of its actuator.
-
 For a joint without an actuator, as those of URDF, the node file declares one, a drive:
-``{"joint": "elbow", "drive": "position", "kp": 50, "kv": 5, "force_limit": 10}``
-
-============  =====================  ==================================================
-``drive``     gains                  what a command is
-============  =====================  ==================================================
-``position``  ``kp``, and ``kv``     where to go: radians or metres
-``velocity``  ``kv``                 how fast: per second
-``motor``     none                   force or torque: N or N m
-============  =====================  ==================================================
-
-``force_limit`` bounds what any of them applies (N or N m).
+``{"joint": "elbow", "drive": "position", "kp": 50, "kv": 5, "force_limit": 10}``. MuJoCo clamps a
+control to the ``ctrlrange`` of its actuator. ``docs/simulators.md`` has the message types.
 """
 
 from __future__ import annotations
@@ -41,12 +17,13 @@ import mujoco
 from neuros.errors import ModelError
 from neuros.ports import Packet
 from neuros.project.model import Node, Port
-from neuros.simulators.mujoco.declarations import (
+from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
     either,
     find,
+    id_of,
     is_list_of_names,
     names_of,
 )
@@ -62,12 +39,12 @@ _TWIST_FIELDS = {
     6: tuple((part, axis) for part in ("linear", "angular") for axis in "xyz"),
 }
 _NAMING = ("actuator", "actuators", "joint", "joints")
-_GAINS: Mapping[str, tuple[str, ...]] = {
-    "position": ("kp", "kv"),
-    "velocity": ("kv",),
-    "motor": (),
+_GAINS: Mapping[str, Mapping[str, bool]] = {
+    "position": {"kp": True, "kv": False},
+    "velocity": {"kv": True},
+    "motor": {},
 }
-_NEEDED: Mapping[str, tuple[str, ...]] = {"position": ("kp",), "velocity": ("kv",), "motor": ()}
+"""The gains of each kind of drive, and whether it needs them."""
 _DRIVE_KEYS = ("drive", "kp", "kv", "force_limit")
 
 
@@ -114,18 +91,16 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
     (key,) = given
     drives = key in ("joint", "joints")
     faults.unknown_keys(port.mujoco, (*_NAMING, *(_DRIVE_KEYS if drives else ())))
-    value = port.mujoco[key]
-    is_one = key in ("actuator", "joint")
+    value, is_one = port.mujoco[key], key in ("actuator", "joint")
     names = (value,) if is_one else value
     if not is_list_of_names(names):
         faults.add(key, f"{value!r} is not a {'name' if is_one else 'list of names'}")
         return None
-    drive = _read_drive(port.mujoco, faults.add) if drives else None
-    _, sizes = _MESSAGE_TYPES.get(port.type, (None, ()))
+    drive = _read_drive(port.mujoco, faults) if drives else None
     if port.type not in _MESSAGE_TYPES:
         text = f"input '{port.name}' is a {port.type}; a command is {either(tuple(_MESSAGE_TYPES))}"
         faults.add(key, text)
-    elif sizes and len(names) not in sizes:
+    elif (sizes := _MESSAGE_TYPES[port.type][1]) and len(names) not in sizes:
         some = either([str(size) for size in sizes])
         faults.add(key, f"a {port.type} drives {some} actuators, not {len(names)}")
     if faults.found:
@@ -133,24 +108,21 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
     return CommandDeclaration(port.name, port.type, tuple(names), f"{pointer}/{key}", drive)
 
 
-def _read_drive(declared: Mapping[str, Any], complain: Callable[[str, str], None]) -> Drive | None:
-    """The drive that a node file declares; ``complain`` gets keys and what is wrong with them."""
+def _read_drive(declared: Mapping[str, Any], faults: Faults) -> Drive | None:
     kind = declared.get("drive")
     if not isinstance(kind, str) or kind not in _GAINS:
-        complain("drive", f"{kind!r} is not one of {', '.join(_GAINS)}")
+        faults.add("drive", f"{kind!r} is not one of {', '.join(_GAINS)}")
         return None
-    allowed = ("drive", "force_limit", *_GAINS[kind])
-    values = {}
+    gains, values = {**_GAINS[kind], "force_limit": False}, dict[str, float]()
     for key in _DRIVE_KEYS[1:]:
+        value = declared.get(key)
         if key not in declared:
-            if key in _NEEDED[kind]:
-                complain(key, f"missing: a {kind} drive needs it")
-            continue
-        value = declared[key]
-        if key not in allowed:
-            complain(key, f"a {kind} drive has no {key}")
+            if gains.get(key):
+                faults.add(key, f"missing: a {kind} drive needs it")
+        elif key not in gains:
+            faults.add(key, f"a {kind} drive has no {key}")
         elif isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            complain(key, f"{value!r} is not a positive number")
+            faults.add(key, f"{value!r} is not a positive number")
         else:
             values[key] = float(value)
     return Drive(kind, **values)
@@ -193,29 +165,24 @@ def bind_commands(
 ) -> dict[str, Command]:
     """For each input the function from its packets to controls; problems are reported."""
     commands: dict[str, Command] = {}
-    for declaration in declarations:
-        found = [_find(model, declaration, name, problems) for name in declaration.actuators]
-        actuators = [element[1] for element in found if element]
-        read, _ = _MESSAGE_TYPES[declaration.type]
-        command = read(model, actuators, declaration.input)
-        commands[declaration.input] = _checked(declaration.input, command)
+    for declared in declarations:
+        # The actuator that a drive has added is missing only with its joint.
+        sort = "actuator" if declared.drive is None else "joint"
+        known = [
+            name
+            for name in declared.actuators
+            if find(model, (sort,), name, declared.pointer, problems)
+        ]
+        found = [find(model, ("actuator",), name, declared.pointer, problems) for name in known]
+        read, _ = _MESSAGE_TYPES[declared.type]
+        command = read(model, [actuator for _, actuator in filter(None, found)], declared.input)
+        commands[declared.input] = _checked(declared.input, command)
     return commands
-
-
-def _find(
-    model: Any, declaration: CommandDeclaration, name: str, problems: Problems
-) -> tuple[str, int] | None:
-    """An actuator; one that a drive has added is missing only with its joint."""
-    what = "actuator" if declaration.drive is None else "joint"
-    found = find(model, (what,), name, declaration.pointer, problems)
-    if found is None or what == "actuator":
-        return found
-    return find(model, ("actuator",), name, declaration.pointer, problems)
 
 
 def control(model: Any, actuator: str, value: float) -> Controls:
     """One control by the name of its actuator; raises ``ModelError``."""
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR.value, actuator)
+    index = id_of(model, "actuator", actuator)
     if index < 0:
         hint = did_you_mean(actuator, names_of(model, "actuator"))
         raise ModelError(f"the model has no actuator '{actuator}'{hint}")

@@ -1,9 +1,10 @@
-"""Sensors: declarations in the node file, measured quantities, and the ROS messages they fill.
+"""Sensors: a class each, with what a node file declares, the units, and how it fills a message.
 
-Declarations are read and checked without a model; every problem is gathered, so that the user sees
-all of them at once. Each ``_bind_...`` then looks the elements up once, by name, and returns a
-function that fills a packet from the data right after ``mj_forward``; only that runs at a firing.
+To add one, write a subclass of :class:`Sensor` here and name it in :data:`SENSORS`; then
+:func:`write_schema` puts it into the schema of node files.
 
+Declarations are read and checked without a model. All problems are gathered. A sensor looks its
+elements up once, by name; at a firing it only fills a packet, from the data after ``mj_forward``.
 Where the model has a sensor of its own at the element (``gyro``, ``accelerometer``, ``framequat``),
 its reading is taken, with its cutoff. Otherwise the quantity is computed from the data, as MuJoCo's
 sensors compute it.
@@ -11,10 +12,11 @@ sensors compute it.
 
 from __future__ import annotations
 
+import json
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import mujoco
 import numpy as np
@@ -22,8 +24,9 @@ import numpy.typing as npt
 
 from neuros.ports import Packet
 from neuros.project.model import Node, Port
+from neuros.project.validate import SCHEMA_FOLDER, schema
 from neuros.simulators.mujoco.cameras import Cameras
-from neuros.simulators.mujoco.declarations import (
+from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
@@ -32,9 +35,6 @@ from neuros.simulators.mujoco.declarations import (
     is_list_of_names,
     names_of,
 )
-
-Fill: TypeAlias = Callable[[Packet, Any, int], None]
-"""``fill(packet, data, time_ns)``."""
 
 Vector: TypeAlias = "list[float]"
 """3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
@@ -56,115 +56,45 @@ class SensorDeclaration:
     height: int = 480
 
 
-@dataclass(frozen=True)
-class Binding:
-    """One declaration on its way to a :data:`Fill`."""
+class Sensor:
+    """A sensor behind an output, bound to a model; one subclass for each kind.
 
-    declaration: SensorDeclaration
-    model: Any
-    cameras: Cameras
-    problems: Problems
+    The first line of a subclass's docstring describes it in the schema.
 
-    def find(self, *sorts: str) -> tuple[str, int] | None:
-        """The one element of the declaration."""
-        name, pointer = self.declaration.elements[0], f"{self.declaration.pointer}/element"
-        return find(self.model, sorts, name, pointer, self.problems)
-
-    def find_all(self, *sorts: str) -> list[tuple[str, int]]:
-        """The elements of the declaration, in order; unknown ones are reported and left out."""
-        pointer = f"{self.declaration.pointer}/element"
-        found = (
-            find(self.model, sorts, name, pointer, self.problems)
-            for name in self.declaration.elements
-        )
-        return [element for element in found if element]
-
-
-@dataclass(frozen=True)
-class SensorKind:
-    """One kind of sensor: what it can be declared with, and how it is bound to a model.
-
-    ``types`` are the message types that it can fill; ``list_types`` those of them that take a list
-    of elements; ``element`` says whether one has to be named.
+    Attributes:
+        kind: what ``"sensor"`` in a node file says.
+        types: the message types that it can fill.
+        list_types: those of them that take a list of elements.
+        sorts: the sorts of elements it measures, empty for none; the first that has the name wins.
+        is_optional: whether the element may be left out.
+        keys: further keys of its declaration, in pixels.
+        declared: the declaration.
+        elements: sort and id of each element that it names.
     """
 
-    bind: Callable[[Binding], Fill | None]
-    types: tuple[str, ...]
-    element: str = "required"  # or "optional", or "none"
-    list_types: tuple[str, ...] = ()
-    keys: tuple[str, ...] = ()
+    kind: ClassVar[str]
+    types: ClassVar[tuple[str, ...]]
+    list_types: ClassVar[tuple[str, ...]] = ()
+    sorts: ClassVar[tuple[str, ...]] = ()
+    is_optional: ClassVar[bool] = False
+    keys: ClassVar[tuple[str, ...]] = ()
 
+    def __init__(
+        self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
+    ) -> None:
+        self.declared, self.model, self.cameras = declared, model, cameras
+        pointer = f"{declared.pointer}/element"
+        found = [find(model, self.sorts, name, pointer, problems) for name in declared.elements]
+        self.elements = [element for element in found if element]
+        if len(self.elements) == len(found):
+            self.bind(problems)
 
-def read_sensors(node: Node, problems: Problems) -> tuple[SensorDeclaration, ...]:
-    """The sensors that the outputs of ``node`` declare; faulty ones are left out and reported."""
-    found = (
-        _sensor(port, f"{node.pointer}/outputs/{index}/mujoco", problems)
-        for index, port in enumerate(node.outputs)
-        if port.mujoco
-    )
-    return tuple(sensor for sensor in found if sensor)
+    def bind(self, problems: Problems) -> None:
+        """Prepare to measure the elements, once; what is wrong with them is reported."""
 
-
-def _sensor(port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
-    name = port.mujoco.get("sensor")
-    kind = SENSOR_KINDS.get(name) if isinstance(name, str) else None
-    if kind is None:
-        hint = did_you_mean(str(name or ""), SENSOR_KINDS)
-        problems.add(f"{pointer}/sensor", f"{name!r} is not a kind of sensor{hint}")
-        return None
-    faults = Faults(pointer, problems)
-    faults.unknown_keys(port.mujoco, ("sensor", "element", "rate", *kind.keys))
-    if port.type not in kind.types:
-        faults.add(
-            "sensor",
-            f"'{name}' fills {either(kind.types)}, but output '{port.name}' is a {port.type}",
-        )
-    elements = _elements(port, kind, faults)
-    rate: Any = port.mujoco.get("rate")
-    if not _is_positive(rate):
-        faults.add("rate", f"{rate!r} is not a positive number (firings per simulated second)")
-        rate = 1
-    size = {key: _pixels(port.mujoco, key, faults) for key in kind.keys if key in port.mujoco}
-    if faults.found:
-        return None
-    return SensorDeclaration(
-        port.name, port.type, str(name), elements, float(rate), pointer, **size
-    )
-
-
-def _elements(port: Port, kind: SensorKind, faults: Faults) -> tuple[str, ...]:
-    value = port.mujoco.get("element")
-    if value is None:
-        if kind.element == "required":
-            faults.add("element", "missing: name the element of the model that is measured")
-        return ()
-    if kind.element == "none":
-        faults.add("element", "a clock measures no element: leave this key out")
-        return ()
-    if isinstance(value, str):
-        return (value,)
-    if not is_list_of_names(value):
-        faults.add("element", f"{value!r} is neither a name nor a list of names")
-        return ()
-    if port.type not in kind.list_types:
-        hint = f"; a list needs {either(kind.list_types)}" if kind.list_types else ""
-        faults.add("element", f"a {port.type} holds one element only{hint}")
-        return ()
-    return tuple(value)
-
-
-def _pixels(declared: Mapping[str, Any], key: str, faults: Faults) -> int:
-    value = declared[key]
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16384:
-        faults.add(key, f"{value!r} is not a number of pixels from 1 to 16384")
-        return 1
-    return value
-
-
-def _is_positive(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return 0 < value < float("inf")
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        """Fill a message from the data right after ``mj_forward``."""
+        raise NotImplementedError
 
 
 def _set_time(time: Any, time_ns: int) -> None:
@@ -189,8 +119,8 @@ def _set_quaternion(quaternion: Any, values: Vector) -> None:
 class _Place:
     """The frame of a site, or of a body (its own frame, not the one of its inertia)."""
 
-    def __init__(self, model: Any, what: str, index: int) -> None:
-        self._model, self._is_site, self.index = model, what == "site", index
+    def __init__(self, model: Any, sort: str, index: int) -> None:
+        self._model, self._is_site, self.index = model, sort == "site", index
         objects = mujoco.mjtObj
         self.object = (objects.mjOBJ_SITE if self._is_site else objects.mjOBJ_XBODY).value
         self._spatial, self._turned = np.zeros(6), np.zeros(4)
@@ -201,19 +131,19 @@ class _Place:
     def position(self, data: Any) -> Vector:
         """In the world, metres."""
         positions = data.site_xpos if self._is_site else data.xpos
-        return _plain(positions[self.index])
+        return _listed(positions[self.index])
 
     def orientation(self, data: Any) -> Vector:
         """In the world, a unit quaternion."""
         if not self._is_site:
-            return _plain(data.xquat[self.index])
+            return _listed(data.xquat[self.index])
         mujoco.mju_mulQuat(self._turned, data.xquat[self._body], self._in_body)
-        return _plain(self._turned)
+        return _listed(self._turned)
 
     def angular_velocity(self, data: Any) -> Vector:
         """In the frame of the place, rad/s: a gyroscope."""
         mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
-        return _plain(self._spatial[:3])
+        return _listed(self._spatial[:3])
 
     def acceleration(self, data: Any) -> Vector:
         """In the frame of the place, m/s^2, gravity included: an accelerometer."""
@@ -221,10 +151,10 @@ class _Place:
         if not getattr(data, "flg_rnepost", False):
             mujoco.mj_rnePostConstraint(self._model, data)
         mujoco.mj_objectAcceleration(self._model, data, self.object, self.index, self._spatial, 1)
-        return _plain(self._spatial[3:])
+        return _listed(self._spatial[3:])
 
 
-def _plain(values: Any) -> Vector:
+def _listed(values: Any) -> Vector:
     numbers: Vector = values.tolist()
     return numbers
 
@@ -238,7 +168,7 @@ class _OwnSensor:
     variance: float
 
     def read(self, data: Any) -> Vector:
-        return _plain(data.sensordata[self.start : self.end])
+        return _listed(data.sensordata[self.start : self.end])
 
 
 def _own_sensor(model: Any, sensor_type: Any, place: _Place) -> _OwnSensor | None:
@@ -256,94 +186,11 @@ def _own_sensor(model: Any, sensor_type: Any, place: _Place) -> _OwnSensor | Non
     return None
 
 
-def _bind_imu(binding: Binding) -> Fill | None:
-    """``sensor_msgs/Imu`` in the frame of a site or body, as REP 145 wants it.
-
-    ``linear_acceleration`` (m/s^2) includes gravity: +9.81 upwards at rest, 0 in free fall.
-    ``angular_velocity`` in rad/s; ``orientation`` of the element in the world. Covariances: the
-    square of ``noise`` of the model's own sensor on the diagonal, else zeros ("unknown"). MuJoCo
-    adds no noise to readings, and neither is any added here.
-    """
-    element = binding.find("site", "body")
-    if element is None:
-        return None
-    model, frame = binding.model, binding.declaration.elements[0]
-    place = _Place(model, *element)
-    gyro = _own_sensor(model, mujoco.mjtSensor.mjSENS_GYRO, place)
-    accelerometer = _own_sensor(model, mujoco.mjtSensor.mjSENS_ACCELEROMETER, place)
-    orientation = _own_sensor(model, mujoco.mjtSensor.mjSENS_FRAMEQUAT, place)
-
-    def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        _set_header(packet.header, time_ns, frame)
-        velocity = gyro.read(data) if gyro else place.angular_velocity(data)
-        acceleration = accelerometer.read(data) if accelerometer else place.acceleration(data)
-        attitude = orientation.read(data) if orientation else place.orientation(data)
-        _set_vector(packet.angular_velocity, velocity)
-        _set_vector(packet.linear_acceleration, acceleration)
-        _set_quaternion(packet.orientation, attitude)
-        if gyro:
-            packet.angular_velocity_covariance[::4] = gyro.variance
-        if accelerometer:
-            packet.linear_acceleration_covariance[::4] = accelerometer.variance
-        if orientation:
-            packet.orientation_covariance[::4] = orientation.variance
-
-    return fill
-
-
-def _bind_pose(binding: Binding) -> Fill | None:
-    """``geometry_msgs/PoseStamped`` or ``Pose`` of a site or body in the world, in metres."""
-    element = binding.find("site", "body")
-    if element is None:
-        return None
-    place = _Place(binding.model, *element)
-    stamped = binding.declaration.type.endswith("Stamped")
-
-    def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        if stamped:
-            _set_header(packet.header, time_ns, _WORLD_FRAME)
-        pose = packet.pose if stamped else packet
-        _set_vector(pose.position, place.position(data))
-        _set_quaternion(pose.orientation, place.orientation(data))
-
-    return fill
-
-
-def _bind_joint_states(binding: Binding) -> Fill | None:
-    """``sensor_msgs/JointState`` of hinges (rad, rad/s, N m) and slides (m, m/s, N).
-
-    Without names: all that have one, in the order of the model. ``effort`` is what the actuators
-    apply to the joint.
-    """
-    model, names = binding.model, binding.declaration.elements
-    single = (mujoco.mjtJoint.mjJNT_HINGE.value, mujoco.mjtJoint.mjJNT_SLIDE.value)
-    if names:
-        joints = [index for _, index in binding.find_all("joint")]
-        pointer = f"{binding.declaration.pointer}/element"
-        for index in (index for index in joints if model.jnt_type[index] not in single):
-            name = names_of(model, "joint")[index]
-            binding.problems.add(pointer, f"joint '{name}' is neither a hinge nor a slide")
-    else:
-        named = enumerate(names_of(model, "joint"))
-        joints = [index for index, name in named if name and model.jnt_type[index] in single]
-        names = tuple(names_of(model, "joint")[index] for index in joints)
-    positions, speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-
-    def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        _set_time(packet.header.stamp, time_ns)
-        packet.name = list(names)
-        packet.position = array("d", data.qpos[positions].tobytes())
-        packet.velocity = array("d", data.qvel[speeds].tobytes())
-        packet.effort = array("d", data.qfrc_actuator[speeds].tobytes())
-
-    return fill
-
-
 class _Touch:
     """The contacts of one geom or body."""
 
-    def __init__(self, model: Any, what: str, index: int) -> None:
-        self._model, self._is_geom, self._index = model, what == "geom", index
+    def __init__(self, model: Any, sort: str, index: int) -> None:
+        self._model, self._is_geom, self._index = model, sort == "geom", index
         geoms = np.arange(model.ngeom)
         self._mine = geoms == index if self._is_geom else model.geom_bodyid[geoms] == index
 
@@ -377,8 +224,99 @@ class _Touch:
             yield contact, (-1 if mine[contact, 0] else 1), local
 
 
-def _bind_contacts(binding: Binding) -> Fill | None:
-    """Contacts of a geom, or of the geoms of a body.
+class Imu(Sensor):
+    """An IMU at a site or body, in its frame, as in REP 145.
+
+    ``linear_acceleration`` (m/s^2) includes gravity: +9.81 upwards at rest, 0 in free fall.
+    ``angular_velocity`` in rad/s; ``orientation`` of the element in the world. Covariances: the
+    square of ``noise`` of the model's own sensor on the diagonal, else zeros ("unknown"). Neither
+    MuJoCo nor NeuROS adds noise to readings.
+    """
+
+    kind = "imu"
+    types = ("sensor_msgs/msg/Imu",)
+    sorts = ("site", "body")
+
+    def bind(self, problems: Problems) -> None:
+        self._place = place = _Place(self.model, *self.elements[0])
+        kinds = mujoco.mjtSensor
+        self._gyro = _own_sensor(self.model, kinds.mjSENS_GYRO, place)
+        self._accelerometer = _own_sensor(self.model, kinds.mjSENS_ACCELEROMETER, place)
+        self._orientation = _own_sensor(self.model, kinds.mjSENS_FRAMEQUAT, place)
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        place, gyro, accelerometer = self._place, self._gyro, self._accelerometer
+        orientation = self._orientation
+        _set_header(packet.header, time_ns, self.declared.elements[0])
+        velocity = gyro.read(data) if gyro else place.angular_velocity(data)
+        acceleration = accelerometer.read(data) if accelerometer else place.acceleration(data)
+        attitude = orientation.read(data) if orientation else place.orientation(data)
+        _set_vector(packet.angular_velocity, velocity)
+        _set_vector(packet.linear_acceleration, acceleration)
+        _set_quaternion(packet.orientation, attitude)
+        if gyro:
+            packet.angular_velocity_covariance[::4] = gyro.variance
+        if accelerometer:
+            packet.linear_acceleration_covariance[::4] = accelerometer.variance
+        if orientation:
+            packet.orientation_covariance[::4] = orientation.variance
+
+
+class Pose(Sensor):
+    """Pose of a site or body in the world, in metres."""
+
+    kind = "pose"
+    types = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Pose")
+    sorts = ("site", "body")
+
+    def bind(self, problems: Problems) -> None:
+        self._place = _Place(self.model, *self.elements[0])
+        self._is_stamped = self.declared.type.endswith("Stamped")
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        if self._is_stamped:
+            _set_header(packet.header, time_ns, _WORLD_FRAME)
+        pose = packet.pose if self._is_stamped else packet
+        _set_vector(pose.position, self._place.position(data))
+        _set_quaternion(pose.orientation, self._place.orientation(data))
+
+
+class JointStates(Sensor):
+    """Joints, all that have a name if no element is given.
+
+    Hinges (rad, rad/s, N m) and slides (m, m/s, N). Without names the order is that of the model.
+    ``effort`` is what the actuators apply to the joint.
+    """
+
+    kind = "joint_states"
+    types = list_types = ("sensor_msgs/msg/JointState",)
+    sorts = ("joint",)
+    is_optional = True
+
+    def bind(self, problems: Problems) -> None:
+        names, types = names_of(self.model, "joint"), self.model.jnt_type
+        single = (mujoco.mjtJoint.mjJNT_HINGE.value, mujoco.mjtJoint.mjJNT_SLIDE.value)
+        joints = [index for _, index in self.elements]
+        if not joints:
+            joints = [i for i, name in enumerate(names) if name and types[i] in single]
+        for index in joints:
+            if types[index] not in single:
+                text = f"joint '{names[index]}' is neither a hinge nor a slide"
+                problems.add(f"{self.declared.pointer}/element", text)
+        self._names = [names[index] for index in joints]
+        self._positions = self.model.jnt_qposadr[joints]
+        self._speeds = self.model.jnt_dofadr[joints]
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        _set_time(packet.header.stamp, time_ns)
+        packet.name = list(self._names)
+        packet.position = array("d", data.qpos[self._positions].tobytes())
+        packet.velocity = array("d", data.qvel[self._speeds].tobytes())
+        packet.effort = array("d", data.qfrc_actuator[self._speeds].tobytes())
+
+
+class Contacts(Sensor):
+    """Contacts of a geom or body; of a list of them into a Float64MultiArray.
 
     ========================  ==========================================================
     message type              content
@@ -393,83 +331,174 @@ def _bind_contacts(binding: Binding) -> Fill | None:
     A body stands for its own geoms, not for those of its children. Contacts between geoms of one
     element do not count.
     """
-    elements = binding.find_all("geom", "body")
-    if len(elements) < len(binding.declaration.elements):
-        return None
-    touches = [_Touch(binding.model, what, index) for what, index in elements]
 
-    def fill_bool(packet: Any, data: Any, time_ns: int) -> None:
-        packet.data = touches[0].normal_force(data) > 0
+    kind = "contacts"
+    types = (
+        "std_msgs/msg/Bool",
+        "std_msgs/msg/Float64",
+        "std_msgs/msg/Float64MultiArray",
+        "geometry_msgs/msg/WrenchStamped",
+    )
+    list_types = ("std_msgs/msg/Float64MultiArray",)
+    sorts = ("geom", "body")
 
-    def fill_float(packet: Any, data: Any, time_ns: int) -> None:
-        packet.data = touches[0].normal_force(data)
+    def bind(self, problems: Problems) -> None:
+        self._touches = [_Touch(self.model, *element) for element in self.elements]
 
-    def fill_floats(packet: Any, data: Any, time_ns: int) -> None:
-        packet.data = [touch.normal_force(data) for touch in touches]
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        touch = self._touches[0]
+        match self.declared.type:
+            case "std_msgs/msg/Bool":
+                packet.data = touch.normal_force(data) > 0
+            case "std_msgs/msg/Float64":
+                packet.data = touch.normal_force(data)
+            case "std_msgs/msg/Float64MultiArray":
+                packet.data = [each.normal_force(data) for each in self._touches]
+            case "geometry_msgs/msg/WrenchStamped":
+                _set_header(packet.header, time_ns, _WORLD_FRAME)
+                force, torque = touch.wrench(data)
+                _set_vector(packet.wrench.force, force.tolist())
+                _set_vector(packet.wrench.torque, torque.tolist())
 
-    def fill_wrench(packet: Any, data: Any, time_ns: int) -> None:
-        _set_header(packet.header, time_ns, _WORLD_FRAME)
-        force, torque = touches[0].wrench(data)
-        _set_vector(packet.wrench.force, force.tolist())
-        _set_vector(packet.wrench.torque, torque.tolist())
 
-    return {
-        "std_msgs/msg/Bool": fill_bool,
-        "std_msgs/msg/Float64": fill_float,
-        "std_msgs/msg/Float64MultiArray": fill_floats,
-        "geometry_msgs/msg/WrenchStamped": fill_wrench,
-    }[binding.declaration.type]
+class Camera(Sensor):
+    """A camera of the model, rgb8."""
 
+    kind = "camera"
+    types = ("sensor_msgs/msg/Image",)
+    sorts = ("camera",)
+    keys = ("width", "height")
 
-def _bind_camera(binding: Binding) -> Fill | None:
-    """``sensor_msgs/Image``, ``rgb8``, of a camera of the model."""
-    element = binding.find("camera")
-    if element is None:
-        return None
-    camera, frame = element[1], binding.declaration.elements[0]
-    width, height = binding.declaration.width, binding.declaration.height
-    cameras = binding.cameras
-
-    def fill(packet: Packet, data: Any, time_ns: int) -> None:
-        _set_header(packet.header, time_ns, frame)
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        width, height = self.declared.width, self.declared.height
+        _set_header(packet.header, time_ns, self.declared.elements[0])
         packet.width, packet.height, packet.step = width, height, 3 * width
         packet.encoding = "rgb8"
-        # rclpy checks lists and bytes element by element; an array is taken as it is.
+        # rclpy checks lists and bytes element by element; an array is taken unchanged.
         pixels = array("B", (0,)) * (3 * width * height)
-        cameras.render(data, camera, np.frombuffer(pixels, np.uint8).reshape(height, width, 3))
+        image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
+        self.cameras.render(data, self.elements[0][1], image)
         packet.data = pixels
 
-    return fill
 
+class Clock(Sensor):
+    """Simulated time."""
 
-def _bind_clock(binding: Binding) -> Fill:
-    """``rosgraph_msgs/Clock``: simulated time."""
+    kind = "clock"
+    types = ("rosgraph_msgs/msg/Clock",)
 
-    def fill(packet: Packet, data: Any, time_ns: int) -> None:
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         _set_time(packet.clock, time_ns)
 
-    return fill
 
-
-SENSOR_KINDS: Mapping[str, SensorKind] = {
-    "imu": SensorKind(_bind_imu, ("sensor_msgs/msg/Imu",)),
-    "pose": SensorKind(_bind_pose, ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Pose")),
-    "joint_states": SensorKind(
-        _bind_joint_states,
-        ("sensor_msgs/msg/JointState",),
-        "optional",
-        ("sensor_msgs/msg/JointState",),
-    ),
-    "contacts": SensorKind(
-        _bind_contacts,
-        (
-            "std_msgs/msg/Bool",
-            "std_msgs/msg/Float64",
-            "std_msgs/msg/Float64MultiArray",
-            "geometry_msgs/msg/WrenchStamped",
-        ),
-        list_types=("std_msgs/msg/Float64MultiArray",),
-    ),
-    "camera": SensorKind(_bind_camera, ("sensor_msgs/msg/Image",), keys=("width", "height")),
-    "clock": SensorKind(_bind_clock, ("rosgraph_msgs/msg/Clock",), "none"),
+SENSORS: Mapping[str, type[Sensor]] = {
+    sensor.kind: sensor for sensor in (Imu, Pose, JointStates, Contacts, Camera, Clock)
 }
+
+
+# ---- declarations
+
+
+def read_sensors(node: Node, problems: Problems) -> tuple[SensorDeclaration, ...]:
+    """The sensors that the outputs of ``node`` declare; faulty ones are left out and reported."""
+    found = (
+        _declaration(port, f"{node.pointer}/outputs/{index}/mujoco", problems)
+        for index, port in enumerate(node.outputs)
+        if port.mujoco
+    )
+    return tuple(sensor for sensor in found if sensor)
+
+
+def _declaration(port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
+    faults, name = Faults(pointer, problems), port.mujoco.get("sensor")
+    sensor = SENSORS.get(name) if isinstance(name, str) else None
+    if sensor is None:
+        hint = did_you_mean(str(name or ""), SENSORS)
+        faults.add("sensor", f"{name!r} is not a kind of sensor{hint}")
+        return None
+    faults.unknown_keys(port.mujoco, ("sensor", "element", "rate", *sensor.keys))
+    if port.type not in sensor.types:
+        text = f"'{name}' fills {either(sensor.types)}, but output '{port.name}' is a {port.type}"
+        faults.add("sensor", text)
+    elements = _elements(port, sensor, faults)
+    rate: Any = port.mujoco.get("rate")
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < float("inf"):
+        faults.add("rate", f"{rate!r} is not a positive number (firings per simulated second)")
+    pixels = {key: port.mujoco[key] for key in sensor.keys if key in port.mujoco}
+    for key, value in pixels.items():
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16384:
+            faults.add(key, f"{value!r} is not a number of pixels from 1 to 16384")
+    if faults.found:
+        return None
+    return SensorDeclaration(
+        port.name, port.type, sensor.kind, elements, float(rate), pointer, **pixels
+    )
+
+
+def _elements(port: Port, sensor: type[Sensor], faults: Faults) -> tuple[str, ...]:
+    value = port.mujoco.get("element")
+    if value is None:
+        if sensor.sorts and not sensor.is_optional:
+            faults.add("element", "missing: name the element of the model that is measured")
+    elif not sensor.sorts:
+        faults.add("element", f"a {sensor.kind} measures no element: leave this key out")
+    elif isinstance(value, str):
+        return (value,)
+    elif not is_list_of_names(value):
+        faults.add("element", f"{value!r} is neither a name nor a list of names")
+    elif port.type not in sensor.list_types:
+        hint = f"; a list needs {either(sensor.list_types)}" if sensor.list_types else ""
+        faults.add("element", f"a {port.type} holds one element only{hint}")
+    else:
+        return tuple(value)
+    return ()
+
+
+def bind_sensors(
+    model: Any, declared: Iterable[SensorDeclaration], cameras: Cameras, problems: Problems
+) -> dict[str, Sensor]:
+    """The sensor behind each output; problems are reported."""
+    return {each.output: SENSORS[each.kind](each, model, cameras, problems) for each in declared}
+
+
+# ---- schema
+
+
+def with_sensors(node_schema: Mapping[str, Any]) -> dict[str, Any]:
+    """The schema of node files with the sensors that there are."""
+    part = dict(node_schema["$defs"]["mujoco_sensor"])
+    properties = dict(part["properties"])
+    kinds = (f"{s.kind} ({' or '.join(s.types)}): {_summary(s)}" for s in SENSORS.values())
+    properties["sensor"] = properties["sensor"] | {
+        "description": " ".join(kinds),
+        "enum": list(SENSORS),
+    }
+    part |= {"properties": properties, "allOf": [_rule(sensor) for sensor in SENSORS.values()]}
+    return {**node_schema, "$defs": {**node_schema["$defs"], "mujoco_sensor": part}}
+
+
+def _summary(sensor: type[Sensor]) -> str:
+    return (sensor.__doc__ or "").splitlines()[0]
+
+
+def _rule(sensor: type[Sensor]) -> dict[str, Any]:
+    """What the schema demands of a declaration of this kind."""
+    element: dict[str, Any] = {"type": ["string", "array"] if sensor.list_types else "string"}
+    keys = dict.fromkeys(key for each in SENSORS.values() for key in each.keys)
+    then: dict[str, Any] = {
+        "description": _summary(sensor),
+        "properties": {
+            "element": element if sensor.sorts else {"not": {}},
+            **{key: {"not": {}} for key in keys if key not in sensor.keys},
+        },
+    }
+    if sensor.sorts and not sensor.is_optional:
+        then["required"] = ["element"]
+    kind = {"properties": {"sensor": {"const": sensor.kind}}, "required": ["sensor"]}
+    return {"if": kind, "then": then}
+
+
+def write_schema() -> None:
+    """Write the sensors into ``schema/node.schema.json``."""
+    text = json.dumps(with_sensors(schema("node")), indent=2, ensure_ascii=False)
+    (SCHEMA_FOLDER / "node.schema.json").write_text(f"{text}\n", "utf-8")

@@ -1,8 +1,12 @@
-"""Simulator object of a plugin: it steps the world, and sends the packets of its sensors."""
+"""Simulator of a plugin: it steps the world, sends the packets of its sensors, shows a window."""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,14 +15,16 @@ from typing import Any
 from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
 from neuros.simulators.mujoco.commands import Controls, control
-from neuros.simulators.mujoco.declarations import did_you_mean
-from neuros.simulators.mujoco.free_run import FreeRun, StepLock
-from neuros.simulators.mujoco.viewer import open_viewer
+from neuros.simulators.mujoco.lookup import did_you_mean
+from neuros.simulators.mujoco.timing import FreeRun, StepLock
 from neuros.simulators.mujoco.world import World
 
 _BOUT_S = 0.005
 _BOUT_STEPS = 20
 _PAUSE_LOOK_S = 0.1
+_REFRESH_S = 1 / 60
+_SPACE = 32
+_CLOSE_S = 4.0  # less than a node has to end; software OpenGL takes its time
 
 
 class MuJoCo:
@@ -55,9 +61,11 @@ class MuJoCo:
         self._lock = StepLock()
         self._unread: dict[str, Packet] = {}
         self._run: FreeRun | None = None
-        self._viewer = open_viewer(
-            node, self.model, self.data, toggle=self._toggle_pause, closed=self.resume
-        )
+        self._viewer: Viewer | None = None
+        if launch := find_launcher(node):
+            self._viewer = Viewer(
+                launch, self.model, self.data, toggle=self._toggle_pause, closed=self.resume
+            )
         self._is_over = False
         node.own_simulated_time(lambda: self.sim_time)
         node.on_close(self.close)
@@ -279,3 +287,100 @@ class MuJoCo:
             self.resume()
         else:
             self.pause()
+
+
+class Viewer:
+    """MuJoCo's native window, passive: it shows the simulation, and can pause it.
+
+    The space bar pauses and resumes; closing the window resumes for good. ``launch`` is
+    ``mujoco.viewer.launch_passive`` or something that looks like it.
+    """
+
+    def __init__(
+        self,
+        launch: Callable[..., Any],
+        model: Any,
+        data: Any,
+        *,
+        toggle: Callable[[], None],
+        closed: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._launch, self._toggle, self._closed, self._clock = launch, toggle, closed, clock
+        self._next = 0.0
+        self._handle: Any = None
+        self._threads: set[threading.Thread] = set()
+        self.show(model, data)
+
+    @property
+    def is_open(self) -> bool:
+        return self._handle is not None and bool(self._handle.is_running())
+
+    def show(self, model: Any, data: Any) -> None:
+        """Open the window for another model."""
+        self.close()
+        others = set(threading.enumerate())
+        self._handle = self._launch(model, data, key_callback=self._on_key)
+        fresh = set(threading.enumerate()) - others
+        # launch_passive draws in a thread that is named after its function.
+        self._threads = {thread for thread in fresh if "_launch_internal" in thread.name}
+
+    def sync(self) -> None:
+        """Show the present data, at most 60 times per wall second; not during a step."""
+        if self._handle is None or self._clock() < self._next:
+            return
+        self._next = self._clock() + _REFRESH_S
+        if self._handle.is_running():
+            self._handle.sync()
+        else:
+            self._handle = None
+            self._closed()
+
+    def close(self) -> None:
+        """Close the window; returns when it is gone.
+
+        GLFW is given up at the end of the process, and must not be while a window is still drawn.
+        """
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            handle.close()
+        for thread in self._threads:
+            thread.join(_CLOSE_S)
+        self._threads = set()
+
+    def _on_key(self, key: int) -> None:
+        if key == _SPACE:
+            self._toggle()
+
+
+def find_launcher(node: NodeContext) -> Callable[..., Any] | None:
+    """The function that opens a window if ``NEUROS_GUI`` asks for one; else ``None``.
+
+    Where none can open, a warning says why.
+    """
+    wanted = node.description.environment.get("NEUROS_GUI", os.environ.get("NEUROS_GUI", ""))
+    if wanted in ("", "0"):
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # glfw warns of what is reported below
+            # launch_passive would wait for ever where GLFW finds no display.
+            reason = "" if _has_display() else "there is no display"
+            if not reason:
+                import mujoco.viewer
+
+                launch: Callable[..., Any] = mujoco.viewer.launch_passive
+                return launch
+    except ImportError as error:
+        reason = str(error)
+    node.get_logger().warning(f"NEUROS_GUI is set, but no viewer opens: {reason}")
+    return None
+
+
+def _has_display() -> bool:
+    variables = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform.startswith("linux") and not any(map(os.environ.get, variables)):
+        return False
+    import glfw
+
+    return bool(glfw.init())

@@ -17,15 +17,14 @@ from neuros.simulators.convert.sdf import convert_sdf
 from neuros.simulators.convert.urdf import read_urdf
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
-from neuros.simulators.mujoco.declarations import Problems, has_any, names_of
+from neuros.simulators.mujoco.lookup import Problems, has_any, names_of
 from neuros.simulators.mujoco.sensors import (
-    SENSOR_KINDS,
-    Binding,
-    Fill,
+    Sensor,
     SensorDeclaration,
+    bind_sensors,
     read_sensors,
 )
-from neuros.simulators.mujoco.timebase import Schedule, Timebase
+from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
@@ -49,7 +48,7 @@ _DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
 class _Bound:
     """The declarations, bound to one model: all of them, or but for what is yet to be spawned."""
 
-    fills: Mapping[str, Fill]
+    sensors: Mapping[str, Sensor]
     commands: Mapping[str, Command]
     is_complete: bool
 
@@ -130,7 +129,7 @@ class World:
         packets = {}
         for output in outputs:
             packet = packets[output] = self._node.make_packet(output)
-            self._bound.fills[output](packet, self.data, time_ns)
+            self._bound.sensors[output].fill(packet, self.data, time_ns)
         return packets
 
     def reset(self) -> None:
@@ -191,14 +190,12 @@ class World:
 
         sensors = [sensor for sensor in self._sensors if can_be_bound(sensor.elements)]
         commands = [command for command in self._commands if can_be_bound(command.actuators)]
-        fills = {}
-        for sensor in sensors:
-            if fill := SENSOR_KINDS[sensor.kind].bind(
-                Binding(sensor, model, self.cameras, problems)
-            ):
-                fills[sensor.output] = fill
         is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
-        return _Bound(fills, bind_commands(model, commands, problems), is_complete)
+        return _Bound(
+            bind_sensors(model, sensors, self.cameras, problems),
+            bind_commands(model, commands, problems),
+            is_complete,
+        )
 
     def _look_at_warnings(self, count: int) -> None:
         for warning, number in enumerate(self.data.warning.number.tolist()):

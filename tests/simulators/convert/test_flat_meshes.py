@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from neuros.simulators.convert.find import Finder
 from neuros.simulators.convert.meshes import _convex_hull
 from neuros.simulators.convert.output import write_mjcf
+from neuros.simulators.convert.poses import from_rpy
 from neuros.simulators.convert.urdf import read_urdf
-from neuros.simulators.convert.values import from_rpy
 
 CORNERS = np.array([(-2, -1, 0), (2, -1, 0), (2, 1, 0), (-2, 1, 0)], float)
 FACES = "f 1 2 3\nf 1 3 4\n"

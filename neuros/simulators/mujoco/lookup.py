@@ -1,4 +1,4 @@
-"""Problems of declarations in a node file, and the elements of a model that they name."""
+"""Elements of a model that a node file names, and the problems of its declarations."""
 
 from __future__ import annotations
 
@@ -10,21 +10,13 @@ import mujoco
 
 from neuros.errors import ModelError
 
-_OBJECTS = {
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "camera": mujoco.mjtObj.mjOBJ_CAMERA,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}
-_COUNTS = {
-    "site": "nsite",
-    "body": "nbody",
-    "geom": "ngeom",
-    "camera": "ncam",
-    "joint": "njnt",
-    "actuator": "nu",
+_SORTS = {
+    "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
+    "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
+    "camera": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
+    "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
 }
 
 
@@ -90,26 +82,30 @@ def either(types: Sequence[str]) -> str:
     return " or ".join(types)
 
 
-def names_of(model: Any, what: str) -> list[str]:
+def names_of(model: Any, sort: str) -> list[str]:
     """The names of all elements of one sort, ``""`` for one without a name, by id."""
-    count = getattr(model, _COUNTS[what])
-    return [mujoco.mj_id2name(model, _OBJECTS[what].value, index) or "" for index in range(count)]
+    kind, count = _SORTS[sort]
+    return [mujoco.mj_id2name(model, kind.value, i) or "" for i in range(getattr(model, count))]
+
+
+def id_of(model: Any, sort: str, name: str) -> int:
+    """The id of an element; -1 if there is none of that name."""
+    return int(mujoco.mj_name2id(model, _SORTS[sort][0].value, name))
 
 
 def has_any(model: Any, name: str) -> bool:
     """Whether an element of any sort has this name."""
-    return any(mujoco.mj_name2id(model, sort.value, name) >= 0 for sort in _OBJECTS.values())
+    return any(id_of(model, sort, name) >= 0 for sort in _SORTS)
 
 
 def find(
     model: Any, sorts: Sequence[str], name: str, pointer: str, problems: Problems
 ) -> tuple[str, int] | None:
     """The sort and id of the element called ``name``; the first of ``sorts`` that has it wins."""
-    for what in sorts:
-        index = mujoco.mj_name2id(model, _OBJECTS[what].value, name)
-        if index >= 0:
-            return what, index
-    known = [known for what in sorts for known in names_of(model, what) if known != "world"]
+    for sort in sorts:
+        if (index := id_of(model, sort, name)) >= 0:
+            return sort, index
+    known = [known for sort in sorts for known in names_of(model, sort) if known != "world"]
     hint = did_you_mean(name, known)
     problems.add(pointer, f"the model has no {' or '.join(sorts)} '{name}'{hint}")
     return None

@@ -1,0 +1,459 @@
+"""What hangs on the links of SDF: geoms of collisions and visuals, sensors, sites and lights.
+
+A sensor becomes a site or camera called ``link/sensor``: a node file names that as the ``element``
+of a sensor. MuJoCo's cameras show colours only; a lidar is a rangefinder per ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from neuros.simulators.convert.elements import Element
+from neuros.simulators.convert.output import Building, put
+from neuros.simulators.convert.poses import Pose, from_quaternion, from_rpy
+from neuros.simulators.convert.scopes import Joint, Link, Scope
+
+_VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
+_GEOMS = mujoco.mjtGeom
+_ALL_MASKS = 0xFFFF  # what Gazebo gives a collision that names none
+_GREY = (0.7, 0.7, 0.7, 1.0)
+# The diffuse colours of Gazebo's own materials, as far as a colour is all that they are.
+_SCRIPTS: Mapping[str, tuple[float, float, float]] = {
+    "Gazebo/Black": (0, 0, 0),
+    "Gazebo/Blue": (0, 0, 1),
+    "Gazebo/DarkGray": (0.175, 0.175, 0.175),
+    "Gazebo/DarkGrey": (0.175, 0.175, 0.175),
+    "Gazebo/FlatBlack": (0.1, 0.1, 0.1),
+    "Gazebo/Gray": (0.7, 0.7, 0.7),
+    "Gazebo/Green": (0, 1, 0),
+    "Gazebo/Grey": (0.7, 0.7, 0.7),
+    "Gazebo/Indigo": (0.33, 0, 0.5),
+    "Gazebo/Orange": (1, 0.5088, 0.0468),
+    "Gazebo/Purple": (1, 0, 1),
+    "Gazebo/Red": (1, 0, 0),
+    "Gazebo/Turquoise": (0, 1, 1),
+    "Gazebo/White": (1, 1, 1),
+    "Gazebo/Yellow": (1, 1, 0),
+}
+_SENSORS = mujoco.mjtSensor
+_SIMPLE = {
+    "altimeter": (
+        ("position", _SENSORS.mjSENS_FRAMEPOS),
+        ("velocity", _SENSORS.mjSENS_FRAMELINVEL),
+    ),
+    "magnetometer": (("field", _SENSORS.mjSENS_MAGNETOMETER),),
+}
+# SDF's cameras look along x, with z up; MuJoCo's along -z, with y up.
+_TO_CAMERA = Pose(rotation=np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
+_CAMERAS = {
+    "camera": "",
+    "wideanglecamera": "a pinhole camera in MuJoCo, without the wide angle lens",
+    "wide_angle_camera": "a pinhole camera in MuJoCo, without the wide angle lens",
+    "depth": "colours only, no depth",
+    "depth_camera": "colours only, no depth",
+    "rgbd": "colours only, no depth",
+    "rgbd_camera": "colours only, no depth",
+}
+# A rangefinder of MuJoCo's looks along z.
+_TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
+_MOST_RAYS = 1000
+_SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # where nothing says how many
+_SITE = mujoco.mjtObj.mjOBJ_SITE
+_LIGHTS = {
+    "directional": mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+    "point": mujoco.mjtLightType.mjLIGHT_POINT,
+    "spot": mujoco.mjtLightType.mjLIGHT_SPOT,
+}
+
+
+@dataclass
+class _Shape:
+    """A geometry as MuJoCo takes it: half lengths in metres; ``pose`` is seen from its owner."""
+
+    type: Any
+    size: list[float] = field(default_factory=list)
+    mesh: str = ""
+    pose: Pose = field(default_factory=Pose)
+
+
+def add_shapes(building: Building, link: Link, *, is_solid: bool) -> None:
+    """Add the geoms of a link; the mass of a solid one is computed from its collisions."""
+    for element in link.element.each("collision"):
+        geom = _add(building, link, element, is_solid=is_solid)
+        if geom is not None:
+            geom.group = _COLLISION_GROUP
+            _read_surface(building, element, geom)
+            building.geoms[id(element)] = geom
+            if is_solid:
+                geom.density = element.number("density", 1000.0, positive=True)
+    for element in link.element.each("visual"):
+        geom = _add(building, link, element, is_solid=False)
+        if geom is not None:
+            geom.group, geom.contype, geom.conaffinity, geom.mass = _VISUAL_GROUP, 0, 0, 0
+            geom.rgba = _colour(element)
+
+
+def share_masks(building: Building) -> None:
+    """Give the geoms without a mask Gazebo's, once any geom has one of its own."""
+    if building.masks:
+        for key, geom in building.geoms.items():
+            geom.contype = geom.conaffinity = building.masks.get(key, _ALL_MASKS)
+
+
+def _add(building: Building, link: Link, element: Element, *, is_solid: bool) -> Any:
+    shape = _read(building, element, is_solid=is_solid)
+    if shape is None:
+        return None
+    if shape.type == _GEOMS.mjGEOM_PLANE and not link.is_static:
+        element.note("MuJoCo has planes only where nothing moves")
+        return None
+    geom = building.body(link).add_geom(type=shape.type)
+    geom.size[: len(shape.size)] = shape.size
+    if shape.mesh:
+        geom.meshname = shape.mesh
+    pose = link.scope.read_pose(element, link.pose)
+    put(geom, pose @ shape.pose, link.pose)
+    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
+    geom.name = building.name("geom", f"{link.name}/{element.name}", noting)
+    mesh = element.child("geometry", "mesh")
+    if shape.mesh and mesh is not None and element.tag == "collision":
+        building.colliding_meshes[geom.name] = mesh
+    return geom
+
+
+def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | None:
+    geometry = owner.child("geometry")
+    if geometry is None:
+        owner.problem("<geometry> is missing")
+        return None
+    element = next(iter(geometry.children), None)
+    if element is None:
+        return None
+    element.taken = True
+
+    def positive(tag: str, default: float) -> float:
+        return element.number(tag, default, positive=True)
+
+    match element.tag:
+        case "empty":
+            return None
+        case "box":
+            return _Shape(_GEOMS.mjGEOM_BOX, _halves(element, (1, 1, 1)))
+        case "sphere":
+            return _Shape(_GEOMS.mjGEOM_SPHERE, [positive("radius", 1)])
+        case "cylinder" | "capsule" as kind:
+            size = [positive("radius", 0.5), positive("length", 1) / 2]
+            return _Shape(getattr(_GEOMS, f"mjGEOM_{kind.upper()}"), size)
+        case "ellipsoid":
+            radii = element.vector("radii", (1.0, 1.0, 1.0))
+            return _Shape(_GEOMS.mjGEOM_ELLIPSOID, _all_positive(element, radii))
+        case "plane":
+            return _plane(element)
+        case "mesh":
+            return _mesh(building, owner, element, is_solid=is_solid)
+    element.note(f"MuJoCo has no geom for a <{element.tag}>")
+    return None
+
+
+def _halves(element: Element, default: tuple[float, ...]) -> list[float]:
+    return [length / 2 for length in _all_positive(element, element.vector("size", default))]
+
+
+def _all_positive(element: Element, sizes: tuple[float, ...]) -> list[float]:
+    if min(sizes) > 0:
+        return list(sizes)
+    element.problem("every size must be positive")
+    return [1.0] * len(sizes)
+
+
+def _plane(element: Element) -> _Shape | None:
+    normal = np.array(element.vector("normal", (0.0, 0.0, 1.0)))
+    if not normal.any():
+        element.problem("the normal is zero")
+        return None
+    size = _halves(element, (1, 1))
+    quaternion = np.zeros(4)
+    mujoco.mju_quatZ2Vec(quaternion, normal / np.linalg.norm(normal))
+    turned = from_quaternion((0, 0, 0), quaternion)
+    return _Shape(_GEOMS.mjGEOM_PLANE, [*size, 1.0], pose=turned)
+
+
+def _mesh(building: Building, owner: Element, element: Element, *, is_solid: bool) -> _Shape | None:
+    uri = element.child("uri")
+    if uri is None or not uri.text:
+        element.problem("<uri> is missing: which file is the mesh in?")
+        return None
+    scale = element.vector("scale", (1.0, 1.0, 1.0))
+    is_needed = owner.tag == "collision"
+    name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_needed)
+    return None if name is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
+
+
+def _read_surface(building: Building, collision: Element, geom: Any) -> None:
+    surface = collision.child("surface")
+    if surface is None:
+        return
+    friction = surface.child("friction", "ode")
+    if friction is not None:
+        along = friction.number("mu", 1.0)
+        across = friction.number("mu2", along)
+        geom.friction[0] = min(along, 1e6)
+        if across != along:
+            friction.remark(f"MuJoCo's friction is {along:g} in every direction")
+    contact = surface.child("contact")
+    if contact is None:
+        return
+    if contact.is_true("collide_without_contact"):
+        contact.remark("it pushes what it touches: MuJoCo's contacts are felt by their force")
+    mask = contact.child("collide_bitmask")
+    if mask is not None:
+        try:
+            building.masks[id(collision)] = int(mask.text, 0) & 0x7FFFFFFF
+        except ValueError:
+            mask.problem(f"'{mask.text}' is not a whole number")
+
+
+def _colour(visual: Element) -> tuple[float, ...]:
+    """Red, green, blue and opacity of a visual, each from 0 to 1."""
+    opacity = 1.0 - visual.number("transparency", 0.0)
+    material = visual.child("material")
+    red, green, blue, alpha = _GREY if material is None else _diffuse(material)
+    return (red, green, blue, alpha * opacity)
+
+
+def _diffuse(material: Element) -> tuple[float, ...]:
+    base = _GREY
+    script = material.child("script")
+    if script is not None:
+        name = script.text_of("name")
+        if name in _SCRIPTS:
+            script.take_all()
+            base = (*_SCRIPTS[name], 1.0)
+        else:
+            script.note("a material script of Gazebo's")
+    element = material.child("diffuse")
+    if element is None:
+        return base
+    try:
+        values = [float(word) for word in element.text.split()]
+    except ValueError:
+        values = []
+    if len(values) not in (3, 4):
+        element.problem("a colour is red, green, blue and opacity, each from 0 to 1")
+        return base
+    return (*values, 1.0)[:4]
+
+
+def add_link_sensors(building: Building, link: Link) -> None:
+    """Add the sensors of a link."""
+    for element in link.element.each("sensor"):
+        kind = element.type
+        pose = link.scope.read_pose(element, link.pose)
+        if kind == "imu":
+            _add_imu(building, link, element, pose)
+        elif kind in _CAMERAS:
+            _add_camera(building, link, element, pose)
+        elif kind in ("ray", "lidar", "gpu_ray", "gpu_lidar"):
+            _add_rays(building, link, element, pose)
+        elif kind == "contact":
+            how = '`"sensor": "contacts"`, `"element": "link/collision"`'
+            element.note(f"declare it in the node file: {how}")
+        elif kind in _SIMPLE:
+            site = _add_site(building, link, element, pose)
+            for what, sort in _SIMPLE[kind]:
+                _add_sensor(building, f"{site}/{what}", sort, site, element)
+            if kind == "altimeter":
+                element.remark("the whole position and velocity in MuJoCo")
+            element.child(kind)  # now read; what is inside it is listed
+        else:
+            element.note(f"MuJoCo has no sensor like '{kind}'")
+
+
+def add_joint_sensors(building: Building, link: Link, joint: Joint, *, is_turned: bool) -> None:
+    """Add the sensors of the joint that the body of a link hangs on."""
+    for element in joint.element.each("sensor"):
+        if element.type != "force_torque":
+            element.note("only a force_torque sensor belongs to a joint")
+            continue
+        settings = element.child("force_torque") or element.made("force_torque")
+        frame = settings.text_of("frame") or "child"
+        place = joint.scope.read_pose(element, joint.anchor)
+        ends = {"child": joint.child, "parent": joint.parent}
+        if frame in ends:
+            end = ends[frame]
+            place = Pose(place.position, np.eye(3) if end is None else end.pose.rotation)
+        elif frame != "sensor":
+            settings.problem(f"'{frame}' is none of child, parent and sensor")
+        # MuJoCo measures the force on the body that hangs; SDF, unless told otherwise, what the
+        # child does to the parent.
+        if (settings.text_of("measure_direction") == "parent_to_child") == is_turned:
+            element.remark("with the opposite sign in MuJoCo")
+        site = _add_site(building, link, element, place, f"{joint.name}/{element.name}")
+        _add_sensor(building, f"{site}/force", _SENSORS.mjSENS_FORCE, site, element)
+        _add_sensor(building, f"{site}/torque", _SENSORS.mjSENS_TORQUE, site, element)
+
+
+def _add_imu(building: Building, link: Link, element: Element, pose: Pose) -> None:
+    site = _add_site(building, link, element, pose)
+    imu = element.child("imu")
+    for what, sort, group in (
+        ("gyro", _SENSORS.mjSENS_GYRO, "angular_velocity"),
+        ("accelerometer", _SENSORS.mjSENS_ACCELEROMETER, "linear_acceleration"),
+        ("orientation", _SENSORS.mjSENS_FRAMEQUAT, ""),
+    ):
+        sensor = _add_sensor(building, f"{site}/{what}", sort, site, element)
+        axes = imu.child(group) if imu is not None and group else None
+        if axes is not None:
+            sensor.noise = _deviation(axes)
+
+
+def _deviation(axes: Element) -> float:
+    """The largest standard deviation of three axes; MuJoCo keeps one number, and adds no noise."""
+    largest = 0.0
+    for axis in axes.children:
+        noise = axis.child("noise")
+        if noise is not None and noise.attributes.get("type", "none") != "none":
+            largest = max(largest, noise.number("stddev", 0.0))
+            noise.note("the deviation becomes the covariance; no noise is added")
+        axis.take_all()
+    axes.taken = True
+    return largest
+
+
+def _add_camera(building: Building, link: Link, element: Element, pose: Pose) -> None:
+    """Add the camera of a sensor, whose own pose in the world is ``pose``."""
+    settings = element.child("camera") or element.made("camera")
+    image = settings.child("image") or element.made("image")
+    pose = link.scope.read_pose(settings, pose)
+    across = settings.number("horizontal_fov", 1.047, positive=True)
+    width = image.number("width", 320.0, positive=True)
+    height = image.number("height", 240.0, positive=True)
+    if across >= math.pi:
+        settings.problem(f"a field of view is below pi, not {across:g}")
+        return
+    camera = building.body(link).add_camera(resolution=[int(width), int(height)])
+    camera.name = building.name("camera", f"{link.name}/{element.name}", element)
+    camera.fovy = math.degrees(2 * math.atan(math.tan(across / 2) * height / width))
+    put(camera, pose @ _TO_CAMERA, link.pose)
+    if remark := _CAMERAS[element.type]:
+        element.remark(remark)
+
+
+def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> None:
+    """Add a site and a rangefinder for every ray of a sensor, row by row from below."""
+    settings = next((s for s in map(element.child, ("ray", "lidar")) if s is not None), element)
+    (columns, yaws), (rows, pitches) = (
+        _angles(settings, way) for way in ("horizontal", "vertical")
+    )
+    count = columns * rows
+    if not 1 <= count <= _MOST_RAYS:
+        element.note(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
+        return
+    distance = settings.child("range")
+    most = math.inf if distance is None else distance.number("max", math.inf)
+    if distance is not None:
+        distance.take_all()
+    for row, pitch in enumerate(pitches):
+        for column, yaw in enumerate(yaws):
+            ray = pose @ from_rpy(0, 0, 0, 0, -pitch, yaw) @ _TO_RAY
+            suffix = f"/{row * columns + column}" if count > 1 else ""
+            site = _add_site(building, link, element, ray, f"{link.name}/{element.name}{suffix}")
+            sensor = _add_sensor(building, site, _SENSORS.mjSENS_RANGEFINDER, site, element)
+            sensor.cutoff = most if math.isfinite(most) else 0
+            if hasattr(mujoco, "mjtRayDataField"):  # since then it says what it measures
+                sensor.intprm[0] = 1 << mujoco.mjtRayDataField.mjRAYDATA_DIST.value
+    element.remark(f"{count} rangefinder(s) in MuJoCo, -1 where nothing is hit")
+
+
+def _angles(settings: Element, way: str) -> tuple[int, list[float]]:
+    scan = settings.child("scan", way)
+    if scan is None:
+        return 1, [0.0]
+    (samples,) = map(int, scan.vector("samples", (_SAMPLES[way],)))
+    (least,) = scan.vector("min_angle", (0.0,))
+    (most,) = scan.vector("max_angle", (0.0,))
+    if scan.number("resolution", 1.0) != 1:
+        scan.remark("as many rays as samples; none between them")
+    if samples > _MOST_RAYS:
+        return samples, []
+    return samples, [float(angle) for angle in np.linspace(least, most, max(samples, 0))]
+
+
+def add_frames(building: Building, scope: Scope) -> None:
+    """A site for every ``<frame>``: a place with a name, as the tip of a tool."""
+    for inner, element in scope.each("frame"):
+        if inner.is_world or element.name not in inner.frames or element.name[:1] == "_":
+            continue
+        link = inner.body(element.name, element)
+        if link is not None:
+            site = building.body(link).add_site()
+            site.name = building.name("site", inner.prefix + element.name, element)
+            put(site, inner.pose @ inner.place(element.name, element), link.pose)
+
+
+def _add_site(
+    building: Building, link: Link, element: Element, pose: Pose, wanted: str = ""
+) -> str:
+    """Add a site to a link, where ``pose`` is in the world; returns its name."""
+    site = building.body(link).add_site(group=4)
+    name = building.name("site", wanted or f"{link.name}/{element.name}", element)
+    site.name = name
+    put(site, pose, link.pose)
+    return name
+
+
+def _add_sensor(building: Building, name: str, kind: Any, site: str, element: Element) -> Any:
+    """Add a sensor of MuJoCo's that measures at a site."""
+    unique = building.name("sensor", name, element)
+    return building.spec.add_sensor(name=unique, type=kind, objtype=_SITE, objname=site)
+
+
+def add_lights(building: Building, scope: Scope) -> None:
+    """Lights of a world, of models and of links."""
+    for inner in scope.and_models():
+        for element in inner.element.each("light"):
+            _add_light(building, element, inner.read_pose(element, inner.pose), None)
+        for link in inner.links.values():
+            for element in link.element.each("light"):
+                _add_light(building, element, inner.read_pose(element, link.pose), link)
+
+
+def _add_light(building: Building, element: Element, pose: Pose, link: Link | None) -> None:
+    kind = element.attributes.get("type", "point")
+    if kind not in _LIGHTS:
+        element.problem(f"'{kind}' is not a light", f"there are: {', '.join(_LIGHTS)}")
+        return
+    local = (Pose() if link is None else link.pose).inverse() @ pose
+    light: Any = building.body(link).add_light(pos=local.position, type=_LIGHTS[kind])
+    light.name = building.name("light", element.name, element)
+    direction = np.array(element.vector("direction", (0.0, 0.0, -1.0)))
+    if direction.any():
+        light.dir = local.rotation @ (direction / np.linalg.norm(direction))
+    light.diffuse = _light_colour(element, "diffuse", 1.0)
+    light.specular = _light_colour(element, "specular", 0.1)
+    light.castshadow = element.is_true("cast_shadows")
+    attenuation = element.child("attenuation")
+    if attenuation is not None:
+        defaults = {"constant": 1.0, "linear": 0.0, "quadratic": 0.0}
+        light.attenuation = [attenuation.number(*each) for each in defaults.items()]
+        light.range = attenuation.number("range", 10.0, positive=True)
+    spot = element.child("spot")
+    if spot is not None and kind == "spot":
+        light.cutoff = math.degrees(spot.number("outer_angle", 0.0)) or 45.0
+        light.exponent = spot.number("falloff", 0.0)
+
+
+def _light_colour(owner: Element, tag: str, default: float) -> tuple[float, ...]:
+    """Red, green and blue of a light."""
+    element = owner.child(tag)
+    if element is None:
+        return (default,) * 3
+    if len(element.text.split()) == 3:
+        return owner.vector(tag, (default,) * 3)
+    return owner.vector(tag, (default,) * 3 + (1.0,))[:3]
