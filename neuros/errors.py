@@ -9,6 +9,7 @@
     ├── EnvironmentFault    something is missing on this machine   exit code 4
     ├── RunError            a run did not end well, and was to
     ├── WrongValue          a message holds what its definition does not allow
+    ├── ControlError        a control message is not understood
     └── NodeError           a node failed                      exit code 1
         ├── HookError       ... in a hook of its plugin
         ├── CallbackError   ... in a callback that its plugin has registered with ROS
@@ -105,6 +106,10 @@ class WrongValue(NeurosError, ValueError):
         self.path, self.found, self.allowed = path, found, allowed
         what = f"field '{path}'" if path else "the message"
         super().__init__(f"{what} must be {allowed}, but is {found}")
+
+
+class ControlError(NeurosError):
+    """A message on the control channel of a run is not understood."""
 
 
 class NodeError(NeurosError):

@@ -18,8 +18,8 @@ import sys
 import threading
 import traceback
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 LONG_S = 5.0
 """A hook that runs for this long is named."""
@@ -32,7 +32,8 @@ _THREAD = re.compile(r"(?:Current thread|Thread) 0x0*(?P<ident>[0-9a-f]+)\b.*:")
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
 
 
-class Stack(NamedTuple):
+@dataclass(frozen=True)
+class Stack:
     """The calls from a hook on, the most recent last, as Python shows them."""
 
     node: str

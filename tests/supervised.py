@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from neuros.backends.child_processes import RunningProcess
+from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
+from neuros.ports import ControlListener, NodeProgram
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
 HOST = [sys.executable, "-S", str(Path(__file__).parent / "launcher" / "stand_in_host.py")]
@@ -56,6 +58,7 @@ class Run:
         self.signals: list[int] = []
         self.hosts: list[RunningProcess] = []
         self.lasted_s = 0.0
+        self.listener: Callable[[Path], ControlListener] = UnixListener
 
     def file(self, name: str, act: str, connections: tuple[Connection, ...]) -> NodeFile:
         node = Node(name, "", Path("/plugin.py"), environment={"ACT": f"{act}\n"})
@@ -73,13 +76,15 @@ class Run:
     ) -> Outcome:
         """Run nodes that do as the text under their names says, to the end."""
         files = [self.file(name, act, connections) for name, act in acts.items()]
+        kind = InProcessLauncher if in_process else ProcessLauncher
         supervisor = Supervisor(
             files,
-            _Noting(InProcessLauncher(HOST) if in_process else ProcessLauncher(HOST), self.hosts),
+            _Noting(kind(NodeProgram(program=HOST)), self.hosts),
             {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
             self.folder,
             self.output,
             self.signals,
+            listener=self.listener(self.folder),
             duration_s=duration_s,
             peers=Peers("this run", elsewhere, files),
         )
@@ -93,7 +98,7 @@ class Run:
     def clear(self) -> None:
         """Make the folder new."""
         self.hosts.clear()
-        (self.folder / "control.sock").unlink()
+        (self.folder / SOCKET_NAME).unlink()
 
     def after(self, beginning: str, act: Act) -> None:
         """Do something when the supervisor says something that begins like this."""

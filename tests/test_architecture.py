@@ -45,7 +45,7 @@ PACKAGES = (
     Package(1, ("installation",)),
     Package(1, ("caching",)),
     Package(2, ("engine",)),
-    Package(3, ("ports", "control", "stacks", "options")),
+    Package(3, ("ports", "control", "stacks", "options", "registry")),
     Package(4, ("transport",)),
     Package(4, ("backends",)),
     Package(4, ("simulators",)),

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
+from neuros.control import Report
 from neuros.engine.time_budget import time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection, NodeFile, Project
@@ -24,7 +25,7 @@ class Ended(Protocol):
 
     exit_code: int
     reason: str
-    reports: dict[str, Mapping[str, Any]]
+    reports: dict[str, Report]
     report_times_s: dict[str, float]
     timelines: dict[str, list[Sequence[float]]]
     started_s: float | None
@@ -46,9 +47,9 @@ def run_record(
     run_folder: Path,
 ) -> dict[str, Any]:
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
-    sim_times = [r["sim_time"] for r in ended.reports.values() if r["sim_time"] is not None]
+    sim_times = [r.sim_time for r in ended.reports.values() if r.sim_time is not None]
     sim_s, all_ran_s = max(sim_times, default=None), ended.running_s
-    all_metrics = {**ended.elsewhere, **{n: r["metrics"] or {} for n, r in ended.reports.items()}}
+    all_metrics = {**ended.elsewhere, **{n: r.metrics or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
         "project": project.name,
@@ -159,21 +160,20 @@ def _connection(
 
 def _cut_off(ended: Ended) -> list[str]:
     """The nodes that have not reported their end."""
-    return [name for name, report in ended.reports.items() if not report.get("is_final")]
+    return [name for name, report in ended.reports.items() if not report.is_final]
 
 
 def _node(name: str, ended: Ended) -> dict[str, Any]:
     report = ended.reports.get(name)
-    if report is None or report["metrics"] is None:
+    if report is None or report.metrics is None:
         return {"report": None}
-    is_final = bool(report.get("is_final"))
     age_s = ended.ended_s - ended.report_times_s[name]
-    metrics = report["metrics"]
+    metrics = report.metrics
     return {
         "accounting": metrics["accounting"],
         "hooks": metrics["hooks"],
-        "sim_time": report["sim_time"],
-        "report": "final" if is_final else f"last report {age_s:.1f} s before the end",
+        "sim_time": report.sim_time,
+        "report": "final" if report.is_final else f"last report {age_s:.1f} s before the end",
     }
 
 

@@ -19,17 +19,17 @@ from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
 from neuros.api.run_folder import make_run_folder, write_node_files
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.progress import Progress
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import Session, reaper_environment, this_process
-from neuros.control import SOCKET_NAME
+from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
 from neuros.errors import EnvironmentFault
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
-from neuros.node.peer_link import ELSEWHERE_VARIABLE
 from neuros.options import recorded_values
 from neuros.recording.plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
@@ -95,6 +95,7 @@ class Execution:
         except BaseException:
             self._domain.release()
             raise
+        self._listener = plan.deployment.control_listener(self.folder) or UnixListener(self.folder)
         self._logs = self._log_files()
         self._console = Console(
             stream,
@@ -108,8 +109,7 @@ class Execution:
         """The log files, by what is to be shown of their origin."""
         names = [file.node.name for file in self._files]
         logs = {name: self.folder / name / "node.log" for name in names}
-        if self._plan.backend == "in-process":
-            logs["host"] = self.folder / "host.log"
+        logs |= self._plan.deployment.logs(self.folder)
         if self._recording_plan is not None:
             logs["recorder"] = log_of(self.folder)
         return logs
@@ -126,7 +126,8 @@ class Execution:
             environment = reaper_environment(self._session(started))
             reaper = Reaper.start(self._run_id, self._domain, environment)
             stack.callback(reaper.finish)
-            reaper.remove_later(self.folder / SOCKET_NAME)
+            for file in self._listener.files:
+                reaper.remove_later(file)
             return self._run(reaper, started)
 
     def cancel(self) -> None:
@@ -140,7 +141,7 @@ class Execution:
         recording = None
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
-            for severity, notice in self._plan.back_end.notices:
+            for severity, notice in self._plan.notices:
                 self._console.log(severity, notice)
             recording = self._recording(reaper)
             supervisor = self._supervisor(reaper)
@@ -171,8 +172,9 @@ class Execution:
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
             record |= {
-                "backend": self._plan.backend,
-                **self._plan.back_end.record(),
+                "backend": self._plan.back_end.name,
+                "is_one_process": self._plan.back_end.is_one_process,
+                **self._plan.deployment.record(),
                 "domain_id": self._domain.id,
                 "namespace": self._plan.project.names.namespace,
                 "started": started,
@@ -202,6 +204,7 @@ class Execution:
     def _beside(self) -> dict[str, str]:
         """What programs beside the nodes get, which know the same messages."""
         path = {key: os.environ[key] for key in ("PYTHONPATH",) if key in os.environ}
+        path[CONTROL_VARIABLE] = self._listener.address
         messages = self._plan.messages
         return with_messages({**path, **self._environment()}, messages.paths if messages else ())
 
@@ -238,31 +241,32 @@ class Execution:
 
     def _observation(self) -> Observation:
         names = [file.node.name for file in self._files]
-        is_one_process = self._plan.backend == "in-process"
         return Observation(
             self._run_id,
             self.folder,
             self._plan.project,
             names,
             monitors_load=self._plan.request.monitor_system_load,
-            is_one_process=is_one_process,
+            is_one_process=self._plan.back_end.is_one_process,
         )
 
     def _as_here(self, text: str) -> str:
         """With the names that paths have on this machine."""
-        return self._plan.back_end.as_here(text, self._files[0].folders)
+        return self._plan.deployment.as_here(text, self._files[0].folders)
 
     def _session(self, started: float) -> Session:
         """What `neuros ps` shows of it."""
         return Session(
             self._run_id,
             self._plan.project.name,
-            self._plan.backend,
+            self._plan.back_end.name,
             tuple(file.node.name for file in self._files),
             str(self.folder),
             started,
             this_process(),
             self._plan.project.names.namespace,
+            self._plan.back_end.is_one_process,
+            self._listener.address,
         )
 
     def _supervisor(self, reaper: Reaper) -> Supervisor:
@@ -273,6 +277,7 @@ class Execution:
             self.folder,
             self._console,
             self._signals,
+            listener=self._listener,
             wishes=self._wishes,
             duration_s=self._plan.request.end.wall_s,
             peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 
-BACK_ENDS = ("auto", "docker", "process", "in-process")
 _RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
 
 
@@ -96,11 +95,16 @@ class Request(ProjectOptions):
     backend: str | None = option(
         "--backend",
         default="auto",
-        choices=BACK_ENDS,
         variable="NEUROS_BACKEND",
-        page="docker.md",
-        help="run each node in a container (docker), each in a process (process), or all in one"
-        " process (in-process); auto: docker where an engine has the images, else process",
+        metavar="NAME",
+        page="back_ends.md",
+        help="run nodes on this back end: each in a container (docker), each in a process"
+        " (process), or all in one process (in-process); auto: docker where an engine has the"
+        " images, else process; other distributions may add back ends",
+    )
+    backend_options: Mapping[str, Any] | None = option(
+        page="back_ends.md",
+        help="options of the back end, by name; on the command line they are flags",
     )
     duration: float | str | None = option(
         "--duration",

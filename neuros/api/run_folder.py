@@ -77,7 +77,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
         for file in files:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
-            seen = plan.back_end.as_seen(file)
+            seen = plan.deployment.as_seen(file)
             path.write_text(_text(node_file_to_json(seen)), "utf-8")
     except FileExistsError as error:
         raise UsageError(

@@ -9,7 +9,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
+
+from neuros.control import Report
 
 _WINDOW_S = 5.0
 """Rates are those of the last few reports, not of the whole run."""
@@ -21,7 +23,7 @@ class Reported(Protocol):
     """Reports of a run that goes on."""
 
     @property
-    def reports(self) -> Mapping[str, Mapping[str, Any]]: ...
+    def reports(self) -> Mapping[str, Report]: ...
     @property
     def started_s(self) -> float | None: ...
     @property
@@ -97,7 +99,7 @@ class Progress:
     def _end_sim_s(self) -> float | None:
         if self._sim_s is not None:
             return self._sim_s
-        ends = [r.get("expected_end_s") for r in self._outcome.reports.values()]
+        ends = [r.expected_end_s for r in self._outcome.reports.values()]
         return max((end for end in ends if end is not None), default=None)
 
     def _read(self) -> _Reading | None:
@@ -105,8 +107,8 @@ class Progress:
         if self._outcome.started_s is None:
             return None
         reports = self._outcome.reports.values()
-        times = [r["sim_time"] for r in reports if r["sim_time"] is not None]
-        all_metrics = [r["metrics"] for r in reports if r["metrics"] is not None]
+        times = [r.sim_time for r in reports if r.sim_time is not None]
+        all_metrics = [r.metrics for r in reports if r.metrics is not None]
         reading = _Reading(
             self._clock() - self._outcome.paused_s,
             max(times, default=None),

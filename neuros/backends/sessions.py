@@ -13,11 +13,13 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any
 
+from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
-from neuros.control import connect
+from neuros.control import Interrupt
+from neuros.control.link import ControlLink
+from neuros.errors import EnvironmentFault
 
 _VARIABLE = "NEUROS_GUARDED_RUN"
 
@@ -30,9 +32,11 @@ class Session:
         run: its id.
         folder: the run folder.
         namespace: of its nodes on the ROS graph, empty or as in ``/left``.
+        is_one_process: whether its nodes share a process.
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
+        control: address of its control channel.
         user: number of the user whose run it is: that of its reaper, whatever that says.
     """
 
@@ -44,6 +48,8 @@ class Session:
     since: float
     launcher: tuple[int, int]
     namespace: str = ""
+    is_one_process: bool = False
+    control: str = ""
     user: int = field(default_factory=os.getuid)
 
     @property
@@ -61,7 +67,7 @@ class Session:
         """The state of each node: running, ending (its launcher has gone), or not running."""
         processes = RunProcesses(self.run)
         there = set(processes.nodes().values())
-        if self.backend == "in-process" and processes.alive():
+        if self.is_one_process and processes.alive():
             there = set(self.nodes)
         up = "running" if self.is_led else "ending"
         return {node: up if node in there else "not running" for node in self.nodes}
@@ -69,19 +75,19 @@ class Session:
     def interrupt(self) -> None:
         """Ask its launcher to end it, as Ctrl+C does.
 
-        Over its control socket: where a Python program has started it, a signal would reach that
-        program, which may do something else meanwhile. A signal where that socket is not there yet.
+        Over its control channel: where a Python program has started it, a signal would reach that
+        program, which may do something else meanwhile. A signal where there is no channel yet.
         """
         if not self.is_led:
             return
         try:
-            lines = connect(Path(self.folder))
-        except OSError:
+            link = ControlLink(connect(self.control), (), "the supervisor")
+        except (OSError, EnvironmentFault):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
         else:
-            lines.send("signal")
-            lines.close()
+            link.send(Interrupt())
+            link.close()
 
 
 def reaper_environment(session: Session) -> dict[str, str]:

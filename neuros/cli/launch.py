@@ -10,14 +10,17 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from neuros.api.request import LaunchOptions
+from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.projects import add_project, load_with_messages
-from neuros.options import parsed_as
+from neuros.errors import NeurosError
+from neuros.options import add_options, parsed_as, values_of
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
@@ -31,6 +34,35 @@ def add_launch(launch: argparse.ArgumentParser) -> None:
     launch.set_defaults(command=_launch)
 
 
+def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
+    """Add the options of the back end that the arguments name; for ``--help``, of all."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--backend", nargs="?")
+    first.add_argument("-h", "--help", action="store_true")
+    asked, _ = first.parse_known_args(arguments)
+    for name in BACK_ENDS if asked.help else {_back_end_of(asked)} - {AUTO}:
+        try:
+            back_end = BACK_ENDS.load(name)
+        except NeurosError as error:
+            if not asked.help:
+                raise
+            launch.add_argument_group(f"back end {name}", str(error))
+            continue
+        group = launch.add_argument_group(f"back end {name}", f"each node in {back_end.place}")
+        add_options(group, [replace(each, group="") for each in back_end.options])
+
+
+def _back_end_of(parsed: argparse.Namespace) -> str:
+    return str(parsed.backend or os.environ.get("NEUROS_BACKEND") or AUTO)
+
+
+def _back_end_options(parsed: argparse.Namespace) -> dict[str, Any]:
+    """The options of the back end that were given."""
+    name = _back_end_of(parsed)
+    values = {} if name == AUTO else values_of(BACK_ENDS.load(name).options, parsed)
+    return {key: value for key, value in values.items() if value is not None}
+
+
 def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with _signals_noted() as (signals, waker):
@@ -40,6 +72,7 @@ def _launch(parsed: argparse.Namespace) -> int:
         from neuros.cli.views import Views
 
         options = parsed_as(LaunchOptions, parsed)
+        options = replace(options, backend_options=_back_end_options(parsed))
         project, messages = load_with_messages(parsed)
         plan = make_plan(project, messages, options, is_tried=not options.dry_run)
         if options.dry_run:
@@ -59,11 +92,11 @@ def _dry_run(plan: Plan) -> int:
     recording = recording_of(plan, os.environ)
     folder = run_folder_path(plan.request.output, plan.project.name, "<utc time>")
     with run_domain(plan, recording) as domain:
-        print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
+        print(f"back end {plan.back_end.name}; {domain.reason}; run folder {folder}")
     messages = plan.messages.describe() if plan.messages else ()
     for line in (*plan.pythons.notices, *plan.pythons.describe(), *messages):
         print(line)
-    for _, notice in plan.back_end.notices:
+    for _, notice in plan.notices:
         print(notice)
     for line in plan.launcher().describe(plan.node_files(folders_of(plan, folder))):
         print(line)

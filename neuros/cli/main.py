@@ -10,7 +10,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -24,6 +24,8 @@ EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 
 
 class Command(NamedTuple):
     """A command: its module, which has ``add_<command>(parser)``, and its line in the help.
+
+    With ``prepare_<command>(parser, arguments)`` the module adds options that depend on others.
 
     Without help it is one that NeuROS starts itself.
     """
@@ -40,6 +42,7 @@ class Command(NamedTuple):
         if is_whole:
             module = import_module(f"neuros.cli.{self.module}")
             getattr(module, f"add_{name.replace('-', '_')}")(parser)
+            parser.prepare = getattr(module, f"prepare_{name}", None)
 
 
 COMMANDS = {
@@ -82,9 +85,13 @@ class _Parser(argparse.ArgumentParser):
     argparse hands it up to the first parser, whose usage has commands only.
     """
 
-    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+    prepare: Callable[[argparse.ArgumentParser, Sequence[str]], None] | None = None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does, but nothing stays unknown."""
-        options, unknown = super().parse_known_args(*args, **kwargs)
+        if self.prepare is not None:
+            self.prepare(self, args)
+        options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             hint = did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
             unknown_text = f"unrecognized arguments: {' '.join(unknown)}"

@@ -12,9 +12,11 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from neuros.backends.control_sockets import connect_by
 from neuros.node.process import NodeProcess
 from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
@@ -66,6 +68,7 @@ def _run_node(options: argparse.Namespace) -> int:
     leave.exit_code = NodeProcess(
         files,
         make_middleware,
+        partial(connect_by, os.environ),
         open_recorder=_recorders(files[0].folders.run) if options.record else None,
         duration_sim_s=options.duration_sim,
         own_logs=options.in_memory,

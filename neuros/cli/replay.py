@@ -165,11 +165,10 @@ def _replay_node(options: argparse.Namespace) -> int:
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.cache import message_cache
-    from neuros.replay.containers import as_on_this_machine, ran_in_container
+    from neuros.replay.containers import as_on_this_machine
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
-    if ran_in_container(run):
-        file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
+    file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
     require_messages(file)
     if not file.node.plugin.is_file():
         raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
@@ -195,10 +194,11 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
         EnvironmentFault: if it cannot be made.
     """
     from neuros.backends.environments.pythons import Pythons
+    from neuros.backends.registered import ran_in_one_process
     from neuros.cli.environments import make_shown_environments
     from neuros.replay.containers import not_here, ran_in_container
 
-    own = [] if run.record.get("backend") == "in-process" else [file.node]
+    own = [] if ran_in_one_process(run.record) else [file.node]
     try:
         pythons = Pythons.choose(own, file.folders.project, dict(os.environ))
         ended = make_shown_environments(pythons, [])

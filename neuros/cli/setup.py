@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuros.backends.containers import OWN_FOLDER, STANDARD
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
     from neuros.backends.docker.recipes import Recipe
-    from neuros.doctor.machine_checks import Finding
 
-STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
-"""What the examples need."""
 _CONTAINERS_EPILOG = """\
 exit codes:
   0    done
@@ -170,7 +168,6 @@ def _build_images(options: argparse.Namespace) -> int:
 
 
 def _list_images(options: argparse.Namespace) -> int:
-    from neuros.backends.containers import OWN_FOLDER
     from neuros.backends.docker.engine import connect
     from neuros.backends.docker.inventory import inventory
     from neuros.backends.docker.recipes import names_in
@@ -220,7 +217,6 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
-    from neuros.backends.containers import OWN_FOLDER
     from neuros.backends.docker.recipes import names_in
     from neuros.distribution import WORKSPACE
     from neuros.project.load import load_project
@@ -273,31 +269,11 @@ def add_doctor(doctor: argparse.ArgumentParser) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from neuros.doctor.machine_checks import State
+    from neuros.doctor.checks import findings
+    from neuros.ports import State
 
     is_well = True
-    for finding in _findings(proves=not options.no_delivery):
+    for finding in findings(os.environ, proves=not options.no_delivery):
         print(finding, flush=True)  # the proofs take seconds
         is_well &= finding.state is not State.BAD
     return 0 if is_well else 4
-
-
-def _findings(*, proves: bool) -> Iterator[Finding]:
-    from neuros.doctor.delivery import prove_delivery
-    from neuros.doctor.machine_checks import (
-        State,
-        look_at_containers,
-        look_at_machine,
-        prove_rendering,
-    )
-
-    yield from look_at_machine(os.environ)
-    yield prove_rendering(os.environ)
-    has_base = False
-    for finding in look_at_containers(STANDARD, os.environ):
-        has_base |= finding.state is State.GOOD and finding.text.startswith("neuros_python:")
-        yield finding
-    if not proves:
-        return
-    for backend in ("in-process", "process", *(["docker"] if has_base else [])):
-        yield prove_delivery(backend)

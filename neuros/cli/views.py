@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import select
 import socket
 import sys
@@ -94,7 +95,7 @@ class Views:
         """Have a tool started later, or say in a few words why it cannot be."""
         from neuros.backends.tools import find_tool
 
-        if self._plan.backend == "in-process":
+        if self._plan.back_end.is_one_process:
             return "nodes of one process talk past ROS, where its tools see nothing"
         found = find_tool(program)
         if isinstance(found, str):
@@ -126,7 +127,7 @@ class Views:
                 "plan": shown_plan(self._plan.project, self._plan.names),
                 "names": self._plan.names,
                 "logs": {name: str(path) for name, path in run.logs.items()},
-                "is_one_process": self._plan.backend == "in-process",
+                "is_one_process": self._plan.back_end.is_one_process,
                 "start_s": time.monotonic(),
             },
         )
@@ -165,8 +166,11 @@ def add_view(view: argparse.ArgumentParser) -> None:
     view.set_defaults(command=_run_view)
 
 
-def _run_view(options: argparse.Namespace) -> int:
+def _run_view(_: argparse.Namespace) -> int:
+    from neuros.backends.control_sockets import connect_by
     from neuros.backends.rerun import await_server
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
     from neuros.viewers.observer import look_on
     from neuros.viewers.rerun_feed import RerunFeed
     from neuros.viewers.visual_types import VisualTypes
@@ -181,7 +185,8 @@ def _run_view(options: argparse.Namespace) -> int:
     feed = RerunFeed(
         told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
     )
-    look_on(Path(options.run), sources, feed.show)
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    look_on(link, sources, feed.show)
     feed.close()
     return 0
 
@@ -192,7 +197,7 @@ def add_dashboard(dashboard: argparse.ArgumentParser) -> None:
     dashboard.set_defaults(command=_run_dashboard)
 
 
-def _run_dashboard(options: argparse.Namespace) -> int:
+def _run_dashboard(_: argparse.Namespace) -> int:
     told = json.loads(sys.stdin.readline())
     listening = socket.socket(fileno=told["descriptor"])
     if not _is_looked_at(listening):
@@ -200,12 +205,22 @@ def _run_dashboard(options: argparse.Namespace) -> int:
     # Loading all this takes a fifth of a second of a core that the nodes can use.
     import asyncio
 
+    asyncio.run(_serve(told, listening))
+    return 0
+
+
+async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
+    from neuros.backends.control_sockets import connect_by
+    from neuros.control import TO_OBSERVERS, ControlLink
+    from neuros.viewers.dashboard.live_metrics import LiveRun
+    from neuros.viewers.dashboard.pages import Pages
     from neuros.viewers.dashboard.server import Dashboard
 
-    names = tuple(told["names"])
-    dashboard = Dashboard(told["plan"], names, _sources(told, names), told["start_s"])
-    asyncio.run(dashboard.serve(listening, told["token"], told["run"], Path(options.run)))
-    return 0
+    names, pages = tuple(told["names"]), Pages()
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    run = LiveRun(pages, link, names, told["start_s"])
+    dashboard = Dashboard(told["plan"], _sources(told, names), pages, run)
+    await dashboard.serve(listening, told["token"], told["run"])
 
 
 def _is_looked_at(listening: socket.socket) -> bool:

@@ -1,7 +1,11 @@
-"""The supervisor's ends of the control channel, one per process of nodes.
+"""The supervisor's ends of the control channel: node processes, and observers of the run.
 
 Nothing here ever waits for a node: one that is stopped, or has forked children which keep its
 socket open, must not hold up the supervisor.
+
+Observers are programs that may pause, step and end a run. They see what nodes show when asked (they
+ask while a user looks), and take no part in the run: when the last one has gone, a run that was
+paused goes on.
 """
 
 from __future__ import annotations
@@ -9,38 +13,52 @@ from __future__ import annotations
 import contextlib
 import selectors
 import socket
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
-from neuros.control import Lines, encode_line, listen
-from neuros.errors import EnvironmentFault
+from neuros.control import (
+    FROM_NODES,
+    FROM_OBSERVERS,
+    End,
+    Ended,
+    Hello,
+    LogRecord,
+    Look,
+    LookAll,
+    Message,
+    NodeStatus,
+    Pause,
+    PhaseChanged,
+    Resume,
+    Step,
+    StepAll,
+    Watch,
+)
+from neuros.control.link import ControlLink, encode
+from neuros.errors import ControlError
+from neuros.launcher.outcome import Outcome, Output, Phase
+from neuros.ports import ControlListener
 
+STRANGER = "a program that has not said what it is"
 _MOST_UNSENT_BYTES = 1 << 20
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024
 
 
 class Channels:
-    """Everybody that has connected to the control socket of a run.
+    """All programs that have connected to the control channel of a run.
 
     Raises:
-        EnvironmentFault: if there can be no such socket in ``run_folder``.
+        EnvironmentFault: if there can be no such channel.
     """
 
-    def __init__(self, run_folder: Path) -> None:
-        try:
-            self._listening = listen(run_folder)
-        except OSError as error:
-            raise EnvironmentFault(
-                f"{run_folder}: cannot make the control socket there ({error.strerror}): is the"
-                " folder used by another run, or on a file system without sockets? Name another"
-                " one with -o"
-            ) from error
-        self._listening.setblocking(False)
+    def __init__(self, listener: ControlListener) -> None:
+        listener.open()
+        self._listener = listener
         self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listening, selectors.EVENT_READ)
-        self._ends: dict[Lines, bytearray] = {}
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._unsent: dict[ControlLink, bytearray] = {}
+        self._nodes: dict[ControlLink, None] = {}  # in the order in which they said hello
         self._waker: socket.socket | None = None
 
     def wake_on(self, waker: socket.socket) -> None:
@@ -57,75 +75,218 @@ class Channels:
                 while self._waker.recv(_WAKING_BYTES) != b"":
                     pass
 
-    def receive(self) -> Iterator[tuple[Lines, Mapping[str, Any]]]:
-        """All that has arrived. What a process sent before it ended is there when it has ended."""
+    def receive(self) -> Iterator[tuple[ControlLink, Message | ControlError]]:
+        """All that has arrived. What a process sent before it ended is there when it has ended.
+
+        A message that is not understood comes as the error that says why.
+        """
         self._accept()
-        for lines in tuple(self._ends):
+        for link in tuple(self._unsent):
             for _ in range(_READS_AT_A_TIME):
-                has_more, messages = _read(lines)
-                yield from ((lines, message) for message in messages)
-                if has_more is None:
-                    self._forget(lines)
-                if not has_more:
+                try:
+                    lines = link.read_lines()
+                except BlockingIOError:
+                    break
+                for line in lines or ():
+                    yield link, self._message_in(line, link)
+                if lines is None:
+                    self.hang_up(link)
+                if link not in self._unsent:
                     break
 
-    def send(self, kind: str, **fields: Any) -> None:
-        """Send to all."""
-        for lines in tuple(self._ends):
-            self.send_to(lines, kind, **fields)
+    def send(self, message: Message) -> None:
+        """Send to all node processes."""
+        for link in tuple(self._nodes):
+            self.send_to(link, message)
 
-    def send_to(self, lines: Lines, kind: str, **fields: Any) -> None:
+    def send_to(self, link: ControlLink, message: Message) -> None:
         """Send to one; what does not go through now goes with the next, or :meth:`flush`."""
-        if lines in self._ends and len(self._ends[lines]) < _MOST_UNSENT_BYTES:
-            self._ends[lines] += encode_line(kind, fields)
-            self._flush(lines)
+        if link in self._unsent and len(self._unsent[link]) < _MOST_UNSENT_BYTES:
+            self._unsent[link] += encode(message)
+            self._flush(link)
 
-    def has(self, lines: Lines) -> bool:
+    def is_node(self, link: ControlLink) -> bool:
+        """Whether a node process is, or was, at the other end."""
+        return link in self._nodes
+
+    def has(self, link: ControlLink) -> bool:
         """Whether that one is still connected."""
-        return lines in self._ends
+        return link in self._unsent
 
     def flush(self) -> None:
         """Try again to send what did not go through."""
-        for lines, unsent in tuple(self._ends.items()):
+        for link, unsent in tuple(self._unsent.items()):
             if unsent:
-                self._flush(lines)
+                self._flush(link)
+
+    def hang_up(self, link: ControlLink) -> None:
+        """Neither send to this one nor hear it any more."""
+        if self._unsent.pop(link, None) is not None:
+            self._selector.unregister(link)
+            link.close()
 
     def close(self) -> None:
-        """Hang up."""
-        for lines in tuple(self._ends):
-            self._forget(lines)
+        """Hang up on all."""
+        for link in tuple(self._unsent):
+            self.hang_up(link)
         self._selector.close()
-        self._listening.close()
+        self._listener.close()
 
     def _accept(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                connected, _ = self._listening.accept()
-                connected.setblocking(False)
-                lines = Lines(connected)
-                self._ends[lines] = bytearray()
-                self._selector.register(lines, selectors.EVENT_READ)
+        while (stream := self._listener.accept()) is not None:
+            stream.setblocking(False)
+            link = ControlLink(stream, (*FROM_NODES, *FROM_OBSERVERS), STRANGER)
+            self._unsent[link] = bytearray()
+            self._selector.register(link, selectors.EVENT_READ)
 
-    def _flush(self, lines: Lines) -> None:
-        unsent = self._ends[lines]
+    def _message_in(self, line: bytes, link: ControlLink) -> Message | ControlError:
+        """The message, after which it is known who is at the other end; else why there is none."""
+        try:
+            message = link.decode(line)
+        except ControlError as error:
+            return error
+        if isinstance(message, Hello):
+            self._nodes[link] = None
+            link.peer = f"the process of {' and '.join(message.nodes)}"
+        elif isinstance(message, Watch):
+            link.peer = "an observer"
+        return message
+
+    def _flush(self, link: ControlLink) -> None:
+        unsent = self._unsent[link]
         # An error shows again, and is dealt with, when we read.
         with contextlib.suppress(OSError):
             while unsent:
-                sent = lines.socket.send(unsent, socket.MSG_NOSIGNAL)
-                del unsent[:sent]
-
-    def _forget(self, lines: Lines) -> None:
-        self._selector.unregister(lines)
-        del self._ends[lines]
-        lines.close()
+                del unsent[: link.stream.send(unsent)]
 
 
-def _read(lines: Lines) -> tuple[bool | None, list[Mapping[str, Any]]]:
-    """One read: whether there may be more (``None``: it has hung up), and what came."""
-    try:
-        messages = lines.receive_now()
-    except BlockingIOError:
-        return False, []
-    except ValueError:  # that is none of ours
-        return None, []
-    return (None, []) if messages is None else (True, messages)
+@dataclass
+class PauseState:
+    """The pause of a run, and the time that it has been paused in all.
+
+    Attributes:
+        send: to all nodes.
+        clock: monotonic, seconds.
+        since_s: when the run was paused, on the clock; ``None`` while it is not.
+    """
+
+    send: Callable[[Message], object]
+    clock: Callable[[], float]
+    since_s: float | None = None
+    _before_s: float = 0.0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the run is paused now."""
+        return self.since_s is not None
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of pause so far."""
+        return self._before_s + (0.0 if self.since_s is None else self.clock() - self.since_s)
+
+    def begin(self) -> None:
+        """Let no hook start."""
+        if self.since_s is None:
+            self.since_s = self.clock()
+            self.send(Pause())
+
+    def end(self) -> None:
+        """Let the run go on."""
+        if self.since_s is not None:
+            self.forget()
+            self.send(Resume())
+
+    def forget(self) -> None:
+        """The pause is over without a request: nodes that drain go on by themselves."""
+        self._before_s, self.since_s = self.total_s, None
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        """Let a paused run do so many steps."""
+        if self.since_s is not None and count > 0:
+            self.send(Step(count, is_driven))
+
+
+class Observers:
+    """The observers of one run.
+
+    Args:
+        is_driven: whether some node starts hooks unasked, and so drives the project.
+        end: ends the run, drained: ``end(reason)``.
+    """
+
+    def __init__(
+        self,
+        channels: Channels,
+        pause: PauseState,
+        is_driven: Callable[[], bool],
+        end: Callable[[str], None],
+    ) -> None:
+        self._channels = channels
+        self._pause = pause
+        self._is_driven = is_driven
+        self._end = end
+        self._links: dict[int, ControlLink] = {}  # by their numbers, which are not given out again
+        self._count = 0
+        self._told: PhaseChanged | None = None
+
+    def take(self, link: ControlLink, message: Message) -> None:
+        """Take a message from or for an observer."""
+        match message:
+            case Watch():
+                self._count += 1
+                self._links[self._count] = link
+                self._told = None
+            case LookAll(wanted):
+                for number, each in self._links.items():
+                    if each is link:
+                        self._channels.send(Look(wanted, number))
+            case NodeStatus(asker=asker):
+                if asker in self._links:
+                    self._channels.send_to(self._links[asker], message)
+            case Pause():
+                self._pause.begin()
+            case Resume():
+                self._pause.end()
+            case StepAll(count):
+                self._pause.step(count, is_driven=self._is_driven())
+            case End(reason):
+                self._end(reason)
+
+    def tell(self, message: Message) -> None:
+        """Send to all observers."""
+        for link in self._links.values():
+            self._channels.send_to(link, message)
+
+    def look_at(self, phase: Phase) -> None:
+        """Tell them of a change of phase; if the last one has gone, end a pause."""
+        if phase is not Phase.RUNNING and self._pause.is_on:
+            self._pause.forget()
+        if not self._links:
+            return
+        self._links = {n: link for n, link in self._links.items() if self._channels.has(link)}
+        if not self._links:
+            self._pause.end()
+        now = PhaseChanged(phase.value, self._pause.is_on)
+        if now != self._told:
+            self._told = now
+            self.tell(now)
+
+    def part(self, outcome: Outcome) -> None:
+        """Tell them how the run has ended."""
+        self.tell(Ended(outcome.exit_code, outcome.reason, outcome.reports, outcome.running_s))
+
+
+@dataclass
+class Overheard:
+    """An output for people whose records observers get, too."""
+
+    _output: Output
+    _tell: Callable[[Message], object]
+
+    def log(self, severity: str, text: str) -> None:
+        self._output.log(severity, text)
+        self._tell(LogRecord(severity, text))
+
+    def poll(self) -> object:
+        return self._output.poll()

@@ -10,21 +10,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from neuros.control import HookDeclaration, Hooks
 from neuros.hooks import HookKind, InputSpec
 from neuros.project.model import Connection, NodeFile
 
 
 @dataclass(frozen=True)
-class DeclaredHook:
+class DeclaredHook(HookDeclaration):
     """A hook as its plugin declares it; ``place`` is that among the hooks of its node's engine."""
 
-    node: str
-    place: int
-    kind: HookKind
-    inputs: tuple[InputSpec, ...]
-    outputs: tuple[str, ...]
+    node: str = ""
+    place: int = 0
 
     @property
     def required(self) -> list[InputSpec]:
@@ -56,19 +53,13 @@ class Declarations:
         self._finalisers: dict[str, list[str]] = {}
         self._finalising: dict[str, str | None] = {}
 
-    def take(self, message: Mapping[str, Any]) -> None:
-        """Take the message ``hooks`` (see :mod:`neuros.control`) of a node."""
-        node = message["node"]
-        self._finalisers[node] = list(message["finalise"])
+    def take(self, message: Hooks) -> None:
+        """Take the declarations of a node."""
+        node = message.node
+        self._finalisers[node] = list(message.finalise)
         self._hooks[node] = [
-            DeclaredHook(
-                node,
-                place,
-                HookKind(hook["kind"]),
-                tuple(InputSpec(*port) for port in hook["inputs"]),
-                tuple(hook["outputs"]),
-            )
-            for place, hook in enumerate(message["hooks"])
+            DeclaredHook(hook.kind, hook.inputs, hook.outputs, node, place)
+            for place, hook in enumerate(message.hooks)
         ]
 
     def note_finalising(self, node: str, hook: str | None) -> None:
@@ -95,7 +86,7 @@ class Declarations:
             clauses.append(f"finalise {noun} {hooks} of '{node}' did not run")
         return clauses
 
-    def last_round(self, stopped: str) -> dict[str, list[int]]:
+    def last_round(self, stopped: str) -> dict[str, tuple[int, ...]]:
         """By node, the places of the hooks that may start once more only, for the end to come.
 
         ``stopped`` is the node that starts no further hook, empty if there is none.
@@ -104,7 +95,7 @@ class Declarations:
         found: dict[str, list[int]] = {}
         for hook in last_round(hooks, self._connections, self._external, stopped):
             found.setdefault(hook.node, []).append(hook.place)
-        return found
+        return {node: tuple(places) for node, places in found.items()}
 
 
 def last_round(

@@ -1,12 +1,16 @@
-"""Phases of a run, and its outcome."""
+"""Phases of a run, its outcome, and its node processes as their reports show them."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol
+
+from neuros.control import Report
+from neuros.launcher.stall_detector import StallDetector
+from neuros.ports import RunningNode
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}
 SIGNAL_NAMES = {
@@ -62,7 +66,7 @@ class Outcome:
 
     exit_code: int = 0
     reason: str = ""
-    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    reports: dict[str, Report] = field(default_factory=dict)
     report_times_s: dict[str, float] = field(default_factory=dict)
     timelines: dict[str, list[Sequence[float]]] = field(default_factory=dict)
     elsewhere: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -85,25 +89,26 @@ class Outcome:
         when the node that owns simulated time had.
         """
         since = {
-            name: report["running_since_s"]
+            name: report.running_since_s
             for name, report in self.reports.items()
-            if report.get("running_since_s") is not None
+            if report.running_since_s is not None
         }
         if self.ending_s is None:
             return None
-        owners = [since[name] for name in since if self.reports[name].get("sim_time") is not None]
+        owners = [since[name] for name in since if self.reports[name].sim_time is not None]
         start_s = max(since.values(), default=self.ending_s)
         if start_s >= self.ending_s or len(since) < len(self.reports):
             start_s = max(owners, default=self.ending_s)
-        return max(0.0, float(self.ending_s - start_s))
+        return max(0.0, self.ending_s - start_s)
 
-    def take(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
+    def take(self, report: Report, now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
+        name = report.node
         if not self.has_final_report(name):
             self.reports[name] = report
-            if report.get("fault") and report["fault"] not in self.faults:
-                self.faults.append(report["fault"])
-            self.timelines.setdefault(name, []).extend(report.get("timeline", ()))
+            if report.fault and report.fault not in self.faults:
+                self.faults.append(report.fault)
+            self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
     def begin_to_end(self, now_s: float) -> None:
@@ -113,7 +118,7 @@ class Outcome:
 
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
-        return bool(self.reports.get(name, {}).get("is_final"))
+        return name in self.reports and self.reports[name].is_final
 
     def end_by_force(self, exit_code: int, name: str) -> None:
         """The user has had killed what was left of a run, by a signal of this name."""
@@ -126,3 +131,82 @@ class Outcome:
         self.failures.append(reason)
         if self.exit_code == 0:
             self.exit_code, self.reason = exit_code, reason
+
+
+class Processes:
+    """Processes that the back end has started, judged by the reports of their nodes.
+
+    Attributes:
+        killed: the names of all nodes whose processes were killed.
+    """
+
+    def __init__(self, detector: StallDetector, outcome: Outcome) -> None:
+        self._detector = detector
+        self._outcome = outcome
+        self._running: list[RunningNode] = []
+        self._has_told_failure: set[str] = set()
+        self.killed: set[str] = set()
+
+    def add(self, started: Sequence[RunningNode]) -> None:
+        """These run from now on."""
+        self._running += started
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def __iter__(self) -> Iterator[RunningNode]:
+        return iter(tuple(self._running))
+
+    def note_failure(self, name: str) -> None:
+        """A node has told that it failed: its process may end now."""
+        self._has_told_failure.add(name)
+
+    def ended(self) -> list[tuple[RunningNode, str]]:
+        """Processes that have ended since the last call, and how."""
+        ended = [(process, how) for process in self._running if (how := process.poll())]
+        for process, _ in ended:
+            self._running.remove(process)
+        return ended
+
+    def kill(self, process: RunningNode) -> None:
+        self.killed.update(process.names)
+        process.kill()
+
+    def not_loaded(self) -> list[RunningNode]:
+        """Processes in which no node has come as far as its first hook."""
+        return [
+            process
+            for process in self._running
+            if not any(self._detector.is_loaded(name) for name in process.names)
+        ]
+
+    def have_reported(self) -> bool:
+        """Whether every node has made its final report, but for those that were killed."""
+        names = {name for process in self._running for name in process.names}
+        return all(map(self._outcome.has_final_report, names - self.killed))
+
+    def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
+        """Whether it was asked to end and has told its last, or has failed and said so."""
+        names = set(process.names)
+        if names <= self.killed or names & self._has_told_failure:
+            return True
+        return is_stopping and all(map(self._outcome.has_final_report, names))
+
+    def how_it_failed(self, process: RunningNode, how: str, *, is_stopping: bool) -> str:
+        """One sentence about a process that should not have ended."""
+        noun = "node" if len(process.names) == 1 else "nodes"
+        return f"{noun} {names_of(process)} {self._when(process, is_stopping)}: {how}"
+
+    def _when(self, process: RunningNode, is_stopping: bool) -> str:
+        if is_stopping:
+            return "ended while finalising"
+        if not any(map(self._detector.is_greeted, process.names)):
+            were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
+            return f"ended before {were} wrote is above)"
+        seen = "".join(self._detector.last_seen(name) for name in process.names)
+        return f"ended unexpectedly{seen}"
+
+
+def names_of(process: RunningNode) -> str:
+    """Its nodes, for people."""
+    return " and ".join(f"'{name}'" for name in process.names)

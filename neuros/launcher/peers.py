@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
+from neuros.control import Report
 from neuros.project.model import Connection, NodeFile
 
 Books = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
@@ -76,16 +77,16 @@ def state_from(text: str) -> PeerState | None:
         return None
 
 
-def books_of(reports: Mapping[str, Mapping[str, Any]], crossing: Sequence[Connection]) -> Books:
+def books_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -> Books:
     """The counters of connections to peers, from the reports of the nodes here."""
     keys = {str(connection) for connection in crossing}
     return {
         name: {
-            part: {key: dict(c) for key, c in report["metrics"][part].items() if key in keys}
-            for part in ("outgoing", "incoming")
+            "outgoing": {key: {**c} for key, c in metrics["outgoing"].items() if key in keys},
+            "incoming": {key: {**c} for key, c in metrics["incoming"].items() if key in keys},
         }
         for name, report in reports.items()
-        if report["metrics"] is not None
+        if (metrics := report.metrics) is not None
     }
 
 
@@ -154,7 +155,7 @@ class Peers:
         """The run here drains."""
         self._utter(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
 
-    def settle(self, probes: Mapping[str, Mapping[str, Any]]) -> bool:
+    def settle(self, probes: Mapping[str, Report]) -> bool:
         """The run here is drained by itself; returns whether peers agree, and nothing is under way.
 
         Others count it as drained only while the counters of both ends are equal. A packet under
@@ -174,7 +175,7 @@ class Peers:
         """The run here stops."""
         self._utter(phase=STOPPING, **self._because(reason, exit_code))
 
-    def finish(self, reports: Mapping[str, Mapping[str, Any]], now_s: float) -> bool:
+    def finish(self, reports: Mapping[str, Report], now_s: float) -> bool:
         """All nodes here have made their final report; returns whether they may go."""
         if self._over_s is None:
             self._over_s = now_s

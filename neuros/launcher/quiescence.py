@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
+from neuros.control import Message, Probe, Probed, ReceivedCounts, SentCounts
 from neuros.launcher.peers import Peers
 from neuros.project.model import Connection, NodeFile
 
@@ -24,7 +25,7 @@ _RUNNING_PAUSE_S = DEADLOCK_AFTER_S / 2
 _LONGEST_PAUSE_S = 2.0
 _BUSY_S = 0.1
 
-Probes = Mapping[str, Mapping[str, Any]]
+Probes = Mapping[str, Probed]
 """The newest probe by node."""
 
 Waits = Mapping[str, Mapping[str, str]]
@@ -45,7 +46,7 @@ class Probing:
     Args:
         names: the nodes, all of which have to answer.
         connections: those among them.
-        send: sends to all processes, ``send("probe", number=3)``.
+        send: sends to all processes.
         peers: who has to agree that the project is drained, where not all nodes are here.
     """
 
@@ -53,7 +54,7 @@ class Probing:
         self,
         names: Iterable[str],
         connections: Sequence[Connection],
-        send: Callable[..., object],
+        send: Callable[[Message], object],
         peers: Peers | None = None,
     ) -> None:
         self._names = set(names)
@@ -64,8 +65,8 @@ class Probing:
         self._number = 0
         self._asked_s = 0.0
         self._pause_s = 0.0
-        self._probes: dict[str, Mapping[str, Any]] = {}
-        self._answers: Mapping[str, Mapping[str, Any]] = {}  # of the last whole round
+        self._probes: dict[str, Probed] = {}
+        self._answers: Probes = {}  # of the last whole round
         self._last_round: tuple[Any, ...] | None = None
         self.verdict = Verdict.UNDECIDED
 
@@ -77,10 +78,10 @@ class Probing:
         self.verdict = Verdict.UNDECIDED if self._names else Verdict.DRAINED
         self._ask(now_s)
 
-    def take(self, name: str, report: Mapping[str, Any]) -> None:
-        """Take a report; it may be the answer to the last probe."""
-        if self._number and report.get("probe") == self._number and name in self._names:
-            self._probes[name] = report
+    def take(self, probe: Probed) -> None:
+        """Take an answer, perhaps to the last probe."""
+        if probe.number == self._number and probe.node in self._names:
+            self._probes[probe.node] = probe
             if len(self._probes) == len(self._names):
                 self._judge()
 
@@ -114,7 +115,7 @@ class Probing:
         if silent and now_s - self._asked_s >= _BUSY_S:
             return [f"{name} is busy" for name in silent]
         probes = self._probes if not silent else self._answers
-        waiting = [name for name, probe in sorted(probes.items()) if probe["is_startable"]]
+        waiting = [name for name, probe in sorted(probes.items()) if probe.is_startable]
         return [
             *(f"a packet is under way on `{key}`" for key in under_way(probes, self._connections)),
             *(f"{name} has a packet to work on" for name in waiting),
@@ -124,13 +125,11 @@ class Probing:
         self._number += 1
         self._asked_s = now_s
         self._probes = {}
-        self._send("probe", number=self._number)
+        self._send(Probe(self._number))
 
     def _judge(self) -> None:
         probes, connections = self._probes, self._connections
         self._answers = probes
-        if any(probe["metrics"] is None for probe in probes.values()):
-            return
         if self._is_draining:
             this_round: tuple[Any, ...] = reliable_counters(probes, connections)
             is_over, verdict = is_drained(probes, connections), Verdict.DRAINED
@@ -166,14 +165,14 @@ def counters(probes: Probes) -> tuple[Any, ...]:
             name,
             tuple(
                 (key, c["sent"], c["acknowledged"])
-                for key, c in sorted(probe["metrics"]["outgoing"].items())
+                for key, c in sorted(probe.metrics["outgoing"].items())
             ),
             tuple(
                 (key, c["received"], c["acknowledged"])
-                for key, c in sorted(probe["metrics"]["incoming"].items())
+                for key, c in sorted(probe.metrics["incoming"].items())
             ),
             tuple(
-                (key, hook["executions"]) for key, hook in sorted(probe["metrics"]["hooks"].items())
+                (key, hook["executions"]) for key, hook in sorted(probe.metrics["hooks"].items())
             ),
         )
         for name, probe in sorted(probes.items())
@@ -203,15 +202,14 @@ def under_way(probes: Probes, connections: Sequence[Connection]) -> list[str]:
 def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
     """Whether no reliable packet is under way, and none waits that some hook could start on."""
     return not under_way(probes, connections) and not any(
-        probe["is_startable"] for probe in probes.values()
+        probe.is_startable for probe in probes.values()
     )
 
 
 def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
     """Whether no node can ever run a hook again."""
     return not under_way(probes, connections) and all(
-        probe["is_running"] and probe["is_idle"] and not probe["is_wakeable"]
-        for probe in probes.values()
+        probe.is_running and probe.is_idle and not probe.is_wakeable for probe in probes.values()
     )
 
 
@@ -223,9 +221,9 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
         sender, receiver = connection.source_node, connection.destination_node
         if sender not in probes or receiver not in probes:
             continue
-        state = probes[receiver]["metrics"]["state"]
+        state = probes[receiver].metrics["state"]
         is_waiting = state["state"] == "waiting"
-        outgoing = probes[sender]["metrics"]["outgoing"][key]
+        outgoing = probes[sender].metrics["outgoing"][key]
         # A packet to itself stays unread for as long as the node waits for another input: then
         # it is that input that it lacks.
         if outgoing["is_blocked"] and not (sender == receiver and is_waiting):
@@ -234,7 +232,7 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
                 receiver, f"is blocked on `{key}` ({outstanding} outstanding)"
             )
         is_cause = is_waiting and state["cause"] == connection.destination_input
-        if is_cause and not probes[receiver]["metrics"]["incoming"][key]["unread"]:
+        if is_cause and not probes[receiver].metrics["incoming"][key]["unread"]:
             result[receiver][sender] = f"waits for `{connection.destination_input}` from {sender}"
     return result
 
@@ -267,8 +265,8 @@ def _ring_through(start: str, waits: Waits) -> list[str]:
 
 def _reliable(
     probes: Probes, connections: Sequence[Connection]
-) -> Iterator[tuple[Connection, Mapping[str, Any], Mapping[str, Any]]]:
-    """Both ends' books of every reliable connection between nodes that were probed."""
+) -> Iterator[tuple[Connection, SentCounts, ReceivedCounts]]:
+    """The counters at both ends of every reliable connection between nodes that were probed."""
     for connection in connections:
         sender = probes.get(connection.source_node)
         receiver = probes.get(connection.destination_node)
@@ -276,6 +274,6 @@ def _reliable(
             key = str(connection)
             yield (
                 connection,
-                sender["metrics"]["outgoing"][key],
-                receiver["metrics"]["incoming"][key],
+                sender.metrics["outgoing"][key],
+                receiver.metrics["incoming"][key],
             )

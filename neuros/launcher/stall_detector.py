@@ -6,15 +6,19 @@ Reports come once per second, so what is said here is up to a second late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuros.control import ExecutingHook, Report
 from neuros.project.model import Connection
 from neuros.stacks import LONG_S, Stack, held_stack, held_threads
 
 STALL_S = 5.0
 """After this long, nodes are asked why nothing moves."""
+
+SILENT_S = 2.0
+"""A node that has not reported for this long reports no more, or not in time."""
 
 _FIRST_REMARK_S = 5.0
 _NEXT_REMARK_S = 10.0
@@ -38,7 +42,7 @@ class StallDetector:
         self._run_folder = run_folder
         self._hosts: dict[str, str] = {}  # by node, the first node of its process
         self._silent = set(names)
-        self._reports: dict[str, Mapping[str, Any]] = {}
+        self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
         self._moved: dict[str, Any] = {}
         self._moved_s = now_s
@@ -53,8 +57,9 @@ class StallDetector:
         self._silent.difference_update(names)
         self._hosts.update(dict.fromkeys(names, names[0]))
 
-    def report(self, name: str, report: Mapping[str, Any], now_s: float) -> None:
+    def report(self, report: Report, now_s: float) -> None:
         """Take a report."""
+        name, metrics = report.node, report.metrics
         self._reports[name] = report
         self._heard_s[name] = now_s
         self._named_as_mute.discard(name)
@@ -62,7 +67,6 @@ class StallDetector:
             self._named_as_held.remove(name)
             if hook := self._executing(name):
                 self._named_hooks.add((name, hook["name"], hook["executions"]))
-        metrics = report["metrics"]
         moved = metrics and (
             [hook["executions"] for hook in metrics["hooks"].values()],
             [c["received"] for c in metrics["incoming"].values()],
@@ -79,7 +83,7 @@ class StallDetector:
     def is_loaded(self, name: str) -> bool:
         """Whether a node has come as far as having an engine that may run hooks."""
         report = self._reports.get(name)
-        return report is not None and report["metrics"] is not None
+        return report is not None and report.metrics is not None
 
     @property
     def is_complete(self) -> bool:
@@ -89,7 +93,7 @@ class StallDetector:
     @property
     def is_driven(self) -> bool:
         """Whether some node starts hooks with no packet for them."""
-        return any(report["is_driving"] for report in self._reports.values())
+        return any(report.is_driving for report in self._reports.values())
 
     def begin_anew(self, now_s: float) -> None:
         """Something has kept the nodes still that is no standstill of their own."""
@@ -164,18 +168,21 @@ class StallDetector:
         """The stack of a node in its plugin, as far as is known."""
         if held := self._held(name):
             return held
-        stack = self._reports.get(name, {}).get("stack")
-        return Stack(*stack) if stack else None
+        return self._reports[name].stack if name in self._reports else None
 
     def threads_of(self, name: str) -> str:
         """The threads of a node's process if that has not reported for seconds."""
         return held_threads(self._run_folder / self._hosts.get(name, name))
 
+    def silent_s(self, name: str, now_s: float) -> float:
+        """For how long a node has not reported."""
+        return now_s - self._heard_s.get(name, now_s)
+
     def executing(self, name: str) -> str:
         """The hook that a node executes, as far as is known; empty if there is none."""
         hook = self._executing(name) if name in self._reports else None
         if hook is not None:
-            return str(hook["name"])
+            return hook["name"]
         held = self._held(name)
         return held.hook if held else ""
 
@@ -196,10 +203,10 @@ class StallDetector:
 
     def _waiting(self) -> list[str]:
         """Connections whose other end has not been found yet."""
-        return sorted({key for report in self._reports.values() for key in report["waiting_for"]})
+        return sorted({key for report in self._reports.values() for key in report.waiting_for})
 
-    def _executing(self, name: str) -> Mapping[str, Any] | None:
-        metrics = self._reports[name]["metrics"]
+    def _executing(self, name: str) -> ExecutingHook | None:
+        metrics = self._reports[name].metrics
         return metrics["executing"] if metrics else None
 
 
@@ -228,24 +235,24 @@ class Backlog:
         self._takers: dict[str, tuple[str, int]] = {}
         self._named: set[str] = set()
 
-    def report(self, report: Mapping[str, Any], now_s: float) -> None:
+    def report(self, report: Report, now_s: float) -> None:
         """Take a report of a node."""
-        metrics = report["metrics"]
+        metrics = report.metrics
         if metrics is None:
             return
-        for key, counts in metrics["outgoing"].items():
-            if key in self._sent and counts["is_reliable"]:
-                self._sent[key].append((now_s, counts["sent"]))
-        for key, counts in metrics["incoming"].items():
+        for key, outgoing in metrics["outgoing"].items():
+            if key in self._sent and outgoing["is_reliable"]:
+                self._sent[key].append((now_s, outgoing["sent"]))
+        for key, incoming in metrics["incoming"].items():
             if key not in self._received:
                 continue
-            self._counted[key] = counts["received"]
-            self._received[key].append((now_s, counts["received"]))
-            _drop(self._received[key], counts["received"] - counts["unread"])
-            if counts["taker"] is None:
+            self._counted[key] = incoming["received"]
+            self._received[key].append((now_s, incoming["received"]))
+            _drop(self._received[key], incoming["received"] - incoming["unread"])
+            if incoming["taker"] is None:
                 self._takers.pop(key, None)
             else:
-                self._takers[key] = counts["taker"], counts["unread"]
+                self._takers[key] = incoming["taker"], incoming["unread"]
 
     def begin_anew(self) -> None:
         """Something has kept the nodes still: what waited meanwhile is not behind."""

@@ -10,27 +10,206 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from neuros.control import Lines
-from neuros.launcher.channels import Channels
+from neuros import control
+from neuros.control import Message, Report
+from neuros.control.link import ControlLink
+from neuros.errors import ControlError
+from neuros.launcher.channels import Channels, Observers, Overheard, PauseState
 from neuros.launcher.declarations import Declarations
-from neuros.launcher.observers import Observers, Overheard, Pause
-from neuros.launcher.outcome import Outcome, Output, Phase
+from neuros.launcher.outcome import (
+    EXIT_CODES,
+    SIGNAL_NAMES,
+    Outcome,
+    Output,
+    Phase,
+    Processes,
+    names_of,
+)
 from neuros.launcher.peers import Peers
-from neuros.launcher.processes import Processes
 from neuros.launcher.quiescence import Probing, Verdict, connections_among
-from neuros.launcher.shutdown import STOP_S, Shutdown
-from neuros.launcher.stall_detector import Backlog, StallDetector
-from neuros.ports import Launcher
+from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector, with_stack
+from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 from neuros.stacks import remove_stack_files
 
+STOP_S = 5.0
+"""What nodes have for their finalise hooks and for flushing, in all."""
+
+# What closing a node that peers have heard may take, before it would be killed.
+_CLOSING_S = 1.0
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
+
+
+@dataclass
+class Shutdown:
+    """Shutdown of a run: its phases, and the events that end each of them.
+
+    Running, then perhaps draining, then stopping, and at worst killed; never back.
+
+    Args:
+        _signals: numbers of the signals that have arrived, appended to by a signal handler.
+    """
+
+    _channels: Channels
+    _processes: Processes
+    _detector: StallDetector
+    _declarations: Declarations
+    _probing: Probing
+    _peers: Peers
+    _outcome: Outcome
+    _output: Output
+    _signals: list[int]
+    phase: Phase = Phase.RUNNING
+    _deadline_s: float = 0.0
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether something outlasts even SIGKILL; the reaper will try on for a while."""
+        return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
+
+    def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
+        """Let packets under way arrive, and then end; only a run that is not ending already.
+
+        ``stopped`` is the node that asks for it, and starts no further hook.
+        """
+        if self.phase is not Phase.RUNNING:
+            return
+        self.phase = Phase.DRAINING
+        now_s = time.monotonic()
+        self._outcome.begin_to_end(now_s)
+        self._outcome.reason = reason
+        self._deadline_s = now_s + drain_s
+        self._output.log("INFO", f"{reason}; letting packets under way arrive")
+        self._peers.drain(reason, drain_s)
+        # A node that is still loading has sent nothing, and nobody could send to it yet.
+        for process in self._processes.not_loaded():
+            self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
+            self._processes.kill(process)
+        self._channels.send(control.Drain(self._declarations.last_round(stopped)))
+        self._probing.drain(self._processes.killed, now_s)
+
+    def fail(self, reason: str, exit_code: int = 1) -> None:
+        """End as failed, at once."""
+        self._outcome.fail(reason, exit_code)
+        if self.phase in (Phase.RUNNING, Phase.DRAINING):
+            self._stop()
+
+    def heed_signals(self) -> None:
+        """End as the user wishes."""
+        while self._signals:
+            number = signal.Signals(self._signals.pop(0))
+            name = SIGNAL_NAMES[number]
+            if self.phase in (Phase.RUNNING, Phase.DRAINING):
+                self._output.log("INFO", f"{name}: stopping (once more kills at once)")
+                self._stop_with(EXIT_CODES[number], f"ended by {name}")
+                self._outcome.is_signalled = True
+            elif self.phase is Phase.STOPPING and self._outcome.is_signalled:
+                self._output.log("WARN", f"{name} again: killing what is left")
+                self._outcome.end_by_force(EXIT_CODES[number], name)
+                self._kill_all()
+            elif self.phase is Phase.STOPPING:
+                self._outcome.is_signalled = True
+                self._output.log("INFO", f"{name}: already ending (once more kills at once)")
+
+    def heed_peers(self) -> None:
+        """End where the project has ended elsewhere, and as it did there."""
+        if self.phase not in (Phase.RUNNING, Phase.DRAINING):
+            return
+        end = self._peers.end(time.monotonic())
+        if end is None:
+            return
+        if end.exit_code == 0:
+            self.drain(end.reason, end.drain_s)
+        elif end.exit_code in EXIT_CODES.values():
+            self._output.log("INFO", f"{end.reason}; stopping")
+            self._stop_with(end.exit_code, end.reason)
+        else:
+            self.fail(end.reason)
+
+    def look(self, now_s: float) -> None:
+        """Go on to the next phase where it is time."""
+        if self.phase is Phase.STOPPING:
+            self._look_at_stopping(now_s)
+        elif self.phase is Phase.DRAINING:
+            if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+                self._stop()
+            elif now_s >= self._deadline_s:
+                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
+                self._output.log("WARN", f"not drained in time: {why}")
+                self._outcome.late_drain = why
+                self._stop()
+
+    def _look_at_stopping(self, now_s: float) -> None:
+        if now_s >= self._deadline_s:
+            for process in self._processes:
+                self._fail_to_end(process, now_s)
+            self._kill_all()
+        elif self._peers.exist and self._processes.have_reported():
+            may_go = self._peers.finish(self._outcome.reports, now_s)
+            if may_go or self._deadline_s - now_s < _CLOSING_S:
+                self._channels.send(control.Leave())
+
+    def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
+        """Its nodes have had their time."""
+        nodes = "node" if len(process.names) == 1 else "nodes"
+        late = [name for name in process.names if not self._outcome.has_final_report(name)]
+        unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
+        why = "; ".join(unfinished) or "its process did not end"
+        self._outcome.fail(
+            f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
+        )
+
+    def _unfinished(self, name: str, now_s: float) -> list[str]:
+        """Clauses about a node that has not made its final report."""
+        hook, is_finalising = self._detector.executing(name), self._declarations.is_finalising(name)
+        clauses = self._declarations.unfinished(name)
+        if hook and not is_finalising:
+            clauses.insert(0, f"'{name}' was still executing '{hook}'")
+        if clauses:
+            return clauses
+        if is_finalising:
+            return [f"'{name}' had finalised, but did not make its final report"]
+        silent_s = self._detector.silent_s(name, now_s)
+        silence = f" and had not reported for {silent_s:.0f} s" if silent_s >= SILENT_S else ""
+        return [f"'{name}' did not begin to finalise{silence}"]
+
+    def _stop_with(self, exit_code: int, reason: str) -> None:
+        self._outcome.exit_code, self._outcome.reason = exit_code, reason
+        self._stop()
+
+    def _stop(self) -> None:
+        self.phase = Phase.STOPPING
+        now_s = time.monotonic()
+        self._outcome.begin_to_end(now_s)
+        self._deadline_s = now_s + STOP_S
+        self._peers.stop(self._outcome.exit_code, self._outcome.reason)
+        self._channels.send(control.Stop())
+        for process in self._processes.not_loaded():
+            self._processes.kill(process)  # it has not come as far as anything worth finalising
+
+    def _kill_all(self) -> None:
+        self.phase = Phase.KILLED
+        self._deadline_s = time.monotonic() + STOP_S
+        for process in self._processes:
+            first, stacks = process.names[0], self._outcome.stacks
+            for name in process.names:
+                if stack := self._detector.stack_of(name):
+                    stacks[name] = stack.text
+                    text = f"{name} was at this point when it was killed"
+                    self._output.log("ERROR", with_stack(text, stack))
+            if stacks.keys().isdisjoint(process.names) and (
+                text := self._detector.threads_of(first)
+            ):
+                stacks[first] = text
+                where = f"{names_of(process)} stood when killed, the most recent call first"
+                self._output.log("ERROR", f"where the threads of {where}:\n{text}")
+            self._processes.kill(process)
 
 
 class Supervisor:
@@ -40,9 +219,10 @@ class Supervisor:
         files: the nodes to start; ``connections`` among them.
         launcher: the back end.
         environment: added to the environment of every node.
-        run_folder: the control socket is put there.
+        run_folder: with a folder for each node.
         output: for log records; its ``poll`` shows what nodes have logged.
         signals: numbers of the signals that have arrived, appended to by a signal handler.
+        listener: where nodes and observers connect to the control channel.
         wishes: reasons for which this program wants the run to end, drained; appended to by any
             thread.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
@@ -55,7 +235,7 @@ class Supervisor:
         observers: who watches it.
 
     Raises:
-        EnvironmentFault: if there can be no control socket in the run folder.
+        EnvironmentFault: if there can be no control channel.
     """
 
     def __init__(
@@ -67,6 +247,7 @@ class Supervisor:
         output: Output,
         signals: list[int],
         *,
+        listener: ControlListener,
         wishes: Sequence[str] = (),
         duration_s: float | None = None,
         peers: Peers | None = None,
@@ -75,28 +256,24 @@ class Supervisor:
         self._files = files
         self._run_folder = run_folder
         self._launcher = launcher
-        self._environment = environment
-        self._output = output = Overheard(output, lambda *a, **k: self.observers.tell(*a, **k))
+        self._environment = {**environment, control.CONTROL_VARIABLE: listener.address}
+        self._output = output = Overheard(output, lambda message: self.observers.tell(message))
         self._wishes = wishes
         self._duration_s = duration_s
         self._paused_before_s = 0.0  # the first hook
         self._peers = peers or Peers("", (), files)
         names = [file.node.name for file in files]
-        self._channels = Channels(run_folder)
+        self._channels = Channels(listener)
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
         self._detector = StallDetector(names, time.monotonic(), run_folder)
         self._processes = Processes(self._detector, self.outcome)
-        self._peers.speak_through(lambda text: self._channels.send("say", text=text))
+        self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
         self._backlog = Backlog(connections)
-        self._probing = Probing(
-            names,
-            connections,
-            self._channels.send,
-            self._peers if self._peers.exist else None,
-        )
+        peers_to_ask = self._peers if self._peers.exist else None
+        self._probing = Probing(names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
         self._shutdown = Shutdown(
             self._channels,
@@ -109,28 +286,14 @@ class Supervisor:
             output,
             signals,
         )
-        self.pause = Pause(self._channels.send, time.monotonic)
+        self.pause = PauseState(self._channels.send, time.monotonic)
         self.observers = Observers(
             self._channels,
             self.pause,
             lambda: self._detector.is_driven,
             lambda reason: self._shutdown.drain(reason, STOP_S),
         )
-        self._handlers: dict[str, Callable[[Lines, Mapping[str, Any]], None]] = {
-            "hello": self._on_hello,
-            "report": self._on_report,
-            "hooks": lambda _, message: self._declarations.take(message),
-            "finalising": lambda _, message: self._declarations.note_finalising(
-                message["node"], message["hook"]
-            ),
-            "first_hook": self._on_first_hook,
-            "shutdown": self._on_shutdown,
-            "failed": self._on_failed,
-            "explanation": self._on_explanation,
-            "heard": self._on_heard,
-            **self.observers.handlers,
-            "signal": lambda *_: signals.append(signal.SIGINT),
-        }
+        self._signals = signals
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
@@ -163,50 +326,68 @@ class Supervisor:
     def _hear(self) -> None:
         messages = list(self._channels.receive())
         # Who ends the project may have been set going by a node whose report was read later.
-        messages.sort(key=lambda pair: pair[1]["kind"] in ("shutdown", "failed"))
-        for lines, message in messages:
-            self._handlers[message["kind"]](lines, message)
+        messages.sort(key=lambda pair: isinstance(pair[1], control.Shutdown | control.Failed))
+        for link, message in messages:
+            if isinstance(message, ControlError):
+                self._refuse(link, message)
+            else:
+                self._take(link, message)
 
-    def _on_hello(self, lines: Lines, message: Mapping[str, Any]) -> None:
-        self._detector.greet(message["nodes"])
+    def _refuse(self, link: ControlLink, error: ControlError) -> None:
+        """A message was not understood: without it, nothing is known of a node for sure."""
+        if self._channels.is_node(link):
+            self._shutdown.fail(f"control channel: {error}")
+        elif self._channels.has(link):
+            self._channels.hang_up(link)
+            self._output.log("WARN", f"control channel: hung up: {error}")
+
+    def _take(self, link: ControlLink, message: Message) -> None:
+        match message:
+            case Report():
+                self._on_report(message)
+            case control.Hello(nodes):
+                self._on_hello(link, nodes)
+            case control.Hooks():
+                self._declarations.take(message)
+            case control.Finalising(node, hook):
+                self._declarations.note_finalising(node, hook)
+            case control.FirstHook():
+                if self.outcome.started_s is None:
+                    self.outcome.started_s = time.monotonic()
+                    self._paused_before_s = self.pause.total_s
+            case control.Shutdown(node, reason, drain_s):
+                because = f": {reason}" if reason else ""
+                self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
+            case control.Failed(node, text):
+                self._processes.note_failure(node)
+                first_line = (text.strip() or "no reason was given").splitlines()[0]
+                self._shutdown.fail(f"node '{node}' failed: {first_line}")
+            case control.Explanation(node, lines):
+                if self._shutdown.phase is Phase.RUNNING:
+                    self._output.log("WARN", f"{node} {'; '.join(lines)}")
+            case control.Heard(node, text):
+                self._peers.hear(node, text, time.monotonic())
+            case control.Interrupt():
+                self._signals.append(signal.SIGINT)
+            case _:
+                self.observers.take(link, message)
+
+    def _on_hello(self, link: ControlLink, nodes: Sequence[str]) -> None:
+        self._detector.greet(nodes)
         if self._peers.exist:
-            self._channels.send_to(lines, "say", text=self._peers.own_state)
+            self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
-            self._channels.send_to(lines, "pause")
+            self._channels.send_to(link, control.Pause())
         if self._shutdown.phase is not Phase.RUNNING:
-            self._channels.send_to(lines, "stop")
+            self._channels.send_to(link, control.Stop())
 
-    def _on_report(self, _: Lines, message: Mapping[str, Any]) -> None:
-        name, now_s = message["node"], time.monotonic()
-        self.outcome.take(name, message, now_s)
-        self._detector.report(name, message, now_s)
-        self._backlog.report(message, now_s)
-        self._probing.take(name, message)
-
-    def _on_first_hook(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self.outcome.started_s is None:
-            self.outcome.started_s = time.monotonic()
-            self._paused_before_s = self.pause.total_s
-
-    def _on_shutdown(self, _: Lines, message: Mapping[str, Any]) -> None:
-        reason = f": {message['reason']}" if message["reason"] else ""
-        self._shutdown.drain(
-            f"{message['node']} ended the project{reason}",
-            float(message["drain_s"]),
-            stopped=message["node"],
-        )
-
-    def _on_failed(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._processes.note_failure(message["node"])
-        first_line = (str(message["text"]).strip() or "no reason was given").splitlines()[0]
-        self._shutdown.fail(f"node '{message['node']}' failed: {first_line}")
-
-    def _on_heard(self, _: Lines, message: Mapping[str, Any]) -> None:
-        self._peers.hear(message["node"], message["text"], time.monotonic())
-
-    def _on_explanation(self, _: Lines, message: Mapping[str, Any]) -> None:
-        if self._shutdown.phase is Phase.RUNNING:
-            self._output.log("WARN", f"{message['node']} {'; '.join(message['lines'])}")
+    def _on_report(self, report: Report) -> None:
+        now_s = time.monotonic()
+        self.outcome.take(report, now_s)
+        self._detector.report(report, now_s)
+        self._backlog.report(report, now_s)
+        if isinstance(report, control.Probed):
+            self._probing.take(report)
 
     # ------------------------------------------------------------------ processes
 
@@ -280,7 +461,7 @@ class Supervisor:
             for severity, text in source.remarks(now_s):
                 self._output.log(severity, text)
         if self._detector.has_just_stalled(now_s):
-            self._channels.send("explain")
+            self._channels.send(control.Explain())
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
         if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from neuros.control import Finalising, FirstHook, Message, Shutdown
 from neuros.engine.engine import Engine
 from neuros.engine.node_ports import PacketType
 from neuros.errors import NeurosError
@@ -32,7 +33,7 @@ class NodeRuntime:
     :class:`PluginServices` those of ``node``.
 
     Args:
-        tell: reports to the supervisor, ``tell(kind, **fields)``.
+        tell: sends to the supervisor.
         fail: called with an error that ends the project.
         recorder: where packets go that are recorded, ``None``: none are.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
@@ -54,7 +55,7 @@ class NodeRuntime:
         middleware: Middleware,
         contexts: ContextSwitch,
         *,
-        tell: Callable[..., object],
+        tell: Callable[[Message], object],
         fail: Callable[[str, NeurosError], None],
         recorder: PacketRecorder | None = None,
         log_file: Path | None,
@@ -89,7 +90,7 @@ class NodeRuntime:
             middleware.loop,
             self._time,
             self.failures,
-            partial(tell, "shutdown", node=self.name),
+            lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
@@ -107,7 +108,7 @@ class NodeRuntime:
             self._recorder,
             self._sampler,
             enter=self._enter,
-            on_first_hook=lambda: tell("first_hook", node=self.name),
+            on_first_hook=lambda: tell(FirstHook(self.name)),
             on_initialised=on_initialised,
         )
         self.reports = NodeReports(
@@ -190,13 +191,13 @@ class NodeRuntime:
         if self.engine is not None:
             for spec in self.specs:
                 if spec.kind is HookKind.FINALISE:
-                    self._tell("finalising", node=self.name, hook=spec.name)
+                    self._tell(Finalising(self.name, spec.name))
                     self._guard(partial(self._effects.run, spec))
-        self._tell("finalising", node=self.name, hook="")
+        self._tell(Finalising(self.name, ""))
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
-        self._tell("finalising", node=self.name, hook=None)
+        self._tell(Finalising(self.name, None))
 
     # ------------------------------------------------------------------ inbox
 

@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import gc
 import os
+import selectors
+import signal
+import socket
 import sys
 import threading
+import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from neuros.control import Lines, connect
+from neuros import control
+from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
+from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
-from neuros.errors import NeurosError
-from neuros.hooks import HookKind, HookSpec
+from neuros.errors import ControlError, NeurosError
 from neuros.node.context import ContextSwitch
-from neuros.node.control_thread import ControlThread, signals_as_socket
 from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
-from neuros.node.peer_link import ELSEWHERE_VARIABLE, PeerLink
-from neuros.ports import Middleware, PacketRecorder
+from neuros.node.reports import declared
+from neuros.ports import ControlStream, Middleware, PacketRecorder, Voice
 from neuros.project.model import NodeFile
 from neuros.stacks import StackFile
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
+
+_REPORT_S = 1.0
+_LEAVE_S = 4.0
 
 
 class NodeProcess:
@@ -35,6 +43,7 @@ class NodeProcess:
     Args:
         files: the nodes that live here.
         make_middleware: joins them to the world; it may take its time to import ROS.
+        connect: connects to the supervisor; the current folder is the run folder by then.
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
         own_logs: whether each node writes to a log file of its own (several nodes share the
@@ -45,6 +54,7 @@ class NodeProcess:
         self,
         files: Sequence[NodeFile],
         make_middleware: MiddlewareFactory,
+        connect: Callable[[], ControlStream],
         *,
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
@@ -52,6 +62,7 @@ class NodeProcess:
     ) -> None:
         self._files = files
         self._make_middleware = make_middleware
+        self._connect = connect
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._own_logs = own_logs
@@ -63,7 +74,7 @@ class NodeProcess:
         self._has_failed = False
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
-        self._lines: Lines | None = None
+        self._link: ControlLink | None = None
         self._stack_file: StackFile | None = None
         self._peers = PeerLink(
             [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
@@ -73,13 +84,13 @@ class NodeProcess:
         """Run to the end; returns 0 if it was asked to end, 1 if a node failed."""
         run_folder = self._files[0].folders.run
         os.chdir(run_folder)
-        self._lines = connect(run_folder)
+        self._link = ControlLink(self._connect(), TO_NODES, "the supervisor")
         own_folder = run_folder / self._files[0].node.name
         plugins = {file.node.name: file.node.plugin for file in self._files}
         self._stack_file = StackFile(own_folder, plugins)
-        self._tell("hello", nodes=[file.node.name for file in self._files], pid=os.getpid())
+        self._tell(control.Hello(tuple(plugins)))
         with signals_as_socket() as signalled:
-            thread = ControlThread(self._lines, signalled, self)
+            thread = ControlThread(self._link, signalled, self)
             thread.start()
             self._guard(self._live)
             for node in self._nodes:
@@ -93,6 +104,38 @@ class NodeProcess:
 
     # ------------------------------------------------------------------ called by the supervisor
 
+    def obey(self, message: Message) -> None:
+        """Do what the supervisor asks for, between two events where hooks are concerned."""
+        match message:
+            case control.Stop():
+                self.ask_to_stop()
+            case control.Leave():
+                self._peers.leave()
+            case control.Say(text):
+                self._peers.say(text)
+            case control.Look(wanted, asker):
+                for node in tuple(self._nodes):
+                    self._tell(node.reports.look(wanted.get(node.name, {}), asker))
+            case control.Explain():
+                self._explain()
+            case _:
+                self.post(lambda: self._obey_in_loop(message))
+
+    def _obey_in_loop(self, message: Message) -> None:
+        if isinstance(message, control.Probe):
+            self._probe(message.number)
+            return
+        for node in self._nodes:
+            match message:
+                case control.Drain(last_round):
+                    node.drain(last_round.get(node.name, ()))
+                case control.Pause():
+                    node.pause()
+                case control.Resume():
+                    node.resume()
+                case control.Step(count, is_driven):
+                    node.step(count, is_driven=is_driven)
+
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
         self._stop_asked.set()
@@ -100,6 +143,11 @@ class NodeProcess:
             node.stop()
         if self._middleware is not None:
             self._middleware.loop.stop()
+
+    def let_go(self) -> None:
+        """The supervisor is gone: end, and wait for no peer. Any thread."""
+        self.ask_to_stop()
+        self._peers.leave()
 
     def post(self, event: Event) -> None:
         """Have an event handled by the loop, as soon as there is one. Any thread."""
@@ -109,66 +157,29 @@ class NodeProcess:
                 return
         self._middleware.loop.post_from_thread(event)
 
-    def drain(self, last_round: Mapping[str, Sequence[int]]) -> None:
-        """Stop the hooks that send unasked; ``last_round``, by node, start at most once more.
-
-        Loop thread only.
-        """
-        for node in self._nodes:
-            node.drain(last_round.get(node.name, ()))
-
-    def pause(self) -> None:
-        """Start no further hook until :meth:`resume`. Loop thread only."""
-        for node in self._nodes:
-            node.pause()
-
-    def resume(self) -> None:
-        """Go on after a pause. Loop thread only."""
-        for node in self._nodes:
-            node.resume()
-
-    def step(self, count: int, *, is_driven: bool) -> None:
-        """While paused, go on by so many steps. Loop thread only."""
-        for node in self._nodes:
-            node.step(count, is_driven=is_driven)
-
-    def look(self, wanted: Mapping[str, Any], asker: int) -> None:
-        """Show an observer what all nodes do; ``wanted`` is what to sample, by node. Any thread."""
-        for node in tuple(self._nodes):
-            self._tell("node_status", **node.reports.look(wanted.get(node.name, {}), asker))
-
-    def probe(self, number: int) -> None:
-        """Report the state of all nodes at one moment. Loop thread only."""
-        assert self._middleware is not None
-        is_idle = not self._middleware.loop.has_waiting_events
-        has_free_threads = self._has_free_threads()
-        for node in self._nodes:
-            fields = node.reports.probe()
-            # A thread of a plugin may submit packets, or end the project, at any time.
-            fields["is_wakeable"] = fields["is_wakeable"] or has_free_threads
-            self._tell("report", **fields, probe=number, is_idle=is_idle)
-
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
         if self._stack_file is not None:
             self._stack_file.renew()
         for node in tuple(self._nodes):
             node.reports.write_packet_log()
-            self._tell("report", **node.reports.state(), is_final=is_final)
+            self._tell(node.reports.report(is_final=is_final))
 
-    def explain(self) -> None:
-        """Report why nothing moves, but for nodes whose hook runs. Any thread."""
+    def _probe(self, number: int) -> None:
+        """Report the state of all nodes at one moment."""
+        assert self._middleware is not None
+        is_idle = not self._middleware.loop.has_waiting_events
+        has_free_threads = self._has_free_threads()
+        for node in self._nodes:
+            self._tell(
+                node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
+            )
+
+    def _explain(self) -> None:
+        """Report why nothing moves, but for nodes whose hook runs."""
         for node in tuple(self._nodes):
             if node.engine is None or node.engine.executing is None:
-                self._tell("explanation", node=node.name, lines=node.reports.explain())
-
-    def say(self, text: str) -> None:
-        """Pass on to nodes elsewhere what the launcher says. Any thread."""
-        self._peers.say(text)
-
-    def leave(self) -> None:
-        """Nothing more will be said to nodes elsewhere. Any thread."""
-        self._peers.leave()
+                self._tell(control.Explanation(node.name, tuple(node.reports.explain())))
 
     # ------------------------------------------------------------------ inside
 
@@ -183,7 +194,7 @@ class NodeProcess:
                 return
             try:
                 node.load()
-                self._tell("hooks", node=node.name, **declared(node.specs))
+                self._tell(declared(node.name, node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
         if self._is_ending:
@@ -239,10 +250,10 @@ class NodeProcess:
             for thread in threading.enumerate()
         )
 
-    def _tell(self, kind: str, **fields: Any) -> None:
-        assert self._lines is not None
+    def _tell(self, message: Message) -> None:
+        assert self._link is not None
         with self._tell_lock:
-            self._lines.send(kind, **fields)
+            self._link.send(message)
 
     def _fail(self, name: str, error: NeurosError) -> None:
         self._has_failed = True
@@ -251,13 +262,7 @@ class NodeProcess:
             node.failures.log(error)
         else:  # there is no logger yet
             traceback.print_exception(error, file=sys.stderr)
-        self._tell(
-            "failed",
-            node=name,
-            text=str(error),
-            hook=getattr(error, "hook", ""),
-            where=getattr(error, "where", ""),
-        )
+        self._tell(control.Failed(name, str(error)))
         self.ask_to_stop()
 
     def _fail_outside_hooks(self, error: BaseException) -> None:
@@ -274,20 +279,146 @@ class NodeProcess:
         self._fail(node.name, error)
 
 
-def declared(specs: Sequence[HookSpec]) -> dict[str, Any]:
-    """The hooks of a node, as the supervisor needs them."""
-    return {
-        "hooks": [
-            {
-                "kind": spec.kind.value,
-                "inputs": [[port.name, port.is_all, port.is_optional] for port in spec.inputs],
-                "outputs": [port.name for port in spec.outputs],
-            }
-            for spec in specs
-            if spec.kind is not HookKind.FINALISE
-        ],
-        "finalise": [spec.name for spec in specs if spec.kind is HookKind.FINALISE],
-    }
+class ControlThread(threading.Thread):
+    """Reports once per second and passes on what the supervisor asks for, also while hooks run.
+
+    A supervisor that has gone, and a signal, both mean: stop. What fails here (a simulator whose
+    time cannot be read, say) fails again in the loop, which knows what to do about it.
+    """
+
+    def __init__(self, link: ControlLink, signalled: socket.socket, process: NodeProcess) -> None:
+        super().__init__(name="neuros-control", daemon=True)
+        self._link = link
+        self._signalled = signalled
+        self._process = process
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        """Until the supervisor hangs up or :meth:`end`."""
+        next_report_s = time.monotonic() + _REPORT_S
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._link, selectors.EVENT_READ)
+            selector.register(self._signalled, selectors.EVENT_READ)
+            while not self._ended.is_set():
+                for key, _ in selector.select(max(0.0, next_report_s - time.monotonic())):
+                    if key.fileobj is self._signalled:
+                        self._on_signal()
+                    elif not self._on_messages():
+                        return
+                if time.monotonic() >= next_report_s and not self._ended.is_set():
+                    next_report_s = time.monotonic() + _REPORT_S
+                    self._try(self._process.report)
+
+    def end(self) -> None:
+        """Report no more."""
+        self._ended.set()
+
+    def _on_signal(self) -> None:
+        try:
+            self._signalled.recv(64)
+        except OSError:
+            return
+        self._process.ask_to_stop()
+
+    def _on_messages(self) -> bool:
+        """Returns False once the supervisor is gone."""
+        try:
+            messages = self._link.receive()
+        except ControlError as error:
+            self._raise_in_loop(error)
+            return True
+        if messages is None:
+            self._process.let_go()
+            return False
+        for message in messages:
+            self._try(functools.partial(self._process.obey, message))
+        return True
+
+    def _try(self, action: Event) -> None:
+        try:
+            action()
+        except Exception as error:
+            self._raise_in_loop(error)
+
+    def _raise_in_loop(self, error: Exception) -> None:
+        def fail() -> None:
+            raise error
+
+        self._process.post(fail)
+
+
+@contextlib.contextmanager
+def signals_as_socket() -> Iterator[socket.socket]:
+    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    reader.setblocking(False)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    try:
+        yield reader
+    finally:
+        signal.set_wakeup_fd(previous)
+        reader.close()
+        writer.close()
+
+
+class PeerLink:
+    """Link between a launcher and its peers, through the nodes of this process.
+
+    The launcher knows no ROS. So each of its nodes publishes the launcher's state, and tells it
+    what nodes elsewhere publish; only in a project that is started in parts.
+
+    Args:
+        names: the nodes of this process.
+        elsewhere: content of the environment variable.
+        tell: sends to the supervisor.
+    """
+
+    def __init__(
+        self, names: Sequence[str], elsewhere: str, tell: Callable[[Message], None]
+    ) -> None:
+        self._names = names
+        self._elsewhere = [name for name in elsewhere.split(",") if name]
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._voice: Voice | None = None
+        self._last_state = ""
+        self._may_leave = threading.Event()
+
+    def open(self, middleware: Middleware) -> None:
+        """Speak and listen from now on."""
+        if not self._elsewhere:
+            return
+        voice = middleware.join_peers(self._names, self._elsewhere, self._hear)
+        with self._lock:
+            self._voice = voice
+            if self._last_state:
+                voice.say(self._last_state)
+
+    def say(self, text: str) -> None:
+        """Pass on what the launcher says, as soon as that is possible. Any thread."""
+        with self._lock:
+            self._last_state = text
+            if self._voice is not None:
+                self._voice.say(text)
+
+    def leave(self) -> None:
+        """Nothing more will be said or needs to be heard. Any thread."""
+        self._may_leave.set()
+
+    def close(self) -> None:
+        """Stay until the launcher has said and heard all; it is bound by what it waits for."""
+        if self._voice is None:
+            return
+        self._may_leave.wait(_LEAVE_S)
+        with self._lock:
+            voice, self._voice = self._voice, None
+        voice.close()
+
+    def _hear(self, name: str, text: str | None) -> None:
+        self._tell(control.Heard(name, text))
 
 
 def _keep_for_good() -> None:

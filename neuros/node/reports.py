@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
+from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeStatus, Probed, Report
 from neuros.engine.engine import Engine
 from neuros.engine.explain import explain
 from neuros.engine.snapshot import snapshot, steadily
+from neuros.hooks import HookKind, HookSpec
 from neuros.node.effects import NodeEffects
 from neuros.node.packet_log import PacketLog
 from neuros.node.sampling import Sampler
@@ -66,14 +68,16 @@ class NodeReports:
         if self._packet_log is not None:
             self._packet_log.write()
 
-    def state(self) -> dict[str, Any]:
+    def report(self, *, is_final: bool = False) -> Report:
         """State and counters. Any thread."""
+        return Report(**self._state(), is_final=is_final)
+
+    def _state(self) -> dict[str, Any]:
         now_ns, engine = self._clock(), self._engine
         metrics = None if engine is None else snapshot(engine, now_ns)
         return {
             "node": self._file.node.name,
-            "has_run": self._effects.has_run,
-            "waiting_for": [str(each) for each in self._transport.waiting_for()],
+            "waiting_for": tuple(str(each) for each in self._transport.waiting_for()),
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
@@ -92,7 +96,7 @@ class NodeReports:
             return stack_in(self._file.node.name, self._file.node.plugin)
         return None
 
-    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> dict[str, Any]:
+    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
         """What an observer is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
@@ -100,25 +104,31 @@ class NodeReports:
             asker: the number of the observer.
         """
         engine = self._engine
-        return {
-            "node": self._file.node.name,
-            "asker": asker,
-            "sim_time": self._time.now_s,
-            "books": None if engine is None else node_status(engine, self._clock()),
-            "samples": self._sampler.ask(wanted, asker),
-        }
+        return NodeStatus(
+            self._file.node.name,
+            asker,
+            self._time.now_s,
+            None if engine is None else live_counters(engine, self._clock()),
+            self._sampler.ask(wanted, asker),
+        )
 
-    def probe(self) -> dict[str, Any]:
-        """The state with what only a moment between two events can tell. Loop thread only."""
+    def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:
+        """The report with what only a moment between two events can tell. Loop thread only.
+
+        A thread of a plugin may submit packets, or end the project, at any time.
+        """
         engine = self._engine
         assert engine is not None
-        return {
-            **self.state(),
-            "is_startable": engine.has_startable_packet,
-            "is_wakeable": engine.is_wakeable
+        return Probed(
+            **self._state(),
+            number=number,
+            is_startable=engine.has_startable_packet,
+            is_wakeable=has_free_threads
+            or engine.is_wakeable
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
-            "is_running": engine.is_running,
-        }
+            is_running=engine.is_running,
+            is_idle=is_idle,
+        )
 
     def explain(self) -> list[str]:
         """Why nothing moves here. Any thread."""
@@ -128,40 +138,50 @@ class NodeReports:
         return explain(engine, self._clock())
 
 
-def node_status(engine: Engine, now_ns: int) -> dict[str, Any]:
-    """Counters, state and latest times, short enough to be sent often. Any thread.
+def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:
+    """The hooks of a node, as the supervisor needs them."""
+    return Hooks(
+        node,
+        tuple(
+            HookDeclaration(spec.kind, spec.inputs, tuple(port.name for port in spec.outputs))
+            for spec in specs
+            if spec.kind is not HookKind.FINALISE
+        ),
+        tuple(spec.name for spec in specs if spec.kind is HookKind.FINALISE),
+    )
 
-    Besides what :func:`neuros.engine.snapshot.snapshot` tells: ``now_s``, the time of the status;
-    ``sent_ns``, by connection the position of the last packet sent and when the last few were;
-    ``taken_ns``, the position of the packet that a hook has started on last, and when that was.
-    Both lack the connections whose packet log has just been written out.
+
+def live_counters(engine: Engine, now_ns: int) -> LiveCounters:
+    """Counters and latest times of a node. Any thread.
+
+    Times lack the connections whose packet log has just been written out.
     """
-    status = snapshot(engine, now_ns)
-    nothing: dict[str, list[Any]] = {}
-    status["hooks"] = {
-        name: [hook["executions"], hook["busy_s"]] for name, hook in status["hooks"].items()
-    }
-    return {
-        **status,
-        "now_s": now_ns / 1e9,
-        "sent_ns": steadily(lambda: _sent(engine), nothing),
-        "taken_ns": steadily(lambda: _taken(engine), nothing),
-        "is_paused": engine.is_paused,
-    }
+    metrics = snapshot(engine, now_ns)
+    for hook in metrics["hooks"].values():
+        for figure in hook.keys() - {"executions", "busy_s"}:
+            del hook[figure]
+    no_sent: dict[str, tuple[int, tuple[int, ...]]] = {}
+    no_taken: dict[str, tuple[int, int]] = {}
+    return LiveCounters(
+        now_ns / 1e9,
+        cast(Metrics, metrics),
+        steadily(lambda: _sent(engine), no_sent),
+        steadily(lambda: _taken(engine), no_taken),
+    )
 
 
-def _sent(engine: Engine) -> dict[str, list[Any]]:
+def _sent(engine: Engine) -> dict[str, tuple[int, tuple[int, ...]]]:
     return {
-        str(window.connection): [window.sent, window.sent_ns[-_LAST_SENT:].tolist()]
+        str(window.connection): (window.sent, tuple(window.sent_ns[-_LAST_SENT:]))
         for window in engine.send_windows.values()
         if window.is_reliable and window.sent_ns
     }
 
 
-def _taken(engine: Engine) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {}
+def _taken(engine: Engine) -> dict[str, tuple[int, int]]:
+    found: dict[str, tuple[int, int]] = {}
     for key, subscription in engine.subscriptions.items():
         count = min(len(subscription.taken), len(subscription.taken_ns))
         if isinstance(key, Connection) and count:
-            found[str(key)] = [subscription.taken[count - 1], subscription.taken_ns[count - 1]]
+            found[str(key)] = subscription.taken[count - 1], subscription.taken_ns[count - 1]
     return found

@@ -156,7 +156,7 @@ class ReplayedNode:
             file,
             self._middleware,
             ContextSwitch(),
-            tell=lambda *_, **__: None,
+            tell=lambda _: None,
             fail=self._fail,
             recorder=self.comparison,
             log_file=None,

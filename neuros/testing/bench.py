@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from neuros.control import Message, Shutdown
 from neuros.engine.engine import Engine
 from neuros.engine.send_window import SendWindow
 from neuros.engine.snapshot import snapshot
@@ -240,9 +241,9 @@ class NodeBench:
     def _executions(self) -> int:
         return sum(hook.executions for hook in self._engine.all_hooks)
 
-    def _listen(self, kind: str, **fields: Any) -> None:
-        if kind == "shutdown" and self.shutdown_reason is None:
-            self.shutdown_reason = str(fields["reason"])
+    def _listen(self, message: Message) -> None:
+        if isinstance(message, Shutdown) and self.shutdown_reason is None:
+            self.shutdown_reason = message.reason
 
     def _fail(self, _: str, error: NeurosError) -> None:
         self._failure = self._failure or error

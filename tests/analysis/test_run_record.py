@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from neuros.analysis.run_record import run_record
+from neuros.control import Report
 from neuros.launcher.outcome import Outcome
 from neuros.project.load import load_project
 from neuros.project.model import Folders
@@ -21,14 +22,9 @@ ROWS = {
 }
 
 
-def report(name: str, *, is_final: bool) -> dict[str, Any]:
-    metrics = {"accounting": {}, "hooks": {}, **ROWS[name]}
-    return {
-        "metrics": metrics,
-        "is_final": is_final,
-        "sim_time": None,
-        "running_since_s": None,
-    }
+def report(name: str, *, is_final: bool) -> Report:
+    metrics: Any = {"accounting": {}, "hooks": {}, **ROWS[name]}
+    return Report(node=name, metrics=metrics, is_final=is_final)
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from neuros.backends.progress import Progress
+from neuros.control import Report
 from neuros.launcher.outcome import Outcome
 
 
@@ -19,15 +19,15 @@ class Clock:
 
 def report(
     sim_s: float | None, sent: int, discarded: int = 0, expected: float | None = None
-) -> Mapping[str, Any]:
-    metrics = {
+) -> Report:
+    metrics: Any = {
         "outgoing": {"a.o -> b.i": {"sent": sent}},
         "incoming": {"b.o -> a.i": {"discarded": discarded}},
     }
-    return {"sim_time": sim_s, "expected_end_s": expected, "metrics": metrics}
+    return Report(node="a", sim_time=sim_s, expected_end_s=expected, metrics=metrics)
 
 
-def run(clock: Clock, reports: list[Mapping[str, Any]], **end: float) -> Progress:
+def run(clock: Clock, reports: list[Report], **end: float) -> Progress:
     """The progress of a run whose reports have come, one per second."""
     outcome = Outcome(started_s=clock())
     progress = Progress(outcome, **end, clock=clock)

@@ -15,7 +15,7 @@ from test_engine_projects import delays, projects, slow_and_fast, strict_plugin,
 
 from neuros.hooks import All, HookSpec, Optional
 from neuros.launcher.declarations import Declarations
-from neuros.node.process import declared
+from neuros.node.reports import declared
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 
 Plugins = Mapping[str, Sequence[HookSpec]]
@@ -44,7 +44,7 @@ def last_round(
     ]
     declarations = Declarations(files)
     for name, specs in plugins.items():
-        declarations.take({"node": name, **declared(specs)})
+        declarations.take(declared(name, specs))
     found = declarations.last_round(stopped)
     return {name: [plugins[name][place].name for place in places] for name, places in found.items()}
 

@@ -1,7 +1,8 @@
 """A host that holds no nodes but keeps to the control channel as its test says.
 
 Standard library only, so that it is there in a moment. The environment variable ``ACT`` holds what
-it does, in Python, with the functions below; the folder is the run folder.
+it does, in Python, with the functions below; the folder is the run folder. Messages are those of
+``neuros.control``, by kind, as they go through the channel.
 """
 
 from __future__ import annotations
@@ -21,24 +22,33 @@ class Host:
     """The node's end of the control channel."""
 
     def __init__(self) -> None:
-        self.socket = socket.socket(socket.AF_UNIX)
+        self.scheme, _, self.place = os.environ["NEUROS_CONTROL"].partition(":")
+        is_unix = self.scheme == "unix"
+        self.socket = socket.socket(socket.AF_UNIX if is_unix else socket.AF_INET)
         self.lines = self.socket.makefile("r")
         self.is_idle = True
         self.connections: dict[str, dict[str, Any]] = {"outgoing": {}, "incoming": {}}
 
     def hello(self) -> None:
-        self.socket.connect("control.sock")
-        self.tell("hello", nodes=NAMES, pid=os.getpid())
+        if self.scheme == "unix":
+            self.socket.connect(os.path.basename(self.place))  # which may be too long as a whole
+        else:
+            name, _, port = self.place.partition(":")
+            self.socket.connect((name, int(port)))
+        self.send("hello", nodes=NAMES)
+
+    def send(self, kind: str, **fields: Any) -> None:
+        self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
 
     def tell(self, kind: str, **fields: Any) -> None:
-        self.socket.sendall(json.dumps({"kind": kind, "node": NAMES[0], **fields}).encode() + b"\n")
+        """Send a message about the (first) node."""
+        self.send(kind, **{"node": NAMES[0], **fields})
 
-    def report(self, **fields: Any) -> None:
+    def report(self, kind: str = "report", **fields: Any) -> None:
         """A report of a node that has been loaded."""
         for name in NAMES:
             metrics = {"hooks": {}, "executing": None, "state": {"state": "idle", "cause": ""}}
-            common = {"waiting_for": [], "sim_time": None, "metrics": metrics | self.connections}
-            self.tell("report", **{**common, "node": name, **fields})
+            self.send(kind, **{"node": name, "metrics": metrics | self.connections, **fields})
 
     def up(self) -> None:
         """Hello, loaded, and the first hook has begun."""
@@ -67,7 +77,8 @@ class Host:
     def answer(self, message: dict[str, Any]) -> None:
         if message["kind"] == "probe":
             self.report(
-                probe=message["number"],
+                "probed",
+                number=message["number"],
                 is_startable=False,
                 is_wakeable=not self.is_idle,
                 is_running=True,

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from neuros.control import Lines, connect
-from neuros.launcher.channels import Channels
-from neuros.launcher.observers import Observers, Pause
+from neuros.backends.control_sockets import UnixListener, connect
+from neuros.control import (
+    TO_NODES,
+    TO_OBSERVERS,
+    End,
+    Ended,
+    Hello,
+    LogRecord,
+    Look,
+    LookAll,
+    Message,
+    NodeStatus,
+    Pause,
+    PhaseChanged,
+    Resume,
+    Step,
+    StepAll,
+    Watch,
+)
+from neuros.control.link import ControlLink
+from neuros.errors import ControlError
+from neuros.launcher.channels import Channels, Observers, PauseState
 from neuros.launcher.outcome import Outcome, Phase
 
 
@@ -18,28 +37,31 @@ class Run:
     """Observers of a run that is not there."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
         self.now_s = 100.0
-        self.channels = Channels(folder)
-        self.pause = Pause(self.channels.send, lambda: self.now_s)
+        listener = UnixListener(folder)
+        self.address = listener.address
+        self.channels = Channels(listener)
+        self.pause = PauseState(self.channels.send, lambda: self.now_s)
         self.ends: list[str] = []
         self.is_driven = True
         self.observers = Observers(
             self.channels, self.pause, lambda: self.is_driven, self.ends.append
         )
 
-    def join(self) -> Lines:
+    def join(self, *, is_node: bool = False) -> ControlLink:
         """Somebody connects."""
-        lines = connect(self.folder)
-        lines.socket.settimeout(5.0)
-        return lines
+        stream = connect(self.address)
+        assert isinstance(stream, socket.socket)
+        stream.settimeout(5.0)
+        return ControlLink(stream, TO_NODES if is_node else TO_OBSERVERS, "the supervisor")
 
     def hear(self, count: int = 1) -> None:
         """Take so many messages."""
         while count:
             self.channels.wait(5.0)
             for lines, message in self.channels.receive():
-                self.observers.handlers[message["kind"]](lines, message)
+                assert not isinstance(message, ControlError)
+                self.observers.take(lines, message)
                 count -= 1
 
 
@@ -50,84 +72,88 @@ def run(tmp_path: Path) -> Iterator[Run]:
     made.channels.close()
 
 
-def told(lines: Lines, count: int) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
+def told(lines: ControlLink, count: int) -> list[Message]:
+    found: list[Message] = []
     while len(found) < count:
         messages = lines.receive()
         assert messages is not None
-        found += map(dict, messages)
+        found += messages
     return found
 
 
 def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines = run.join()
-    lines.send("watch")
+    lines.send(Watch())
     run.hear()
     run.observers.look_at(Phase.RUNNING)
     run.observers.look_at(Phase.RUNNING)
     run.observers.look_at(Phase.DRAINING)
     run.observers.part(Outcome(3, "why"))
     assert told(lines, 3) == [
-        {"kind": "phase", "phase": "running", "is_paused": False},
-        {"kind": "phase", "phase": "draining", "is_paused": False},
-        {"kind": "ended", "exit_code": 3, "reason": "why", "reports": {}, "running_s": None},
+        PhaseChanged("running", False),
+        PhaseChanged("draining", False),
+        Ended(3, "why", {}, None),
     ]
     lines.close()
 
 
 def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
-    node, first, second = run.join(), run.join(), run.join()
+    node, first, second = run.join(is_node=True), run.join(), run.join()
+    node.send(Hello(("a",)))
+    run.hear()
     for observer in (first, second):
-        observer.send("watch")
+        observer.send(Watch())
         run.hear()
     for observer, wanted in ((first, {"a": {"x": {}}}), (second, {})):
-        observer.send("look", wanted=wanted)
+        observer.send(LookAll(wanted))
         run.hear()
     looks = told(node, 2)
-    assert [look["wanted"] for look in looks] == [{"a": {"x": {}}}, {}]
+    assert looks == [Look({"a": {"x": {}}}, 1), Look({}, 2)]
     for look in looks:
-        node.send("node_status", node="a", asker=look["asker"], samples=look["wanted"].get("a", {}))
+        assert isinstance(look, Look)
+        samples = {port: dict(each) for port, each in look.wanted.get("a", {}).items()}
+        node.send(NodeStatus("a", look.asker, samples=samples))
     run.hear(2)
     for observer, samples in ((first, {"x": {}}), (second, {})):
-        run.observers.tell("log", severity="INFO", text="that is all")
-        found = [each for each in told(observer, 3) if each["kind"] in ("node_status", "log")]
-        assert [each["kind"] for each in found[:2]] == ["node_status", "log"]
-        assert found[0]["samples"] == samples
+        run.observers.tell(LogRecord("INFO", "that is all"))
+        found = told(observer, 2)
+        assert isinstance(found[0], NodeStatus)
+        assert found[0].samples == samples
+        assert found[1] == LogRecord("INFO", "that is all")
     for lines in (node, first, second):
         lines.close()
 
 
 def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> None:
-    observer = run.join()
-    for kind, fields in (
-        ("step", {"count": 1}),  # it does not stand still: nothing happens
-        ("pause", {}),
-        ("pause", {}),
-        ("step", {"count": 3}),
-        ("step", {"count": -1}),
+    node, observer = run.join(is_node=True), run.join()
+    node.send(Hello(("a",)))
+    run.hear()
+    for message in (
+        StepAll(1),  # it is not paused: nothing happens
+        Pause(),
+        Pause(),
+        StepAll(3),
+        StepAll(-1),
     ):
-        observer.send(kind, **fields)
+        observer.send(message)
     run.hear(5)
     run.now_s += 7.0
     assert run.pause.is_on
     assert run.pause.total_s == 7.0
-    observer.send("resume")
+    observer.send(Resume())
     run.hear()
     run.now_s += 1.0
     assert not run.pause.is_on
     assert run.pause.total_s == 7.0
-    assert told(observer, 3) == [
-        {"kind": "pause"},
-        {"kind": "step", "count": 3, "is_driven": True},
-        {"kind": "resume"},
-    ]
+    assert told(node, 3) == [Pause(), Step(3, True), Resume()]
+    node.close()
     observer.close()
 
 
 def test_a_run_goes_on_when_nobody_is_left_to_resume_it(run: Run) -> None:
     observer = run.join()
-    observer.send("watch")
-    observer.send("pause")
+    observer.send(Watch())
+    observer.send(Pause())
     run.hear(2)
     run.observers.look_at(Phase.RUNNING)
     assert run.pause.is_on
@@ -148,7 +174,7 @@ def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
 
 def test_an_observer_may_end_the_run(run: Run) -> None:
     observer = run.join()
-    observer.send("end", reason="enough")
+    observer.send(End("enough"))
     run.hear()
     assert run.ends == ["enough"]
     observer.close()

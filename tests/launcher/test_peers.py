@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from neuros.control import Report
 from neuros.launcher.peers import (
     DRAINED,
     DRAINING,
@@ -55,10 +56,11 @@ def launcher() -> Launcher:
     return Launcher()
 
 
-def sent(number: int, acknowledged: int | None = None) -> dict[str, Any]:
+def sent(number: int, acknowledged: int | None = None) -> dict[str, Report]:
     """A report of ``a``."""
     counters = {"sent": number, "acknowledged": number if acknowledged is None else acknowledged}
-    return {"a": {"metrics": {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}}}
+    metrics: Any = {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}
+    return {"a": Report(node="a", metrics=metrics)}
 
 
 def received(number: int) -> dict[str, Any]:

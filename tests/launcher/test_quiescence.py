@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neuros.control import Message, Probe, Probed
 from neuros.launcher.quiescence import (
     Probing,
     Verdict,
@@ -35,10 +37,10 @@ BA = wire("b.o -> a.x", index=1)
 LOSSY = wire("a.p -> b.y", None, index=2)
 
 
-def probe(**changes: Any) -> dict[str, Any]:
+def probe(node: str = "a", number: int = 0, **changes: Any) -> Probed:
     """A probe of a node that waits for nothing, without connections."""
     metrics = {"outgoing": {}, "incoming": {}, "hooks": {}, "state": {"state": "idle", "cause": ""}}
-    return {
+    answer: dict[str, Any] = {
         "metrics": metrics | changes.pop("metrics", {}),
         "is_startable": False,
         "is_wakeable": False,
@@ -46,23 +48,29 @@ def probe(**changes: Any) -> dict[str, Any]:
         "is_idle": True,
         **changes,
     }
+    return Probed(node=node, number=number, **answer)
 
 
-def sender(connection: Connection, sent: int, acknowledged: int, **changes: Any) -> dict[str, Any]:
+def metrics_of(answer: Probed) -> Any:
+    """To be changed."""
+    return answer.metrics
+
+
+def sender(connection: Connection, sent: int, acknowledged: int, **changes: Any) -> Probed:
     book = {
         "sent": sent,
         "acknowledged": acknowledged,
         "outstanding": sent - acknowledged,
         "is_blocked": sent - acknowledged >= connection.window,
     }
-    return probe(metrics={"outgoing": {str(connection): book}}, **changes)
+    return probe(connection.source_node, metrics={"outgoing": {str(connection): book}}, **changes)
 
 
-def receiver(
-    connection: Connection, received: int, acknowledged: int, **changes: Any
-) -> dict[str, Any]:
+def receiver(connection: Connection, received: int, acknowledged: int, **changes: Any) -> Probed:
     book = {"received": received, "acknowledged": acknowledged}
-    return probe(metrics={"incoming": {str(connection): book}}, **changes)
+    return probe(
+        connection.destination_node, metrics={"incoming": {str(connection): book}}, **changes
+    )
 
 
 # ------------------------------------------------------------------ drained
@@ -126,7 +134,7 @@ def test_every_count_tells_whether_something_has_happened() -> None:
     assert before != counters({"a": sender(AB, 1, 1), "b": receiver(AB, 1, 0)})
     assert before != counters({"a": sender(AB, 1, 0), "b": receiver(AB, 1, 1)})
     busier = sender(AB, 1, 0)
-    busier["metrics"]["hooks"] = {"step": {"executions": 1}}
+    metrics_of(busier)["hooks"] = {"step": {"executions": 1}}
     assert before != counters({"a": busier, "b": receiver(AB, 1, 0)})
 
 
@@ -135,8 +143,8 @@ def test_every_count_tells_whether_something_has_happened() -> None:
 
 def test_a_ring_of_full_connections_is_named_with_its_connections() -> None:
     a, b = sender(AB, 1, 0), sender(BA, 1, 0)
-    a["metrics"]["incoming"][str(BA)] = {"received": 1, "acknowledged": 0}
-    b["metrics"]["incoming"][str(AB)] = {"received": 1, "acknowledged": 0}
+    metrics_of(a)["incoming"][str(BA)] = {"received": 1, "acknowledged": 0}
+    metrics_of(b)["incoming"][str(AB)] = {"received": 1, "acknowledged": 0}
     assert cycle(waits({"a": a, "b": b}, [AB, BA])) == [
         ("a", "is blocked on `a.o -> b.x` (1 outstanding)"),
         ("b", "is blocked on `b.o -> a.x` (1 outstanding)"),
@@ -146,8 +154,8 @@ def test_a_ring_of_full_connections_is_named_with_its_connections() -> None:
 def test_a_ring_of_missing_inputs_is_named_with_the_inputs() -> None:
     a, b = sender(AB, 0, 0), sender(BA, 0, 0)
     for node, source in ((a, BA), (b, AB)):
-        node["metrics"]["incoming"][str(source)] = {"received": 0, "acknowledged": 0, "unread": 0}
-        node["metrics"]["state"] = {"state": "waiting", "cause": "x"}
+        metrics_of(node)["incoming"][str(source)] = {"received": 0, "acknowledged": 0, "unread": 0}
+        metrics_of(node)["state"] = {"state": "waiting", "cause": "x"}
     assert cycle(waits({"a": a, "b": b}, [AB, BA])) == [
         ("a", "waits for `x` from b"),
         ("b", "waits for `x` from a"),
@@ -266,18 +274,30 @@ class World:
         key = str(connection)
         return self.received.get(key, 0) - self.taken.get(key, 0)
 
-    def probe(self, name: str) -> dict[str, Any]:
-        answer = probe(is_startable=False)
+    def probe(self, name: str, number: int) -> Probed:
+        outgoing, incoming = {}, {}
+        is_startable = False
         for c in self.connections:
             key = str(c)
             if c.source_node == name:
-                book = {"sent": self.sent.get(key, 0), "acknowledged": self.heard.get(key, 0)}
-                answer["metrics"]["outgoing"][key] = book
+                heard = self.heard.get(key, 0)
+                outgoing[key] = {"sent": self.sent.get(key, 0), "acknowledged": heard}
             if c.destination_node == name:
-                book = {"received": self.received.get(key, 0)}
-                answer["metrics"]["incoming"][key] = book | {"acknowledged": self.taken.get(key, 0)}
-                answer["is_startable"] |= self.unread(c) > 0
-        return answer
+                taken = self.taken.get(key, 0)
+                incoming[key] = {"received": self.received.get(key, 0), "acknowledged": taken}
+                is_startable |= self.unread(c) > 0
+        metrics = {"outgoing": outgoing, "incoming": incoming}
+        return probe(name, number, metrics=metrics, is_startable=is_startable)
+
+
+def asked_into(asked: list[int]) -> Callable[[Message], None]:
+    """Notes the numbers of probes."""
+
+    def send(message: Message) -> None:
+        assert isinstance(message, Probe)
+        asked.append(message.number)
+
+    return send
 
 
 RING = [wire("a.o -> b.x"), wire("b.o -> c.x", index=1), wire("c.o -> a.x", index=2)]
@@ -290,8 +310,9 @@ STEPS = st.lists(
 @settings(max_examples=200)
 @given(STEPS)
 def test_two_equal_rounds_never_miss_what_is_under_way(steps: list[tuple[str, int]]) -> None:
-    world, asked = World(RING), []
-    probing = Probing("abc", RING, lambda kind, number: asked.append(number))
+    world = World(RING)
+    asked: list[int] = []
+    probing = Probing("abc", RING, asked_into(asked))
     world.send(RING[0])
     probing.drain(without=(), now_s=0.0)
     answered: set[str] = set()
@@ -303,7 +324,7 @@ def test_two_equal_rounds_never_miss_what_is_under_way(steps: list[tuple[str, in
         elif step == "answer":
             name = "abc"[index]
             answered.add(name)
-            probing.take(name, world.probe(name) | {"probe": asked[-1]})
+            probing.take(world.probe(name, asked[-1]))
         if len(answered) == 3:
             answered = set()
             if probing.look(now_s, 0.0) is Verdict.DRAINED:
@@ -314,35 +335,35 @@ def test_two_equal_rounds_never_miss_what_is_under_way(steps: list[tuple[str, in
 
 def test_a_project_that_rests_is_found_drained_after_two_rounds() -> None:
     asked: list[int] = []
-    probing = Probing("ab", [AB], lambda kind, number: asked.append(number))
+    probing = Probing("ab", [AB], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
     for now_s in (1.0, 2.0):
-        probing.take("a", sender(AB, 3, 3) | {"probe": asked[-1]})
-        probing.take("b", receiver(AB, 3, 3) | {"probe": asked[-1]})
+        probing.take(sender(AB, 3, 3, number=asked[-1]))
+        probing.take(receiver(AB, 3, 3, number=asked[-1]))
         verdict = probing.look(now_s, 0.0)
     assert verdict is Verdict.DRAINED
     assert asked == [1, 2]
 
 
-def test_answers_to_older_questions_and_ordinary_reports_do_not_count() -> None:
+def test_answers_to_older_questions_do_not_count() -> None:
     asked: list[int] = []
-    probing = Probing("a", [], lambda kind, number: asked.append(number))
+    probing = Probing("a", [], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
-    probing.take("a", probe())
-    probing.take("a", probe(probe=asked[-1] - 1))
+    probing.take(probe())
+    probing.take(probe(number=asked[-1] - 1))
     probing.look(1.0, 0.0)
     assert asked == [1], "nobody has answered yet"
 
 
 def test_without_a_node_that_ever_began_there_is_nothing_to_drain() -> None:
-    probing = Probing("ab", [AB], lambda kind, number: None)
+    probing = Probing("ab", [AB], lambda _: None)
     probing.drain(without="ab", now_s=0.0)
     assert probing.look(0.0, 0.0) is Verdict.DRAINED
 
 
 def test_nobody_is_asked_while_something_moves() -> None:
     asked: list[int] = []
-    probing = Probing("a", [], lambda kind, number: asked.append(number))
+    probing = Probing("a", [], asked_into(asked))
     probing.look(10.0, 0.9)
     assert asked == []
     probing.look(11.0, 1.0)
@@ -353,24 +374,24 @@ def test_nobody_is_asked_while_something_moves() -> None:
 def test_the_longer_nothing_moves_the_more_rarely_nodes_are_asked_until_something_does() -> None:
     asked: list[float] = []
     now_s = 0.0
-    probing = Probing("a", [], lambda kind, number: asked.append(now_s))
+    probing = Probing("a", [], lambda _: asked.append(now_s))
     for tick in range(1, 600):
         now_s = tick / 10
         has_moved_s = 50.0 if now_s >= 50.0 else 0.0
         probing.look(now_s, now_s - has_moved_s)
         if asked and asked[-1] == now_s:
-            probing.take("a", probe(probe=len(asked), is_wakeable=True))
+            probing.take(probe(number=len(asked), is_wakeable=True))
     assert asked[:5] == [1.0, 1.5, 2.5, 4.5, 6.5], "two soon, for a deadlock; then ever later"
     assert [at for at in asked if at >= 50.0][:3] == [51.0, 51.5, 52.5], "and soon again"
 
 
 def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> None:
     asked: list[int] = []
-    probing = Probing("ab", [AB], lambda kind, number: asked.append(number))
+    probing = Probing("ab", [AB], asked_into(asked))
     for now_s in (10.0, 11.0):
         assert probing.look(now_s, now_s) is Verdict.UNDECIDED
-        probing.take("a", sender(AB, 1, 0) | {"probe": asked[-1]})
-        probing.take("b", receiver(AB, 1, 0) | {"probe": asked[-1]})
+        probing.take(sender(AB, 1, 0, number=asked[-1]))
+        probing.take(receiver(AB, 1, 0, number=asked[-1]))
     assert probing.look(11.1, 11.1) is Verdict.DEAD
     text = probing.why_dead()
     assert "a is blocked on `a.o -> b.x` (1 outstanding)" in text
@@ -379,11 +400,11 @@ def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> 
 
 def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:
     asked: list[int] = []
-    probing = Probing("ab", [AB], lambda kind, number: asked.append(number))
+    probing = Probing("ab", [AB], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
-    probing.take("a", sender(AB, 2, 1) | {"probe": 1})
+    probing.take(sender(AB, 2, 1, number=1))
     assert probing.what_is_left(1.0) == ["b is busy"]
-    probing.take("b", receiver(AB, 1, 1, is_startable=True) | {"probe": 1})
+    probing.take(receiver(AB, 1, 1, is_startable=True, number=1))
     left = ["a packet is under way on `a.o -> b.x`", "b has a packet to work on"]
     assert probing.what_is_left(1.0) == left
     probing.look(2.0, 0.0)

@@ -8,28 +8,28 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuros.control import Report
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.project.model import Connection
 
 
 def report(
+    node: str = "a",
     executions: int = 0,
     received: int = 0,
     *,
     executing: dict[str, Any] | None = None,
     waiting_for: tuple[str, ...] = (),
-) -> dict[str, Any]:
-    return {
-        "waiting_for": list(waiting_for),
-        "metrics": {
-            "hooks": {"step": {"executions": executions}},
-            "incoming": {"b.o -> a.x": {"received": received}},
-            "executing": executing,
-        },
+) -> Report:
+    metrics: Any = {
+        "hooks": {"step": {"executions": executions}},
+        "incoming": {"b.o -> a.x": {"received": received}},
+        "executing": executing,
     }
+    return Report(node=node, waiting_for=waiting_for, metrics=metrics)
 
 
-LOADING = {"waiting_for": [], "metrics": None}
+LOADING = Report(node="b")
 
 
 def executing(for_s: float, executions: int = 7) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def detector_of(*names: str) -> StallDetector:
     detector = StallDetector(names, 0.0, Path("nowhere"))
     detector.greet(names)
     for name in names:
-        detector.report(name, report(), 0.0)
+        detector.report(report(name), 0.0)
     return detector
 
 
@@ -70,14 +70,14 @@ def test_a_standstill_is_asked_about_once_after_five_seconds() -> None:
 def test_the_next_standstill_is_asked_about_again() -> None:
     detector = detector_of("a")
     assert detector.has_just_stalled(5.0)
-    detector.report("a", report(executions=1), 6.0)
+    detector.report(report("a", executions=1), 6.0)
     assert not detector.has_just_stalled(10.9)
     assert detector.has_just_stalled(11.0)
 
 
 def test_a_packet_that_arrives_is_a_movement() -> None:
     detector = detector_of("a")
-    detector.report("a", report(received=1), 3.0)
+    detector.report(report("a", received=1), 3.0)
     assert detector.rested_s(4.0) == 1.0
 
 
@@ -88,27 +88,27 @@ def test_rest_is_the_time_since_the_last_movement(steps: list[tuple[float, bool]
         now_s += pause_s
         if moves:
             count, moved_s = count + 1, now_s
-        detector.report("a", report(executions=count), now_s)
+        detector.report(report("a", executions=count), now_s)
         assert detector.rested_s(now_s) == now_s - moved_s
 
 
 def test_nothing_rests_while_a_hook_executes() -> None:
     detector = detector_of("a", "b")
-    detector.report("b", report(executing=executing(1.0)), 3.0)
+    detector.report(report("b", executing=executing(1.0)), 3.0)
     assert detector.rested_s(4.0) == 0.0
 
 
 def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> None:
     detector = StallDetector(["a", "b"], 0.0, Path("nowhere"))
     detector.greet(["a"])
-    detector.report("a", report(), 0.0)
+    detector.report(report("a"), 0.0)
     assert not detector.has_just_stalled(9.0), "b has not come yet"
     detector.greet(["b"])
-    detector.report("b", LOADING, 9.0)
+    detector.report(LOADING, 9.0)
     assert not detector.has_just_stalled(15.0), "b is importing its plugin"
-    detector.report("b", report(waiting_for=("c.o -> b.x",)), 15.0)
+    detector.report(report("b", waiting_for=("c.o -> b.x",)), 15.0)
     assert not detector.has_just_stalled(21.0), "b waits for its sender: that is said as a remark"
-    detector.report("b", report(), 21.0)
+    detector.report(report("b"), 21.0)
     assert detector.has_just_stalled(21.0)
 
 
@@ -117,10 +117,10 @@ def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> 
 
 def test_waiting_connections_are_named_after_5_seconds_and_then_every_10() -> None:
     detector = detector_of("a")
-    detector.report("a", report(waiting_for=("b.o -> a.x", "b.p -> a.y")), 1.0)
+    detector.report(report("a", waiting_for=("b.o -> a.x", "b.p -> a.y")), 1.0)
     said = []
     for tenths in range(300):
-        detector.report("a", report(waiting_for=("b.o -> a.x", "b.p -> a.y")), tenths / 10)
+        detector.report(report("a", waiting_for=("b.o -> a.x", "b.p -> a.y")), tenths / 10)
         said += [(tenths / 10, text) for text in remarks(detector, tenths / 10)]
     text = "connections still waiting for their other end: b.o -> a.x; b.p -> a.y"
     assert said == [(5.0, text), (15.0, text), (25.0, text)]
@@ -129,7 +129,7 @@ def test_waiting_connections_are_named_after_5_seconds_and_then_every_10() -> No
 def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
     detector = detector_of("a", "b")
     for name in "ab":
-        detector.report(name, report(waiting_for=("b.o -> a.x",)), 4.0)
+        detector.report(report(name, waiting_for=("b.o -> a.x",)), 4.0)
     (text,) = remarks(detector, 5.0)
     assert text.count("b.o -> a.x") == 1
 
@@ -137,38 +137,43 @@ def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
 def test_nodes_that_start_slowly_are_named() -> None:
     detector = StallDetector(["a", "b", "c"], 0.0, Path("nowhere"))
     detector.greet(["b", "c"])
-    detector.report("b", LOADING, 4.0)
-    detector.report("c", report(), 4.0)
+    detector.report(LOADING, 4.0)
+    detector.report(
+        report(
+            "c",
+        ),
+        4.0,
+    )
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
 
 
 def test_when_all_is_well_nothing_is_said() -> None:
     detector = detector_of("a")
     for second in range(60):
-        detector.report("a", report(executions=second), float(second))
+        detector.report(report("a", executions=second), float(second))
         assert remarks(detector, float(second)) == []
 
 
 def test_a_hook_that_has_run_for_5_seconds_is_named_once() -> None:
     detector = detector_of("a")
-    detector.report("a", report(executing=executing(4.9)), 4.0)
+    detector.report(report("a", executing=executing(4.9)), 4.0)
     assert remarks(detector, 4.0) == []
-    detector.report("a", report(executing=executing(5.9)), 5.0)
+    detector.report(report("a", executing=executing(5.9)), 5.0)
     assert remarks(detector, 5.0) == ["a has been executing 'step' for 5 s"]
-    detector.report("a", report(executing=executing(6.9)), 6.0)
+    detector.report(report("a", executing=executing(6.9)), 6.0)
     assert remarks(detector, 6.0) == []
-    detector.report("a", report(executing=executing(5.0, executions=8)), 20.0)
+    detector.report(report("a", executing=executing(5.0, executions=8)), 20.0)
     assert remarks(detector, 20.0) == ["a has been executing 'step' for 5 s"], "another execution"
 
 
 def test_a_node_that_does_not_report_is_named_once() -> None:
     detector = detector_of("a")
-    detector.report("a", report(executing=executing(1.0)), 1.0)
+    detector.report(report("a", executing=executing(1.0)), 1.0)
     assert remarks(detector, 5.9) == []
     (text,) = remarks(detector, 6.0)
     assert text.startswith("a has not reported for 5 s, last seen executing 'step': ")
     assert remarks(detector, 7.0) == []
-    detector.report("a", report(), 8.0)
+    detector.report(report("a"), 8.0)
     (text,) = remarks(detector, 13.0)
     assert text.startswith("a has not reported for 5 s: ")
 
@@ -185,15 +190,14 @@ def counted(
     received: int | None = None,
     unread: int = 0,
     taker: str | None = "look",
-) -> dict[str, Any]:
+) -> Report:
     """Of the sender or of the receiver."""
     incoming = {"received": received, "unread": unread, "taker": taker if unread else None}
-    return {
-        "metrics": {
-            "outgoing": {} if sent is None else {KEY: {"sent": sent, "is_reliable": True}},
-            "incoming": {} if received is None else {KEY: incoming},
-        }
+    metrics: Any = {
+        "outgoing": {} if sent is None else {KEY: {"sent": sent, "is_reliable": True}},
+        "incoming": {} if received is None else {KEY: incoming},
     }
+    return Report(node="camera" if received is None else "brain", metrics=metrics)
 
 
 def said(backlog: Backlog, now_s: float) -> list[str]:

@@ -10,92 +10,125 @@ from typing import Any
 
 import pytest
 
-from neuros.control import Lines, connect
+from neuros.backends.control_sockets import UnixListener, connect
+from neuros.control import TO_NODES, Explanation, Failed, Hello, Probe, Stop, Watch
+from neuros.control.link import ControlLink, kind_of
+from neuros.errors import ControlError
 from neuros.launcher.channels import Channels
+
+
+class Node(ControlLink):
+    """The end of a node."""
+
+    def __init__(self, folder: Path) -> None:
+        stream = connect(UnixListener(folder).address)
+        assert isinstance(stream, socket.socket)
+        self.socket = stream
+        super().__init__(stream, TO_NODES, "the supervisor")
 
 
 @pytest.fixture
 def channels(tmp_path: Path) -> Iterator[Channels]:
-    channels = Channels(tmp_path)
+    channels = Channels(UnixListener(tmp_path))
     yield channels
     channels.close()
 
 
 @pytest.fixture
-def node(channels: Channels, tmp_path: Path) -> Iterator[Lines]:
-    lines = connect(tmp_path)
-    yield lines
-    lines.close()
+def node(channels: Channels, tmp_path: Path) -> Iterator[Node]:
+    node = Node(tmp_path)
+    yield node
+    node.close()
 
 
 def kinds(channels: Channels) -> list[Any]:
-    return [message["kind"] for _, message in channels.receive()]
+    return [
+        "refused" if isinstance(message, ControlError) else kind_of(type(message))
+        for _, message in channels.receive()
+    ]
 
 
-def test_what_was_said_before_hanging_up_is_heard_in_one_go(
-    channels: Channels, node: Lines
-) -> None:
-    node.send("hello", nodes=["a"])
-    node.send("failed", text="why")
+def test_what_was_said_before_hanging_up_is_heard_in_one_go(channels: Channels, node: Node) -> None:
+    node.send(Hello(("a",)))
+    node.send(Failed("a", "why"))
     node.close()
     assert kinds(channels) == ["hello", "failed"]
     assert kinds(channels) == []
 
 
-def test_several_hundred_kilobytes_are_one_go_too(channels: Channels, node: Lines) -> None:
+def test_several_hundred_kilobytes_are_one_go_too(channels: Channels, node: Node) -> None:
     node.socket.setblocking(False)
     count = 0
-    while node.send("report", text="x" * 1000):
+    while node.send(Explanation("a", ("x" * 1000,))):
         count += 1
-    assert kinds(channels)[:count] == ["report"] * count
+    assert kinds(channels)[:count] == ["explanation"] * count
 
 
-def test_half_a_line_waits_for_its_other_half(channels: Channels, node: Lines) -> None:
-    node.socket.sendall(b'{"kind": "rep')
+def test_half_a_line_waits_for_its_other_half(channels: Channels, node: Node) -> None:
+    node.socket.sendall(b'{"kind": "wat')
     assert kinds(channels) == []
-    node.socket.sendall(b'ort"}\n')
-    assert kinds(channels) == ["report"]
+    node.socket.sendall(b'ch"}\n')
+    assert kinds(channels) == ["watch"]
 
 
-def test_whoever_does_not_keep_to_the_format_is_hung_up_on(channels: Channels, node: Lines) -> None:
-    node.socket.sendall(b"GET / HTTP/1.1\r\n\r\n")
-    assert kinds(channels) == []
+def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
+    channels: Channels, node: Node
+) -> None:
+    node.socket.sendall(b"GET / HTTP/1.1\r\n")
+    node.send(Hello(("a", "b")))
+    node.socket.sendall(b'{"kind": "first_hook"}\n')
+    (link, stranger), _, (_, known) = channels.receive()
+    assert str(stranger).startswith(
+        "a program that has not said what it is sent what is no control"
+    )
+    assert str(known) == (
+        "the process of a and b sent a wrong control message 'first_hook': field node is missing"
+    )
+    channels.hang_up(link)
     node.socket.settimeout(5.0)
     assert node.receive() is None
 
 
-def test_all_are_told(channels: Channels, node: Lines, tmp_path: Path) -> None:
-    other = connect(tmp_path)
-    assert kinds(channels) == []
-    channels.send("probe", number=3)
+def test_all_nodes_are_told(channels: Channels, node: Node, tmp_path: Path) -> None:
+    other, observer = Node(tmp_path), Node(tmp_path)
     for lines in (node, other):
-        assert lines.receive() == [{"kind": "probe", "number": 3}]
+        lines.send(Hello(("a",)))
+    observer.send(Watch())
+    assert sorted(kinds(channels)) == ["hello", "hello", "watch"]
+    channels.send(Probe(3))
+    for lines in (node, other):
+        assert lines.receive() == [Probe(3)]
+    observer.socket.setblocking(False)
+    assert observer.receive() == [], "it is no node"
     other.close()
+    observer.close()
 
 
 def test_one_that_does_not_read_holds_up_nobody_and_misses_nothing(
-    channels: Channels, node: Lines
+    channels: Channels, node: Node
 ) -> None:
-    assert kinds(channels) == []
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
     node.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     start_s = time.monotonic()
     for number in range(5000):
-        channels.send("probe", number=number)
+        channels.send(Probe(number))
     assert time.monotonic() - start_s < 2.0
     got: list[Any] = []
     node.socket.settimeout(5.0)
     while len(got) < 5000:
         got += node.receive() or []
         channels.flush()
-    assert [message["number"] for message in got] == list(range(5000))
+    assert got == [Probe(number) for number in range(5000)]
 
 
-def test_one_that_has_gone_is_no_error(channels: Channels, node: Lines) -> None:
-    assert kinds(channels) == []
+def test_one_that_has_gone_is_no_error(channels: Channels, node: Node) -> None:
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
     node.close()
-    channels.send("stop")
+    channels.send(Stop())
     assert kinds(channels) == []
-    channels.send("stop")
+    channels.send(Stop())
 
 
 def test_a_signal_ends_the_wait(channels: Channels) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,8 +109,10 @@ def test_a_failure_while_a_signal_ends_the_run_is_noted(run: Run) -> None:
 def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None:
     outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
     assert outcome.exit_code == 1
-    assert outcome.reason == (
-        "node 'b' had to be killed 5 s after the end began: it did not come to its end"
+    assert re.fullmatch(
+        r"node 'b' had to be killed 5 s after the end began:"
+        r" 'b' did not begin to finalise and had not reported for \d s",
+        outcome.reason,
     )
     assert 5 <= run.lasted_s < 6.5
 
@@ -153,7 +156,7 @@ def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
 
 
 def test_of_a_node_that_had_to_be_killed_it_is_said_what_it_had_still_to_do(run: Run) -> None:
-    stack = ["b", "close", '  File "b.py", line 7, in close']
+    stack = {"node": "b", "hook": "close", "text": '  File "b.py", line 7, in close'}
     hangs = f"""
 host.up()
 host.tell('hooks', hooks=[], finalise=['save', 'close', 'last'])
@@ -168,8 +171,8 @@ host.report(stack={stack})
         "node 'b' had to be killed 5 s after the end began: finalise hook 'close' of 'b' did not"
         " finish; finalise hook 'last' of 'b' did not run"
     )
-    assert "b was at this point when it was killed:\n" + stack[2] in run.output.said
-    assert outcome.stacks == {"b": stack[2]}
+    assert "b was at this point when it was killed:\n" + stack["text"] in run.output.said
+    assert outcome.stacks == {"b": stack["text"]}
 
 
 def test_hooks_that_have_finished_are_not_blamed(run: Run) -> None:
@@ -189,13 +192,15 @@ host.tell('finalising', hook='')
     assert sorted(outcome.failures) == [
         "node 'b' had to be killed 5 s after the end began:"
         " what 'b' has registered with node.on_close did not end",
-        "node 'c' had to be killed 5 s after the end began: it did not come to its end",
+        "node 'c' had to be killed 5 s after the end began:"
+        " 'c' had finalised, but did not make its final report",
     ]
 
 
 def test_a_report_behind_the_final_one_does_not_count(run: Run) -> None:
-    outcome = run(a=SHUTS_DOWN + "; host.report(late=True)")
+    outcome = run(a=SHUTS_DOWN + "; host.report(sim_time=9.0)")
     assert outcome.has_final_report("a")
+    assert outcome.reports["a"].sim_time is None
 
 
 def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
@@ -204,6 +209,31 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
         "s.sendall(b'GET / HTTP/1.1\\n'); assert s.recv(1) == b''; " + SHUTS_DOWN
     )
     assert outcome.exit_code == 0
+    (text,) = [text for text in run.output.said if text.startswith("control channel")]
+    assert text == (
+        "control channel: hung up: a program that has not said what it is sent what is no control"
+        " message: b'GET / HTTP/1.1'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("message", "complaint"),
+    [
+        ("host.tell('applaud')", "sent a control message of the unknown kind 'applaud'"),
+        ("host.tell('failed')", "sent a wrong control message 'failed': field text is missing"),
+        (
+            "host.report(sim_time='noon')",
+            "sent a wrong control message 'report': field sim_time is 'noon', and must be float",
+        ),
+    ],
+)
+def test_a_node_that_is_not_understood_makes_the_run_fail(
+    run: Run, message: str, complaint: str
+) -> None:
+    outcome = run(a=f"host.up_last(); {message}; host.serve()", b=WELL_BEHAVED)
+    assert outcome.exit_code == 1
+    assert outcome.reason.startswith(f"control channel: the process of a {complaint}")
+    assert all(map(outcome.has_final_report, "ab"))
 
 
 def test_explanations_are_shown_one_line_per_node(run: Run) -> None:

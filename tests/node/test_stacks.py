@@ -88,7 +88,8 @@ def test_a_node_that_reports_tells_it_of_its_main_thread(plugin: Path) -> None:
         thread.join()
 
     module.hook(ask)
-    ((node, hook, text),) = found
+    (stack,) = found
+    node, hook, text = stack.node, stack.hook, stack.text
     assert (node, hook) == ("a", "hook")
     assert text.startswith(f'  File "{plugin}", line 4, in hook\n    deep(wait)\n  File ')
     ask()

@@ -6,33 +6,38 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from neuros.backends.control_sockets import UnixListener, connect
+from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, PhaseChanged, Watch
+from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels
 from neuros.viewers.observer import look_on
 from neuros.viewers.visual_types import Mark, Numbers, VisualTypes
 
 
 def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
-    channels = Channels(tmp_path)
+    listener = UnixListener(tmp_path)
+    channels = Channels(listener)
+    link = ControlLink(connect(listener.address), TO_OBSERVERS, "the supervisor")
     shown: list[tuple[str, Sequence[Mark]]] = []
     sources = {"robot.imu": ("robot", "imu", VisualTypes("sensor_msgs/msg/Imu"))}
     observer = threading.Thread(
-        target=look_on, args=(tmp_path, sources, lambda name, _, marks: shown.append((name, marks)))
+        target=look_on, args=(link, sources, lambda name, _, marks: shown.append((name, marks)))
     )
     observer.start()
     asked = []
     while not shown:
         channels.wait(5.0)
         for lines, message in channels.receive():
-            asked.append(message["kind"])
-            if message["kind"] == "look":
-                fields = message["wanted"]["robot"]["imu"]["fields"]
+            asked.append(type(message))
+            if isinstance(message, LookAll):
+                fields = message.wanted["robot"]["imu"]["fields"]
                 sample = {"fields": fields, "values": [[1e9, *([0.5] * len(fields))]]}
-                channels.send_to(lines, "phase", phase="running", is_paused=False)
-                channels.send_to(lines, "node_status", node="robot", samples={"imu": sample})
+                channels.send_to(lines, PhaseChanged("running", False))
+                channels.send_to(lines, NodeStatus("robot", 1, samples={"imu": sample}))
     channels.close()
     observer.join(5.0)
     assert not observer.is_alive()
-    assert asked[:2] == ["watch", "look"]
+    assert asked[:2] == [Watch, LookAll]
     name, (_, numbers) = shown[0]
     assert name == "robot.imu"
     assert isinstance(numbers, Numbers)

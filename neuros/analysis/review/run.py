@@ -17,6 +17,7 @@ import numpy as np
 
 from neuros.analysis.packets import FOLDER, Numbers, Packets, packet_figures, read_packets
 from neuros.analysis.run_record import connection_of
+from neuros.backends.registered import ran_in_one_process
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection
@@ -53,9 +54,9 @@ class Run:
         return found
 
     @property
-    def is_in_process(self) -> bool:
+    def is_one_process(self) -> bool:
         """Whether all nodes took turns in one thread."""
-        return bool(self.record.get("backend") == "in-process")
+        return ran_in_one_process(self.record)
 
     @property
     def time_owner(self) -> str | None:

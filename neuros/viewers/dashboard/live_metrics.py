@@ -1,14 +1,34 @@
-"""Live metrics of the page, from counters of nodes: rates, shares, latencies, losses."""
+"""A run as the pages of the dashboard see it: live metrics from counters of its nodes.
+
+The supervisor is asked over the control channel only while a page is open.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import itertools
+import time
 from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
+from neuros.control import (
+    Ended,
+    LogRecord,
+    LookAll,
+    Message,
+    Metrics,
+    NodeStatus,
+    PhaseChanged,
+    Report,
+    Watch,
+)
+from neuros.control.link import ControlLink
 from neuros.engine.time_budget import time_budget_of
+from neuros.errors import ControlError
+from neuros.viewers.dashboard.pages import Pages, data_url
 
 WINDOW_S = 1.0
 """Rates and shares are those of about the last second."""
@@ -20,6 +40,9 @@ _MOST_TAKEN = 8
 _MOST_SHOWN = 256
 _UNDER_WAY_S = 0.02
 _LATE_S = 2.0
+_PERIOD_S = 0.2
+_PER_NODE_S = 0.0125
+_PATIENCE_S = 1.0
 
 
 class Latency:
@@ -141,40 +164,45 @@ class LiveMetrics:
         speed = self._speeds.get(("sim", ""))
         return None if speed is None else speed.per_s
 
-    def take(self, status: Mapping[str, Any]) -> None:
+    def take(self, status: NodeStatus) -> None:
         """A node has shown itself."""
-        books = status["books"]
-        if books is None:
-            self.nodes[status["node"]] = {"state": "loading", "cause": ""}
+        counters = status.counters
+        if counters is None:
+            self.nodes[status.node] = {"state": "loading", "cause": ""}
             return
-        now_s = books["now_s"]
-        if status["sim_time"] is not None:
-            self.sim_time = status["sim_time"]
-            self._speed("sim", "", now_s, status["sim_time"])
-        self._take_node(status["node"], books, now_s)
-        for name, counters in books["outgoing"].items():
+        now_s, metrics = counters.now_s, counters.metrics
+        if status.sim_time is not None:
+            self.sim_time = status.sim_time
+            self._speed("sim", "", now_s, status.sim_time)
+        self._take_node(status.node, metrics, now_s)
+        for name, outgoing in metrics["outgoing"].items():
             shown = self.connections.setdefault(name, {})
-            shown |= {key: counters[key] for key in ("sent", "outstanding", "is_blocked")}
-            shown["rate_hz"] = self._speed("sent", name, now_s, counters["sent"])
-            if counters["is_reliable"]:
+            shown |= {key: outgoing[key] for key in ("sent", "outstanding", "is_blocked")}
+            shown["rate_hz"] = self._speed("sent", name, now_s, outgoing["sent"])
+            if outgoing["is_reliable"]:
                 shown["lost"] = 0
             else:
-                self._losses.setdefault(name, Loss()).sent(now_s, counters["sent"])
-        for name, counters in books["incoming"].items():
+                self._losses.setdefault(name, Loss()).sent(now_s, outgoing["sent"])
+        for name, incoming in metrics["incoming"].items():
             shown = self.connections.setdefault(name, {})
-            shown |= {key: counters[key] for key in ("received", "discarded", "unread")}
-            rate_hz = self._speed("received", name, now_s, counters["received"])
+            shown |= {key: incoming[key] for key in ("received", "discarded", "unread")}
+            rate_hz = self._speed("received", name, now_s, incoming["received"])
             shown.setdefault("rate_hz", rate_hz)
             if "sent" not in shown:  # an external topic, or a sender of another launcher
                 shown["rate_hz"] = rate_hz
             if name in self._losses:
-                executing = books["executing"]
+                executing = metrics["executing"]
                 taken_in_s = now_s - (executing["for_s"] if executing else 0.0)
-                self._losses[name].received(now_s, taken_in_s, counters["received"])
+                self._losses[name].received(now_s, taken_in_s, incoming["received"])
                 shown["lost"] = self._losses[name].count
-        self._take_times(books)
+        for name, (last, times_ns) in counters.sent_ns.items():
+            self._latency(name).sent(last, times_ns)
+        for name, (position, time_ns) in counters.taken_ns.items():
+            self._latency(name).taken(position, time_ns)
+        for name, latency in self._latencies.items():
+            self.connections[name]["latency_ms"] = latency.ms
 
-    def end(self, reports: Mapping[str, Mapping[str, Any]], running_s: float | None) -> None:
+    def end(self, reports: Mapping[str, Report], running_s: float | None) -> None:
         """The run is over: counts are final, and rates and shares are those of the whole run.
 
         Args:
@@ -184,14 +212,17 @@ class LiveMetrics:
         self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
         ends: dict[str, dict[str, int]] = {}
         for name, report in reports.items():
-            books = report["metrics"]
-            if books is None:
+            if report.metrics is None:
                 continue
-            self._end_node(name, books, running_s)
-            for connection, counters in (*books["outgoing"].items(), *books["incoming"].items()):
+            self._end_node(name, report.metrics, running_s)
+            counted: list[tuple[str, dict[str, Any]]] = [
+                *((name, {**counts}) for name, counts in report.metrics["outgoing"].items()),
+                *((name, {**counts}) for name, counts in report.metrics["incoming"].items()),
+            ]
+            for connection, counters in counted:
                 shown = self.connections.setdefault(connection, {})
                 shown |= {key: counters[key] for key in _COUNTS if key in counters}
-                if report.get("is_final"):
+                if report.is_final:
                     ends.setdefault(connection, {}).update(counters)
         for connection, shown in self.connections.items():
             count, final = shown.get("sent", shown.get("received")), ends.get(connection, {})
@@ -205,42 +236,31 @@ class LiveMetrics:
         if self.sim_time is not None and running_s:
             self._ended_factor = self.sim_time / running_s
 
-    def _end_node(self, name: str, books: Mapping[str, Any], running_s: float | None) -> None:
-        spent = time_budget_of(books, running_s)
+    def _end_node(self, name: str, metrics: Metrics, running_s: float | None) -> None:
+        spent = time_budget_of(metrics, running_s)
         self.nodes[name] = {
             "state": "ended",
             "cause": "",
             "shares": {} if spent is None else spent.shares,
-            "hooks": {
-                hook: _hook(each["executions"], each["busy_s"], None)
-                for hook, each in books["hooks"].items()
-            },
+            "hooks": {hook: _hook(each, None) for hook, each in metrics["hooks"].items()},
         }
 
-    def _take_node(self, name: str, books: Mapping[str, Any], now_s: float) -> None:
+    def _take_node(self, name: str, metrics: Metrics, now_s: float) -> None:
         shares = {
-            state: self._speed(f"share {state}", name, now_s, _seconds(books, state))
+            state: self._speed(f"share {state}", name, now_s, _seconds(metrics, state))
             for state in _STATES
         }
-        executing = books["executing"]
+        executing = metrics["executing"]
         self.nodes[name] = {
-            **books["state"],
+            **metrics["state"],
             "executing": executing["name"] if executing else None,
             "executing_s": executing["for_s"] if executing else 0.0,
             "shares": shares,
             "hooks": {
-                hook: _hook(count, busy_s, self._speed(f"hook {hook}", name, now_s, count))
-                for hook, (count, busy_s) in books["hooks"].items()
+                hook: _hook(each, self._speed(f"hook {hook}", name, now_s, each["executions"]))
+                for hook, each in metrics["hooks"].items()
             },
         }
-
-    def _take_times(self, books: Mapping[str, Any]) -> None:
-        for name, (last, times_ns) in books["sent_ns"].items():
-            self._latency(name).sent(last, times_ns)
-        for name, (position, time_ns) in books["taken_ns"].items():
-            self._latency(name).taken(position, time_ns)
-        for name, latency in self._latencies.items():
-            self.connections[name]["latency_ms"] = latency.ms
 
     def _latency(self, name: str) -> Latency:
         return self._latencies.setdefault(name, Latency())
@@ -251,14 +271,132 @@ class LiveMetrics:
         return speed.per_s
 
 
-def _seconds(books: Mapping[str, Any], cause: str) -> float:
-    spent = books["accounting"][cause]
+def _seconds(metrics: Metrics, cause: str) -> float:
+    spent = metrics["accounting"][cause]
     return sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
 
 
-def _hook(executions: int, busy_s: float, rate_hz: float | None) -> dict[str, Any]:
+def _hook(figures: Mapping[str, Any], rate_hz: float | None) -> dict[str, Any]:
+    executions, busy_s = figures["executions"], figures["busy_s"]
     return {
         "executions": executions,
         "rate_hz": rate_hz,
         "mean_ms": busy_s / executions * 1e3 if executions else None,
     }
+
+
+class LiveRun:
+    """A run as its pages see it: asks the supervisor while a page is open, and shows the answers.
+
+    Args:
+        link: to the supervisor.
+        names: the nodes of the run.
+        start_s: monotonic time from which the pages count.
+
+    Attributes:
+        phase: the latest state of the run, for the pages.
+    """
+
+    def __init__(
+        self, pages: Pages, link: ControlLink, names: tuple[str, ...], start_s: float
+    ) -> None:
+        self._pages = pages
+        self._link = link
+        self._names = set(names)
+        self._metrics = LiveMetrics()
+        self._answered: set[str] = set()
+        self._has_answered = asyncio.Event()
+        self._is_over = asyncio.Event()
+        self._start_s = start_s
+        self.phase: dict[str, Any] = {"phase": "running", "is_paused": False}
+
+    async def run(self) -> None:
+        """Until the run is over."""
+        loop = asyncio.get_running_loop()
+        self.tell(Watch())
+        loop.add_reader(self._link.fileno(), self._receive)
+        asking = asyncio.create_task(self._ask())
+        try:
+            await self._is_over.wait()
+        finally:
+            asking.cancel()
+            loop.remove_reader(self._link.fileno())
+            self._link.close()
+
+    def tell(self, message: Message) -> None:
+        """Send to the supervisor, which always reads."""
+        if not self._is_over.is_set():
+            self._link.send(message)
+
+    async def _ask(self) -> None:
+        period_s = max(_PERIOD_S, _PER_NODE_S * len(self._names))
+        while True:
+            await self._pages.are_watched.wait()
+            self._answered.clear()
+            self._has_answered.clear()
+            asked_s = time.monotonic()
+            self.tell(LookAll(self._pages.wanted()))
+            # A node whose hook holds Python's global lock answers late: the others need not wait.
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)
+            self._show()
+            await asyncio.sleep(max(0.0, asked_s + period_s - time.monotonic()))
+
+    def _receive(self) -> None:
+        try:
+            messages = self._link.receive()
+        except ControlError as error:
+            self._pages.send("log", [f"[ERROR] [dashboard] {error}"])
+            return
+        if messages is None:
+            self._is_over.set()
+        for message in messages or ():
+            self._take(message)
+
+    def _take(self, message: Message) -> None:
+        match message:
+            case NodeStatus(node):
+                self._metrics.take(message)
+                self._show_samples(node, message.samples)
+                self._answered.add(node)
+                if self._answered >= self._names:
+                    self._has_answered.set()
+            case PhaseChanged():
+                self.phase = dict(vars(message))
+                self._pages.send("phase", self.phase)
+            case LogRecord(severity, text):
+                self._pages.send("log", [f"[{severity}] [neuros] {text}"])
+            case Ended(exit_code, reason, reports, running_s):
+                self._metrics.end(reports, running_s)
+                self._show()
+                self.phase = {"phase": "ended", "is_paused": False}
+                self.phase |= {"exit_code": exit_code, "reason": reason}
+                self._pages.send("phase", self.phase)
+
+    def _show(self) -> None:
+        metrics = self._metrics
+        self._pages.send(
+            "figures",
+            {
+                "t": time.monotonic() - self._start_s,
+                "nodes": metrics.nodes,
+                "connections": metrics.connections,
+                "sim_time": metrics.sim_time,
+                "real_time_factor": metrics.real_time_factor,
+            },
+        )
+
+    def _show_samples(self, node: str, samples: Mapping[str, dict[str, Any]]) -> None:
+        shown = {}
+        for port, sample in samples.items():
+            for row in sample.get("values", ()):
+                row[0] -= self._start_s
+            if "image" in sample:
+                sample["image"] = {
+                    "url": data_url(sample["image"]),
+                    "of": sample["image"]["of"],
+                    "encoding": sample["image"]["encoding"],
+                }
+            shown[f"{node}.{port}"] = sample
+        if shown:
+            self._pages.send("samples", shown)

@@ -44,7 +44,9 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from neuros.viewers.dashboard.link import Link, Pages, wanted_of
+from neuros.control import End, Message, Pause, Resume, StepAll
+from neuros.viewers.dashboard.live_metrics import LiveRun
+from neuros.viewers.dashboard.pages import Pages, wanted_of
 
 STATIC = Path(__file__).parent / "static"
 _LOG_S = 0.2
@@ -61,6 +63,11 @@ _HEADERS = {
 }
 
 
+_REQUESTS: Mapping[str, Message] = {
+    "pause": Pause(),
+    "resume": Resume(),
+    "stop": End("ended from the dashboard"),
+}
 _NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
@@ -89,21 +96,20 @@ class Dashboard:
 
     Args:
         plan: what :func:`neuros.viewers.dashboard.plan.plan` tells of the project.
-        names: the nodes of the run.
-        start_s: monotonic time from which the page counts.
+        pages: shared with ``run``.
     """
 
     def __init__(
-        self, plan: Mapping[str, Any], names: tuple[str, ...], sources: Sources, start_s: float
+        self, plan: Mapping[str, Any], sources: Sources, pages: Pages, run: LiveRun
     ) -> None:
         self._plan = plan
         self._sources = sources
-        self._pages = Pages()
-        self._link = Link(self._pages, names, start_s)
+        self._pages = pages
+        self._run = run
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
 
-    async def serve(self, listening: socket.socket, token: str, run: str, folder: Path) -> None:
-        """Answer requests until the supervisor hangs up. Raises ``OSError`` if it is not there."""
+    async def serve(self, listening: socket.socket, token: str, run: str) -> None:
+        """Answer requests until the supervisor hangs up."""
         config = uvicorn.Config(
             self.app(token, run),
             log_level="warning",
@@ -115,7 +121,7 @@ class Dashboard:
         serving = asyncio.create_task(server.serve([listening]))
         tasks = [asyncio.create_task(each) for each in (self._read_logs(), self._read_load())]
         try:
-            await self._link.run(folder)
+            await self._run.run()
         finally:
             for task in tasks:
                 task.cancel()
@@ -150,7 +156,7 @@ class Dashboard:
         name, page = self._pages.open()
         try:
             page.send("begin", {"page": name, **self._plan})
-            page.send("phase", self._link.phase)
+            page.send("phase", self._run.phase)
             page.send("log", list(self._lines))
             while (event := await page.next_event()) is not None:
                 yield event
@@ -168,16 +174,14 @@ class Dashboard:
 
     async def _do(self, request: Request) -> Response:
         what = request.path_params["what"]
-        if what in ("pause", "resume"):
-            self._link.tell(what)
+        if what in _REQUESTS:
+            self._run.tell(_REQUESTS[what])
         elif what == "step":
             try:
                 count = int((await request.json())["count"])
             except _NOT_UNDERSTOOD:
                 return JSONResponse({"error": "how many steps?"}, 400)
-            self._link.tell("step", count=min(count, _MOST_STEPS))
-        elif what == "stop":
-            self._link.tell("end", reason="ended from the dashboard")
+            self._run.tell(StepAll(min(count, _MOST_STEPS)))
         else:
             return JSONResponse({"error": f"nothing is called '{what}'"}, 404)
         return Response(status_code=204)

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from neuros.control import LiveCounters, NodeStatus, Report
 from neuros.viewers.dashboard.live_metrics import LiveMetrics
 
 LINK = "a.o -> b.x"
 STATES = ("waiting", "blocked", "executing", "idle", "registering", "scheduling", "paused")
 
 
-def node_status(node: str, now_s: float, **books: Any) -> dict[str, Any]:
-    spent = {state: books.get(state, 0.0) for state in STATES}
-    return {
-        "node": node,
-        "sim_time": books.get("sim_time"),
-        "books": {
-            "now_s": now_s,
-            "state": {"state": "waiting", "cause": "x"},
-            "executing": books.get("hook"),
-            "hooks": books.get("hooks", {}),
-            "accounting": spent,
-            "outgoing": books.get("outgoing", {}),
-            "incoming": books.get("incoming", {}),
-            "sent_ns": books.get("sent_ns", {}),
-            "taken_ns": books.get("taken_ns", {}),
-            "is_paused": False,
-        },
+def node_status(node: str, now_s: float, **shown: Any) -> NodeStatus:
+    metrics: Any = {
+        "state": {"state": "waiting", "cause": "x"},
+        "executing": shown.get("hook"),
+        "hooks": shown.get("hooks", {}),
+        "accounting": {state: shown.get(state, 0.0) for state in STATES},
+        "outgoing": shown.get("outgoing", {}),
+        "incoming": shown.get("incoming", {}),
     }
+    times = shown.get("sent_ns", {}), shown.get("taken_ns", {})
+    return NodeStatus(node, 1, shown.get("sim_time"), LiveCounters(now_s, metrics, *times))
 
 
 def outgoing(sent: int, outstanding: int = 0, *, is_reliable: bool = True) -> dict[str, Any]:
@@ -74,9 +69,9 @@ def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first(
         figures = LiveMetrics()
         statuses = [
             node_status(
-                "a", 1.0, outgoing=outgoing(12), sent_ns={LINK: [12, [7_000_000, 9_000_000]]}
+                "a", 1.0, outgoing=outgoing(12), sent_ns={LINK: (12, (7_000_000, 9_000_000))}
             ),
-            node_status("b", 1.0, incoming=incoming(11), taken_ns={LINK: [11, 7_500_000]}),
+            node_status("b", 1.0, incoming=incoming(11), taken_ns={LINK: (11, 7_500_000)}),
         ]
         for each in statuses if is_sender_first else reversed(statuses):
             figures.take(each)
@@ -94,7 +89,8 @@ def test_shares_are_seconds_of_each_state_per_second() -> None:
 
 def test_hooks_have_their_count_and_mean_time() -> None:
     figures = LiveMetrics()
-    figures.take(node_status("a", 1.0, hooks={"f": [10, 0.05], "g": [0, 0.0]}))
+    hooks = {"f": {"executions": 10, "busy_s": 0.05}, "g": {"executions": 0, "busy_s": 0.0}}
+    figures.take(node_status("a", 1.0, hooks=hooks))
     hooks = figures.nodes["a"]["hooks"]
     assert hooks["f"] == {"executions": 10, "rate_hz": 0.0, "mean_ms": pytest.approx(5.0)}
     assert hooks["g"]["mean_ms"] is None
@@ -110,7 +106,7 @@ def test_the_real_time_factor_is_that_of_now() -> None:
 
 def test_a_node_that_loads_its_plugin_has_no_figures_yet() -> None:
     figures = LiveMetrics()
-    figures.take({"node": "a", "sim_time": None, "books": None})
+    figures.take(NodeStatus("a", 1))
     assert figures.nodes == {"a": {"state": "loading", "cause": ""}}
 
 
@@ -164,17 +160,17 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
         "a": ({LINK: {"sent": 8, "outstanding": 0}}, {}, {"executing": {"f": 1.0}, "idle": 3.0}),
         "b": ({}, {LINK: {"received": 6, "discarded": 2, "unread": 0}}, {"waiting": {"x": 4.0}}),
     }
-    reports = {
+    metrics: dict[str, Any] = {
         name: {
-            "is_final": True,
-            "metrics": {
-                "outgoing": out,
-                "incoming": into,
-                "accounting": nothing | spent,
-                "hooks": {"f": {"executions": 4, "busy_s": 1.0}},
-            },
+            "outgoing": out,
+            "incoming": into,
+            "accounting": nothing | spent,
+            "hooks": {"f": {"executions": 4, "busy_s": 1.0}},
         }
         for name, (out, into, spent) in ends.items()
+    }
+    reports = {
+        name: Report(node=name, metrics=each, is_final=True) for name, each in metrics.items()
     }
     figures.end(reports, 4.0)
     assert {node["state"] for node in figures.nodes.values()} == {"ended"}
@@ -190,6 +186,6 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     )
     assert (shown["rate_hz"], figures.real_time_factor) == (2.0, 0.25)
 
-    reports["b"]["is_final"] = False
+    reports["b"] = replace(reports["b"], is_final=False)
     figures.end(reports, 4.0)
     assert figures.connections[LINK]["lost"] is None

@@ -13,7 +13,7 @@ from PIL import Image as Decoder
 from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.node.sampling import preview
-from neuros.viewers.dashboard.link import data_url
+from neuros.viewers.dashboard.pages import data_url
 
 
 def message(width: int, height: int, encoding: str, data: bytes, step: int = 0) -> Image:

@@ -1,0 +1,375 @@
+"""The control channel of a run: typed messages between supervisor, node processes and observers.
+
+It is no part of the data path: nodes report once per second, on a change of state and at the end;
+the supervisor answers rarely. Observers (the dashboard) get no more than they ask for. Every
+message is a dataclass of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`
+and :data:`TO_OBSERVERS` say who sends which.
+
+A message is one line: a JSON object with its fields and ``kind``, the name of its class in
+snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end supplies it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypedDict
+
+from neuros.hooks import HookKind, InputSpec
+from neuros.stacks import Stack
+
+CONTROL_VARIABLE = "NEUROS_CONTROL"
+"""The environment variable with the address at which the supervisor of a run listens."""
+
+ELSEWHERE_VARIABLE = "NEUROS_ELSEWHERE"
+"""The environment variable with the nodes that other launchers start, separated by commas."""
+
+
+# ---------------------------------------------------------------------- what messages are made of
+
+
+class SentCounts(TypedDict):
+    """Counters of an outgoing connection."""
+
+    sent: int
+    acknowledged: int
+    outstanding: int
+    window: int
+    is_reliable: bool
+    is_blocked: bool
+
+
+class ReceivedCounts(TypedDict):
+    """Counters of an incoming connection; ``taker``: the hook that could start on a packet now."""
+
+    received: int
+    consumed: int
+    discarded: int
+    longest_discard: int
+    unread: int
+    acknowledged: int
+    taker: str | None
+
+
+class NodeState(TypedDict):
+    """State of a node (``waiting``, ``blocked``), and the port or connection that causes it."""
+
+    state: str
+    cause: str
+
+
+class ExecutingHook(TypedDict):
+    """The hook that runs, for how long, and how often it had run before."""
+
+    name: str
+    for_s: float
+    executions: int
+
+
+class Metrics(TypedDict):
+    """Metrics of a node, as :func:`neuros.engine.snapshot.snapshot` makes them."""
+
+    state: NodeState
+    executing: ExecutingHook | None
+    outgoing: Mapping[str, SentCounts]
+    incoming: Mapping[str, ReceivedCounts]
+    hooks: Mapping[str, Mapping[str, Any]]
+    accounting: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class LiveCounters:
+    """Counters and latest times of a node, short enough to be sent often.
+
+    Attributes:
+        now_s: time of the reading, on the monotonic clock.
+        metrics: of hooks only ``executions`` and ``busy_s``.
+        sent_ns: by connection, the position of the last packet sent, and when the last few were.
+        taken_ns: by connection, the position of the packet on which a hook has started last, and
+            when that was.
+    """
+
+    now_s: float
+    metrics: Metrics
+    sent_ns: Mapping[str, tuple[int, tuple[int, ...]]]
+    taken_ns: Mapping[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class HookDeclaration:
+    """A hook, as its plugin declares it."""
+
+    kind: HookKind
+    inputs: tuple[InputSpec, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+
+class Message:
+    """Base of all messages."""
+
+
+# ---------------------------------------------------------------------- from nodes
+
+
+@dataclass(frozen=True)
+class Hello(Message):
+    """A node process is up."""
+
+    nodes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Message):
+    """State and counters of a node: once per second, on a change of state, at the end.
+
+    Attributes:
+        waiting_for: connections whose other end has not been found yet.
+        sim_time: simulated seconds, ``None`` where the node owns no time.
+        expected_end_s: simulated time at which the plugin expects to end the project.
+        timeline: further points of simulated and wall time, in seconds.
+        running_since_s: since when the node has been initialised, on the monotonic clock.
+        metrics: ``None`` before the plugin is loaded.
+        stack: where the plugin stands, if its hook runs for long.
+        fault: what cannot be recorded.
+        is_driving: whether some hook starts with no packet for it.
+        is_final: whether this is the last report.
+    """
+
+    node: str
+    waiting_for: tuple[str, ...] = ()
+    sim_time: float | None = None
+    expected_end_s: float | None = None
+    timeline: tuple[tuple[float, float], ...] = ()
+    running_since_s: float | None = None
+    metrics: Metrics | None = None
+    stack: Stack | None = None
+    fault: str | None = None
+    is_driving: bool = False
+    is_final: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probed(Report):
+    """Report of a node between two events, in answer to ``probe``.
+
+    Attributes:
+        number: that of the probe.
+        is_startable: whether a hook could start on a packet that has arrived.
+        is_wakeable: whether a timer, a thread or an external input may wake the node.
+        is_running: whether the node has been initialised and may start hooks.
+        is_idle: whether no event waits.
+    """
+
+    metrics: Metrics = field()  # without the default of a report
+    number: int
+    is_startable: bool
+    is_wakeable: bool
+    is_running: bool
+    is_idle: bool
+
+
+@dataclass(frozen=True)
+class Hooks(Message):
+    """The hooks that a plugin declares, once it is loaded; finalise hooks by name."""
+
+    node: str
+    hooks: tuple[HookDeclaration, ...]
+    finalise: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FirstHook(Message):
+    """A node starts its first hook."""
+
+    node: str
+
+
+@dataclass(frozen=True)
+class Finalising(Message):
+    """A node starts a finalise hook; ``""``: it closes what it holds; ``None``: it has."""
+
+    node: str
+    hook: str | None
+
+
+@dataclass(frozen=True)
+class Shutdown(Message):
+    """A plugin has called ``node.shutdown``."""
+
+    node: str
+    reason: str
+    drain_s: float
+
+
+@dataclass(frozen=True)
+class Failed(Message):
+    """A node has failed."""
+
+    node: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Explanation(Message):
+    """Why a node does not move, in answer to ``explain``."""
+
+    node: str
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Heard(Message):
+    """State that another launcher publishes by its node; ``None``: that node is gone."""
+
+    node: str
+    text: str | None
+
+
+@dataclass(frozen=True)
+class NodeStatus(Message):
+    """State and samples of a node, for the observer with this number; in answer to ``look``."""
+
+    node: str
+    asker: int
+    sim_time: float | None = None
+    counters: LiveCounters | None = None
+    samples: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+
+# ---------------------------------------------------------------------- to nodes
+
+
+@dataclass(frozen=True)
+class Probe(Message):
+    """Report between two events."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Explain(Message):
+    """Say why nothing moves."""
+
+
+@dataclass(frozen=True)
+class Drain(Message):
+    """Stop the hooks that send unasked; some, by node and place, may start once more."""
+
+    last_round: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Stop(Message):
+    """Start no further hook, finalise and end."""
+
+
+@dataclass(frozen=True)
+class Say(Message):
+    """Publish the state of this launcher to its peers."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Leave(Message):
+    """Peers have heard and said all: a node at its end may go."""
+
+
+@dataclass(frozen=True)
+class Pause(Message):
+    """Start no further hook."""
+
+
+@dataclass(frozen=True)
+class Resume(Message):
+    """Go on after a pause."""
+
+
+@dataclass(frozen=True)
+class Step(Message):
+    """While paused, go on by so many steps; ``is_driven``: some hooks start with no packet."""
+
+    count: int
+    is_driven: bool
+
+
+@dataclass(frozen=True)
+class Look(Message):
+    """Show an observer what the node does; ``wanted``: what to sample, by node and port."""
+
+    wanted: Mapping[str, Mapping[str, Any]]
+    asker: int
+
+
+# ---------------------------------------------------------------------- from observers
+
+
+@dataclass(frozen=True)
+class Watch(Message):
+    """An observer is there."""
+
+
+@dataclass(frozen=True)
+class LookAll(Message):
+    """Have every node show its status once; ``wanted``: what to sample, by node and port."""
+
+    wanted: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class StepAll(Message):
+    """While the run is paused, let it go on by so many steps."""
+
+    count: int
+
+
+@dataclass(frozen=True)
+class End(Message):
+    """End the run, drained, with exit code 0."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Interrupt(Message):
+    """Do what Ctrl+C does (``neuros stop``)."""
+
+
+# ---------------------------------------------------------------------- to observers
+
+
+@dataclass(frozen=True)
+class PhaseChanged(Message):
+    """Phase of the run, whenever it changes."""
+
+    phase: str
+    is_paused: bool
+
+
+@dataclass(frozen=True)
+class LogRecord(Message):
+    """Message of the launcher to the user."""
+
+    severity: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Ended(Message):
+    """All nodes have ended; ``reports``: the last one of each; ``running_s``: how long all ran."""
+
+    exit_code: int
+    reason: str
+    reports: Mapping[str, Report]
+    running_s: float | None
+
+
+FROM_NODES: Sequence[type[Message]] = (
+    *(Hello, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation, Heard),
+    NodeStatus,
+)
+TO_NODES: Sequence[type[Message]] = (
+    *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+)
+FROM_OBSERVERS: Sequence[type[Message]] = (Watch, LookAll, Pause, Resume, StepAll, End, Interrupt)
+TO_OBSERVERS: Sequence[type[Message]] = (NodeStatus, PhaseChanged, LogRecord, Ended)

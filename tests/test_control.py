@@ -1,0 +1,172 @@
+"""Messages of the control channel: what goes in comes out, and what does not fit is refused."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuros import control
+from neuros.control import (
+    FROM_NODES,
+    FROM_OBSERVERS,
+    TO_NODES,
+    TO_OBSERVERS,
+    Ended,
+    Finalising,
+    HookDeclaration,
+    Hooks,
+    LiveCounters,
+    Message,
+    NodeStatus,
+    Probed,
+    Report,
+)
+from neuros.control.link import decode, encode, kind_of
+from neuros.errors import ControlError
+from neuros.hooks import HookKind, InputSpec
+from neuros.stacks import Stack
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "control_channel.md"
+MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS])
+ACCEPTED = {kind_of(each): each for each in MESSAGES}
+METRICS: Any = {"state": {"state": "idle", "cause": ""}, "executing": None, "hooks": {}}
+METRICS |= {"outgoing": {"a.o -> b.x": {"sent": 1}}, "incoming": {}, "accounting": {}}
+REPORT = Report(
+    node="a",
+    waiting_for=("a.o -> b.x",),
+    sim_time=1,
+    timeline=((0.0, 1.5),),
+    metrics=METRICS,
+    stack=Stack("a", "step", "  line"),
+)
+VALUES = {
+    "int": 3,
+    "float": 0.5,
+    "str": "text",
+    "bool": True,
+    "tuple[str, ...]": ("a", "b"),
+    "Mapping[str, tuple[int, ...]]": {"a": (0, 2)},
+    "Mapping[str, Mapping[str, Any]]": {"a": {"x": {"fields": ["y"]}}},
+    "Metrics": METRICS,
+}
+RICH = [
+    REPORT,
+    Hooks("a", (HookDeclaration(HookKind.TICK, (InputSpec("x", True),), ("o",)),), ("end",)),
+    NodeStatus("a", 1, 2.0, LiveCounters(1.0, METRICS, {"c": (2, (7, 8))}, {"c": (1, 9)}), {}),
+    Ended(0, "why", {"a": REPORT}, 2.0),
+    Finalising("a", None),
+]
+
+
+def plain(kind: type[Message]) -> Message:
+    """A message with a value in each field that needs one."""
+    values = {}
+    for each in fields(kind):  # type: ignore[arg-type]
+        declared = str(each.type)
+        if each.default is MISSING and each.default_factory is MISSING:
+            empty: Any = {} if declared.startswith("Mapping") else ()
+            values[each.name] = None if "None" in declared else VALUES.get(declared, empty)
+    return kind(**values)
+
+
+@pytest.mark.parametrize("message", [*map(plain, MESSAGES), *RICH], ids=lambda m: type(m).__name__)
+def test_a_message_comes_out_as_it_went_in(message: Message) -> None:
+    line = encode(message)
+    assert line.endswith(b"\n")
+    assert line.count(b"\n") == 1
+    assert decode(line, ACCEPTED, "node 'a'") == message
+
+
+def test_half_a_character_arrives_as_its_escape() -> None:
+    line = encode(control.Failed("a", "file '\udc80'"))
+    assert decode(line, ACCEPTED, "a") == control.Failed("a", r"file '\udc80'")
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        (b"GET / HTTP/1.1", "sent what is no control message: b'GET / HTTP/1.1'"),
+        (b"[1]", "sent what is no control message"),
+        (b"7", "sent what is no control message"),
+        (b'{"node": "a"}', "sent what is no control message"),
+        (b'{"kind": "applaud"}', "sent a control message of the unknown kind 'applaud'"),
+        (b'{"kind": ["stop"]}', "sent a control message of the unknown kind ['stop']"),
+        (b'{"kind": "probe"}', "sent a wrong control message 'probe': field number is missing"),
+        (b'{"kind": "stop", "now": 1}', "wrong control message 'stop': field now is unknown"),
+        (b'{"kind": "probe", "number": true}', "'probe': field number is True, and must be int"),
+        (b'{"kind": "probe", "number": 1.5}', "'probe': field number is 1.5, and must be int"),
+        (b'{"kind": "say", "text": null}', "'say': field text is None, and must be str"),
+        (b'{"kind": "hello", "nodes": "ab"}', "'hello': field nodes is 'ab', and must be a list"),
+        (b'{"kind": "hello", "nodes": ["a", 2]}', "nodes[1] is 2, and must be str"),
+        (
+            b'{"kind": "report", "node": "a", "timeline": [[1]]}',
+            "timeline[0] is [1], and must be a list of 2",
+        ),
+        (b'{"kind": "report", "node": "a", "metrics": 3}', "metrics is 3, and must be an object"),
+        (
+            b'{"kind": "hooks", "node": "a", "hooks": [{"kind": "tock"}], "finalise": []}',
+            "hooks[0].kind is 'tock', and must be one of initialise, tick, function, finalise",
+        ),
+        (
+            b'{"kind": "drain", "last_round": {"a": [0, "1"]}}',
+            "last_round['a'][1] is '1', and must be int",
+        ),
+        (
+            b'{"kind": "ended", "exit_code": 0, "reason": "", "reports": {"a": {}},'
+            b' "running_s": null}',
+            "field reports['a'].node is missing",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_sender_kind_and_field(
+    line: bytes, complaint: str
+) -> None:
+    with pytest.raises(ControlError) as caught:
+        decode(line, ACCEPTED, "node 'a'")
+    assert str(caught.value).startswith("node 'a' sent ")
+    assert complaint in str(caught.value)
+
+
+def test_a_message_is_accepted_only_by_those_for_whom_it_is() -> None:
+    with pytest.raises(ControlError, match="unknown kind 'stop'"):
+        decode(encode(control.Stop()), {kind_of(each): each for each in FROM_NODES}, "node 'a'")
+
+
+def test_a_probe_is_a_report() -> None:
+    probed = plain(Probed)
+    assert isinstance(probed, Report)
+    assert not isinstance(REPORT, Probed)
+
+
+def test_every_class_of_messages_has_a_sender() -> None:
+    classes = [each for each in vars(control).values() if isinstance(each, type)]
+    assert {each for each in classes if issubclass(each, Message)} == {Message, *MESSAGES}
+
+
+def table(kinds: Any) -> str:
+    """What the page shows of them."""
+    rows = ["| kind | fields | meaning |", "| --- | --- | --- |"]
+    for kind in kinds:
+        names = ", ".join(f"`{each.name}`" for each in fields(kind))
+        meaning = str(kind.__doc__).partition("\n\n")[0].replace("``", "`").replace("\n   ", "")
+        rows.append(f"| `{kind_of(kind)}` | {names} | {meaning} |")
+    return "\n".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("title", "kinds"),
+    [
+        ("From a node process", FROM_NODES),
+        ("To node processes", TO_NODES),
+        ("From an observer", FROM_OBSERVERS),
+        ("To observers", TO_OBSERVERS),
+    ],
+)
+def test_the_page_shows_the_messages_as_they_are(title: str, kinds: Any) -> None:
+    text = PAGE.read_text("utf-8")
+    section = re.split(rf"^### {title}$", text, flags=re.MULTILINE)[1]
+    assert section.split("\n### ")[0].split("\n## ")[0].strip() == table(kinds)
