@@ -23,6 +23,12 @@ OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 _RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
 
 
+def _back_ends() -> Iterable[str]:
+    from neuros.backends.registered import AUTO, BACK_ENDS
+
+    return [AUTO, *BACK_ENDS]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions:
     """Changes to a project, for every command that reads one."""
@@ -96,6 +102,7 @@ class Request(ProjectOptions):
         "--backend",
         default="auto",
         variable="NEUROS_BACKEND",
+        suggestions=_back_ends,
         metavar="NAME",
         page="back_ends.md",
         help="run nodes on this back end: each in a container (docker), each in a process"
