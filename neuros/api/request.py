@@ -190,7 +190,9 @@ class Request(ProjectOptions):
         help="show how far the run has come: in a terminal a line that stays, elsewhere a line"
         " every 10 s",
     )
-    verbose: bool = option("-v", "--verbose", default=False, help="show DEBUG records, too")
+    verbose: bool = option(
+        "-v", "--verbose", default=False, is_recorded=False, help="show DEBUG records, too"
+    )
 
     def __post_init__(self) -> None:
         for each in options_of(self):
