@@ -190,8 +190,8 @@ def takes(
 
 
 def _argument_help(option: Option) -> str:
-    flag = f" (``{option.flags[-1]}``)" if option.flags else ""
-    return f"    {option.name}{flag}: {option.full_help}."
+    flag = f"``{option.flags[-1]}``: " if option.flags else ""
+    return f"    {option.name}: {flag}{option.full_help}."
 
 
 def add_options(

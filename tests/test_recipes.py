@@ -100,7 +100,7 @@ def test_a_launch_flag_touches_two_files(checkout: Checkout) -> None:
         "from neuros.options import recorded_values\n"
         "argument = inspect.signature(neuros.Project.run).parameters['quiet']\n"
         "assert (argument.annotation, argument.default) == ('bool', False)\n"
-        "assert 'quiet (``--quiet``): print nothing of the plan.' in neuros.Project.run.__doc__\n"
+        "assert 'quiet: ``--quiet``: print nothing of the plan.' in neuros.Project.run.__doc__\n"
         "assert recorded_values(Request(quiet=True))['quiet'] is True\n"
         f"sys.path.append({str(ROOT / 'docs')!r})\n"
         "from site_parts.command_line import add_option_tables\n"

@@ -62,7 +62,7 @@ def test_a_run_takes_the_options_of_launch_and_records_them(tmp_path: Path) -> N
     told = {"backend": "in-process", "placement": False, "duration": "9", "seed": 3, "nodes": []}
     assert asked == asked | told
     assert not {"output", "verbose", "show", "check", "progress"} & {*asked}
-    assert "duration (``--duration``): end the run" in (neuros.Project.run.__doc__ or "")
+    assert "duration: ``--duration``: end the run" in (neuros.Project.run.__doc__ or "")
 
 
 def test_an_argument_that_there_is_none_is_refused_by_name(tmp_path: Path) -> None:
