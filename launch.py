@@ -1,4 +1,5 @@
 #!/usr/bin/env -S python3 -S
+# PYTHON_ARGCOMPLETE_OK
 """Run a project: ./launch.py PROJECT (the same as: neuros launch PROJECT)
 
 Finds the .venv beside this file by itself. Any Python reads this file: the one that was called

@@ -7,13 +7,18 @@ supervisor use it (layer 5), the command line picks it (layer 6).
 
 from __future__ import annotations
 
+import sys
+from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from neuros.project.model import Connection, Node, NodeFile, Port
+from neuros.errors import EnvironmentFault
+from neuros.options import Option
+from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
 
 Packet: TypeAlias = Any
 """One ROS message."""
@@ -374,12 +379,201 @@ class RunningNode(Protocol):
 
 
 class Launcher(Protocol):
-    """A back end: knows how to start nodes, and nothing of what they do."""
+    """Starts nodes, and knows nothing of what they do."""
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningNode]:
-        """Start all nodes; ``environment`` is added to the environment of each."""
+        """Start all nodes or none; ``environment`` is added to the environment of each.
+
+        Raises ``EnvironmentFault``.
+        """
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
         """One line per thing that :meth:`start` would start."""
+
+
+class Reaper(Protocol):
+    """Ends what is left of a run when its launcher has ended, be it by SIGKILL."""
+
+    def watch(self, pid: int) -> None:
+        """Announce a process that leads a session of its own."""
+
+    def remove_later(self, path: Path) -> None:
+        """Have a file, socket or folder removed once all processes of the run are gone."""
+
+    def clean_with(self, module: str, argument: str) -> None:
+        """Have a module clean up what is no process of this machine: containers, jobs.
+
+        The module needs the standard library only, and has two functions. ``resume(argument,
+        run_id)`` lets paused nodes go on, so that they can end. ``remove(argument, run_id,
+        settle_s=..., give_up_s=...)`` ends and removes what is left, until there was nothing for
+        ``settle_s`` seconds (a killed launcher may just have asked for more), or after
+        ``give_up_s``.
+        """
+
+
+@dataclass(frozen=True)
+class NodeProgram:
+    """The program that runs nodes, and what a run gives it.
+
+    Attributes:
+        options: of the program, as ``--debug``.
+        cores: the cores of nodes that ask for some, by name of the node.
+        pythons: the Python of nodes that do not run on this one, by name of the node.
+        reaper: is told of all that is started; ``None`` where nothing is.
+        environ: the environment of the launcher.
+        program: the command without its options; paths of ``node.json`` files follow these.
+    """
+
+    options: Sequence[str] = ()
+    cores: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    pythons: Mapping[str, Path] = field(default_factory=dict)
+    reaper: Reaper | None = None
+    environ: Mapping[str, str] = field(default_factory=dict)
+    program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "node")
+
+    def command(self, python: Sequence[str] = ()) -> tuple[str, ...]:
+        """The command on this Python, or on the one that ``python`` starts."""
+        return (*(python or self.program[:1]), *self.program[1:], *self.options)
+
+
+Notice: TypeAlias = tuple[str, str]
+"""A line for the user: severity (``INFO``, ``WARN``) and text."""
+
+
+class Deployment(ABC):
+    """A back end made ready for some nodes of a project.
+
+    The methods have defaults for nodes that see the files of this machine as the launcher does.
+    """
+
+    notices: Sequence[Notice] = ()
+
+    @abstractmethod
+    def launcher(self, program: NodeProgram) -> Launcher:
+        """What starts the nodes."""
+
+    def as_seen(self, file: NodeFile) -> NodeFile:
+        """A node with all paths as it sees them itself."""
+        return file
+
+    def as_here(self, text: str, folders: Folders) -> str:
+        """What a node has said, with the names that its paths have on this machine."""
+        return text
+
+    def control_listener(self, run_folder: Path) -> ControlListener | None:
+        """Where node processes connect to the supervisor; ``None``: a socket in the run folder."""
+        return None
+
+    def logs(self, run_folder: Path) -> Mapping[str, Path]:
+        """Logs besides those of the nodes, by what is shown of their origin."""
+        return {}
+
+    def record(self) -> Mapping[str, Any]:
+        """What ``run.json`` is to have of it, ready for JSON; asked for when the run is over."""
+        return {}
+
+
+class State(Enum):
+    """How good a finding is."""
+
+    GOOD = "ok"
+    ABSENT = "-"
+    BAD = "PROBLEM"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of ``neuros doctor``.
+
+    Attributes:
+        subject: what was looked at, "Python".
+        text: what was found.
+        remedy: what to do about it, where there is something to do.
+    """
+
+    state: State
+    subject: str
+    text: str
+    remedy: str = ""
+
+    @classmethod
+    def good(cls, subject: str, text: str) -> Finding:
+        """It is as it should be."""
+        return cls(State.GOOD, subject, text)
+
+    @classmethod
+    def absent(cls, subject: str, text: str, remedy: str = "") -> Finding:
+        """It is not there, and projects run without it."""
+        return cls(State.ABSENT, subject, text, remedy)
+
+    @classmethod
+    def bad(cls, subject: str, text: str, remedy: str = "") -> Finding:
+        """Projects do not run, or not well, because of it."""
+        return cls(State.BAD, subject, text, remedy)
+
+    def __str__(self) -> str:
+        remedy = f": {self.remedy}" if self.remedy else ""
+        return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
+
+
+class BackEnd(ABC):
+    """Where nodes run. Registered as an entry point of the group ``neuros.backends``.
+
+    Attributes:
+        name: in ``--backend``; that of the entry point.
+        place: where it runs a node, as in "each node in *a container*".
+        rank: ``--backend auto`` takes the usable one with the highest; ``None``: never this one.
+        options: of ``neuros launch`` with this back end.
+        is_one_process: whether all nodes share a process. They take turns then, and hand packets
+            over in memory, where ROS tools and other launchers do not see them.
+        has_own_pythons: whether nodes run on Pythons that it brings (those of images), and not on
+            those of this machine.
+    """
+
+    name: str
+    place: str
+    rank: int | None = None
+    options: Sequence[Option] = ()
+    is_one_process = False
+    has_own_pythons = False
+
+    @abstractmethod
+    def prepare(
+        self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
+    ) -> Deployment:
+        """Find what the nodes need to run here.
+
+        Args:
+            options: the value of each of :attr:`options`, by name.
+
+        Raises:
+            EnvironmentFault: with all that is missing, and what to do.
+        """
+
+    def why_not(self, fault: EnvironmentFault) -> str:
+        """Why ``auto`` does not take it, in one line, for what :meth:`prepare` has raised."""
+        reason, *others = str(fault).splitlines()
+        return f"{reason} (and {len(others)} more)" if others else reason
+
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        """What ``neuros doctor`` finds of what it needs."""
+        return ()
+
+    def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
+        """The inverse of :meth:`Deployment.as_seen`, for a run that is over.
+
+        Args:
+            folders: those of this machine.
+            messages: the folder with built message packages of this machine.
+        """
+        return file
+
+    def place_in(self, record: Mapping[str, Any], node: str) -> str:
+        """Where a node of a run that is over has run, as :attr:`place`, by its ``run.json``."""
+        return self.place
+
+    def provenance(self, record: Mapping[str, Any]) -> Mapping[str, str]:
+        """What reports show of :meth:`Deployment.record`, by heading."""
+        return {}

@@ -17,7 +17,7 @@ from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
-from neuros.ports import ControlListener
+from neuros.ports import ControlListener, NodeProgram
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
 HOST = [sys.executable, "-S", str(Path(__file__).parent / "launcher" / "stand_in_host.py")]
@@ -76,9 +76,10 @@ class Run:
     ) -> Outcome:
         """Run nodes that do as the text under their names says, to the end."""
         files = [self.file(name, act, connections) for name, act in acts.items()]
+        kind = InProcessLauncher if in_process else ProcessLauncher
         supervisor = Supervisor(
             files,
-            _Noting(InProcessLauncher(HOST) if in_process else ProcessLauncher(HOST), self.hosts),
+            _Noting(kind(NodeProgram(program=HOST)), self.hosts),
             {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
             self.folder,
             self.output,

@@ -14,10 +14,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+from site_parts.command_line import add_option_tables
+
 from neuros.api.loading import load_with_messages
+from neuros.api.request import LaunchOptions
 from neuros.cli.main import parser
 from neuros.errors import NeurosError
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
+from neuros.options import Option
+from neuros.options import options_of as declared_options
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -155,7 +161,9 @@ def test_every_option_exists() -> None:
 
 
 def test_every_option_is_described() -> None:
-    text = (ROOT / "docs" / "command_line.md").read_text("utf-8")
+    source = [(ROOT / "docs" / "command_line.md").read_text("utf-8")]
+    add_option_tables(None, "docs/command_line", source)
+    (text,) = source
     wanted = {
         option
         for command in ("launch", "validate", "graph")
@@ -163,6 +171,13 @@ def test_every_option_is_described() -> None:
         if option.startswith("--") and option != "--help"
     }
     assert not {option for option in wanted if f"{option}" not in text}
+
+
+@pytest.mark.parametrize("option", declared_options(LaunchOptions), ids=lambda option: option.name)
+def test_the_page_that_says_more_on_an_option_exists(option: Option) -> None:
+    file, _, anchor = option.page.partition("#")
+    assert (ROOT / "docs" / file).exists()
+    assert not anchor or anchor in anchors(ROOT / "docs" / file)
 
 
 def files_named_in(value: Any, keys: tuple[str, ...] = ("plugin", "script")) -> Iterator[str]:

@@ -6,13 +6,14 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from site_parts import code, contents, diagrams, links, pages, wrapping
+from site_parts import code, command_line, contents, diagrams, links, pages, wrapping
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Called by Sphinx."""
     app.connect("builder-inited", pages.write)
     app.connect("source-read", contents.add_toctrees)
+    app.connect("source-read", command_line.add_option_tables)
     app.connect("autodoc-process-docstring", code.leave_out_aliases)
     app.connect("doctree-read", links.lead_to_pages)
     app.connect("doctree-read", wrapping.keep_words_whole)

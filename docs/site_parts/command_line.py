@@ -1,12 +1,23 @@
-"""The options of all commands, as the parser knows them."""
+"""The options of all commands, and tables of those that a page asks for."""
 
 from __future__ import annotations
 
 import argparse
+import posixpath
+import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from site_parts.words import as_text, cell
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+    from neuros.options import Option
+
+_TABLE = re.compile(r"<!-- options of (\w+) -->")
 
 
 def page() -> str:
@@ -50,3 +61,35 @@ def _row(of: argparse.ArgumentParser, action: argparse.Action) -> str:
     name = formatter._format_action_invocation(action)
     text = formatter._expand_help(action) if action.help else ""
     return f"| `{cell(name)}` | {cell(as_text(text))} |"
+
+
+def add_option_tables(app: Sphinx | None, page: str, source: list[str]) -> None:
+    """Put a table into a page where it has ``<!-- options of LaunchOptions -->``."""
+    source[0] = _TABLE.sub(lambda found: _table(found[1], page), source[0])
+
+
+def _table(name: str, page: str) -> str:
+    """The options that a dataclass of :mod:`neuros.api.request` declares."""
+    from neuros.api import request
+    from neuros.options import options_of
+
+    declared_in = (request.Request, request.SweepOptions)
+    in_python = {each.name for cls in declared_in for each in options_of(cls)}
+    shown = [each for each in options_of(getattr(request, name)) if each.flags]
+    rows = [_option_row(each, page, in_python) for each in shown]
+    head = ["| option | in Python | meaning | default |", "| --- | --- | --- | --- |"]
+    return "\n".join([*head, *rows])
+
+
+def _option_row(option: Option, page: str, in_python: Collection[str]) -> str:
+    value = f" {option.value_text}" if option.has_value else ""
+    flags = ", ".join(f"`{flag}{value}`" for flag in option.all_flags)
+    meaning = as_text(option.help.replace("%%", "%"))
+    meaning += "; repeatable" if option.is_repeatable else ""
+    if option.page:
+        file, _, anchor = option.page.partition("#")
+        target = posixpath.relpath(f"docs/{file}", str(Path(page).parent))
+        meaning += f" ([more]({target}{'#' * bool(anchor)}{anchor}))"
+    argument = f"`{option.name}`" if option.name in in_python else ""
+    cells = (flags, argument, cell(meaning), cell(as_text(option.default_text)))
+    return f"| {' | '.join(cells)} |"

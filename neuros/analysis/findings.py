@@ -247,8 +247,8 @@ def findings_of(run: PastRun) -> Findings:
         return Findings(
             "What limits this run cannot be told: no node has reported how it spent its time."
         )
-    if run.is_in_process:
-        return _in_process(run, budgets, run.running_s)
+    if run.is_one_process:
+        return _one_process(run, budgets, run.running_s)
     found = find_bottleneck(budgets, run.ends, run.running_s, run.time_owner)
     assert found is not None
     reasons = [_reason(step, budgets[step.node]) for step in found.steps]
@@ -362,7 +362,7 @@ def _trial(gain: Gain, run: PastRun) -> str:
     return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
 
 
-def _in_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
+def _one_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
     """One thread runs all hooks: none overlap, so that no node holds up another."""
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in budgets.items()), key=lambda x: x[1][1]

@@ -23,6 +23,7 @@ from neuros.analysis.charts import (
 )
 from neuros.analysis.findings import Findings
 from neuros.analysis.run_record import PastRun
+from neuros.backends.registered import back_end_of
 
 _PAGE = Template("""\
 <!DOCTYPE html>
@@ -158,7 +159,7 @@ def _provenance(run: PastRun) -> str:
     record = run.record
     machine, versions = record.get("machine") or {}, record.get("versions") or {}
     git = record.get("git") or {}
-    images = ((record.get("docker") or {}).get("images") or {}).values()
+    back_end = back_end_of(record)
     started = record.get("started")
     when = datetime.fromtimestamp(started, timezone.utc) if started else None
     cells = {
@@ -169,7 +170,7 @@ def _provenance(run: PastRun) -> str:
         "machine": machine and _machine(machine),
         "NeuROS, Python": versions and f"{versions.get('neuros')}, {versions.get('python')}",
         "git": git and f"{git.get('commit')}{' (changed)' if git.get('is_dirty') else ''}",
-        "images": ", ".join(image["name"] for image in images),
+        **(back_end.provenance(record) if back_end else {}),
         "seeds": ", ".join(
             f"{node}: {name} {value}"
             for node, found in (record.get("seeds") or {}).items()

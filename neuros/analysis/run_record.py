@@ -13,17 +13,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from neuros.backends.registered import ran_in_one_process
 from neuros.control import Report
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import UsageError
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
+from neuros.recording.run_file import FORMAT, RUN_FILE, read_run_file
 
 if TYPE_CHECKING:
     from neuros.analysis.packets import Numbers, Packets, Trace
-
-FORMAT = 2
-"""Of ``run.json``; grows when a reader of the old one could no longer read the new one."""
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 _STATES = ("executing", "waiting", "blocked", "idle")
@@ -235,9 +234,9 @@ class PastRun:
         return found
 
     @property
-    def is_in_process(self) -> bool:
+    def is_one_process(self) -> bool:
         """Whether all nodes took turns in one thread."""
-        return bool(self.record.get("backend") == "in-process")
+        return ran_in_one_process(self.record)
 
     @property
     def time_owner(self) -> str | None:
@@ -302,26 +301,13 @@ def open_run(folder: Path) -> PastRun:
     Raises:
         UsageError: if it is none, the run has not ended, or another version of NeuROS wrote it.
     """
-    file = folder / "run.json"
+    run = PastRun(folder, read_run_file(folder))
     try:
-        record = _json_object(file)
-    except FileNotFoundError as error:
-        if any(folder.glob("*/node.json")):
-            why = "its run goes on, or its launcher was killed"
-        else:
-            why = "it is no folder that a run has left behind"
-        raise UsageError(f"{folder} has no run.json: {why}") from error
-    found = record.get("format", 1)
-    if found != FORMAT:
-        raise UsageError(
-            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
-            " version that the run was made with, or run the project again"
-        )
-    run = PastRun(folder, record)
-    try:
-        _ = record["connections"], run.ends
+        _ = run.record["connections"], run.ends
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UsageError(f"{file} is broken (its connections cannot be read: {error!r})") from error
+        raise UsageError(
+            f"{folder / RUN_FILE} is broken (its connections cannot be read: {error!r})"
+        ) from error
     return run
 
 
@@ -329,7 +315,7 @@ def open_for_review(folder: Path) -> PastRun:
     """Read what there is in a run folder.
 
     Raises:
-        UsageError: if no run has left it behind, the run goes on, or a newer version wrote it.
+        UsageError: if no run has left it behind, the run goes on, or another version wrote it.
     """
     try:
         record, missing = _read_record(folder)
@@ -341,23 +327,9 @@ def open_for_review(folder: Path) -> PastRun:
 
 
 def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    file = folder / "run.json"
-    try:
-        record = _json_object(file)
-    except FileNotFoundError:
+    if not (folder / RUN_FILE).exists():
         return _from_project(folder)
-    found = record.get("format", 1)
-    if not isinstance(found, int) or found > FORMAT:
-        raise UsageError(
-            f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
-            " version that the run was made with"
-        )
-    if found == FORMAT:
-        return record, []
-    for index, each in enumerate(record.get("connections", ())):
-        each.setdefault("index", index)
-    why = f"run.json has format {found}: an older version of NeuROS wrote it, and kept less"
-    return record, [why]
+    return read_run_file(folder), []
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:

@@ -18,8 +18,8 @@ from neuros.api.console import Console
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
-from neuros.api.request import Request
-from neuros.api.run_folder import make_run_folder, write_node_files, write_record
+from neuros.api.run_folder import make_run_folder, write_node_files
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.progress import Progress
@@ -30,7 +30,9 @@ from neuros.errors import EnvironmentFault
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
+from neuros.options import recorded_values
 from neuros.recording.recording_plan import RecordingPlan
+from neuros.recording.run_file import RUN_FILE, write_run_file
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
@@ -58,7 +60,6 @@ class Execution:
     """One run of a plan.
 
     Args:
-        request: what it was planned from.
         stream: where to show what goes on, ``None``: nowhere.
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here whenever a signal does, or a wish.
@@ -73,7 +74,6 @@ class Execution:
     def __init__(
         self,
         plan: Plan,
-        request: Request,
         stream: TextIO | None,
         signals: list[int],
         waker: socket.socket,
@@ -81,37 +81,35 @@ class Execution:
         views: Views | None = None,
     ) -> None:
         self._plan = plan
-        self._monitors_load = request.monitors_load
         self._signals = signals
         self._waker = waker
         self._wishes = wishes
         self._views = views
         self._run_id = os.urandom(8).hex()
-        check_observation(monitors_load=request.monitors_load)
-        self._recording_plan = recording_of(plan, request, os.environ)
-        self._domain = run_domain(plan, request, self._recording_plan)
+        check_observation(monitors_load=plan.request.monitor_system_load)
+        self._recording_plan = recording_of(plan, os.environ)
+        self._domain = run_domain(plan, self._recording_plan)
         try:
-            self.folder = make_run_folder(request.output, plan.project.name)
+            self.folder = make_run_folder(plan.request.output, plan.project.name)
             self._files = write_node_files(plan, self.folder)
         except BaseException:
             self._domain.release()
             raise
-        self._listener = plan.back_end.control_listener(self.folder)
+        self._listener = plan.deployment.control_listener(self.folder) or UnixListener(self.folder)
         self._logs = self._log_files()
         self._console = Console(
             stream,
             self._logs,
             lambda: bool(signals),
             self._as_here,
-            shows_progress=request.shows_progress,
+            shows_progress=plan.request.progress,
         )
 
     def _log_files(self) -> dict[str, Path]:
         """The log files, by what is to be shown of their origin."""
         names = [file.node.name for file in self._files]
         logs = {name: self.folder / name / "node.log" for name in names}
-        if self._plan.backend == "in-process":
-            logs["host"] = self.folder / "host.log"
+        logs |= self._plan.deployment.logs(self.folder)
         if self._recording_plan is not None:
             logs["recorder"] = log_of(self.folder)
         return logs
@@ -143,12 +141,12 @@ class Execution:
         recording = None
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
-            for severity, notice in self._plan.back_end.notices:
+            for severity, notice in self._plan.notices:
                 self._console.log(severity, notice)
             recording = self._recording(reaper)
             supervisor = self._supervisor(reaper)
             outcome = supervisor.outcome
-            duration = self._plan.duration
+            duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             if self._views is not None:
                 shown = Shown(self._run_id, self.folder, self._beside(), self._logs)
@@ -174,11 +172,13 @@ class Execution:
             wall_s = outcome.ended_s - (outcome.started_s or started_s)
             record = run_record(self._plan.project, self._files, outcome, wall_s, self.folder)
             record |= {
-                "backend": self._plan.backend,
-                **self._plan.back_end.record(),
+                "backend": self._plan.back_end.name,
+                "is_one_process": self._plan.back_end.is_one_process,
+                **self._plan.deployment.record(),
                 "domain_id": self._domain.id,
                 "namespace": self._plan.project.names.namespace,
                 "started": started,
+                "options": recorded_values(self._plan.request),
                 **observed,
             }
             if recording is not None and recorded is not None:
@@ -229,43 +229,43 @@ class Execution:
     def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
         """Write ``run.json``; where there is no room for it, among the temporary files."""
         try:
-            write_record(record, self.folder)
+            write_run_file(record, self.folder)
         except OSError as error:
             spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
-            problem = f"{self.folder / 'run.json'} cannot be written ({error.strerror})"
+            problem = f"{self.folder / RUN_FILE} cannot be written ({error.strerror})"
             outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
             record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             with contextlib.suppress(OSError):
                 spare.mkdir()
-                write_record(record, spare)
+                write_run_file(record, spare)
 
     def _observation(self) -> Observation:
         names = [file.node.name for file in self._files]
-        is_one_process = self._plan.backend == "in-process"
         return Observation(
             self._run_id,
             self.folder,
             self._plan.project,
             names,
-            monitors_load=self._monitors_load,
-            is_one_process=is_one_process,
+            monitors_load=self._plan.request.monitor_system_load,
+            is_one_process=self._plan.back_end.is_one_process,
         )
 
     def _as_here(self, text: str) -> str:
         """With the names that paths have on this machine."""
-        return self._plan.back_end.as_here(text, self._files[0].folders)
+        return self._plan.deployment.as_here(text, self._files[0].folders)
 
     def _session(self, started: float) -> Session:
         """What `neuros ps` shows of it."""
         return Session(
             self._run_id,
             self._plan.project.name,
-            self._plan.backend,
+            self._plan.back_end.name,
             tuple(file.node.name for file in self._files),
             str(self.folder),
             started,
             this_process(),
             self._plan.project.names.namespace,
+            self._plan.back_end.is_one_process,
             self._listener.address,
         )
 
@@ -279,7 +279,7 @@ class Execution:
             self._signals,
             listener=self._listener,
             wishes=self._wishes,
-            duration_s=self._plan.duration.wall_s,
+            duration_s=self._plan.request.end.wall_s,
             peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
             waker=self._waker,
         )
@@ -311,7 +311,7 @@ def _without_notebook(environ: Mapping[str, str]) -> dict[str, str]:
     return {"MPLBACKEND": ""} if is_inline else {}
 
 
-def run_domain(plan: Plan, request: Request, recording: RecordingPlan | None) -> DomainLock:
+def run_domain(plan: Plan, recording: RecordingPlan | None) -> DomainLock:
     """The ROS domain of a run; released by closing it.
 
     Raises:
@@ -319,4 +319,4 @@ def run_domain(plan: Plan, request: Request, recording: RecordingPlan | None) ->
         EnvironmentFault: if none is free.
     """
     is_known = plan.needs_known_domain or bool(recording and recording.wanted)
-    return choose_domain(request.domain_id, os.environ, is_known)
+    return choose_domain(plan.request.domain_id, os.environ, is_known)

@@ -15,7 +15,6 @@ from typing import Any, TextIO
 
 from neuros.api.execution import Execution
 from neuros.api.plan import Plan
-from neuros.api.request import Request
 from neuros.api.run import Run
 
 _AT_EXIT_S = 20.0
@@ -38,7 +37,7 @@ class LiveRun:
         UsageError, EnvironmentFault: if it cannot begin.
     """
 
-    def __init__(self, plan: Plan, request: Request, *, is_shown: bool) -> None:
+    def __init__(self, plan: Plan, *, is_shown: bool) -> None:
         self._signals: list[int] = []
         self._wishes: list[str] = []
         self._reader, self._writer = socket.socketpair()
@@ -50,7 +49,6 @@ class LiveRun:
         try:
             self._execution = Execution(
                 plan,
-                request,
                 _shown_on() if is_shown else None,
                 self._signals,
                 self._reader,

@@ -11,22 +11,21 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
-from neuros.api.back_end import BackEnd, choose_back_end
-from neuros.api.request import Duration, Request
+from neuros.api.request import Request
 from neuros.backends.environments.pythons import Pythons, require_one_python
 from neuros.backends.node_command import without_mark
 from neuros.backends.placement import place, usable_cores
 from neuros.backends.reaper import Reaper
+from neuros.backends.registered import AUTO, Chosen, choose
 from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
-from neuros.ports import Launcher
-from neuros.project.model import Folders, NodeFile, Project
+from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
+from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.recording.recording_plan import Request as RecordingRequest
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,
@@ -104,17 +103,13 @@ def _address(host: str) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and for how long."""
+    """A project, which of its nodes to start, where, and how."""
 
     project: Project
     names: tuple[str, ...]
-    back_end: BackEnd
-    duration: Duration
-    is_verbose: bool
-    is_placed: bool = True
+    chosen: Chosen
+    request: Request
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
-    has_digests: bool = False
-    recording: RecordingRequest | None = None
     network: Network = THIS_MACHINE
     messages: Messages | None = None
 
@@ -124,9 +119,24 @@ class Plan:
         return tuple(node.name for node in self.project.nodes if node.name not in self.names)
 
     @property
-    def backend(self) -> str:
-        """The name of the back end."""
-        return self.back_end.name
+    def nodes(self) -> list[Node]:
+        """The nodes that are to be started."""
+        return [self.project.node(name) for name in self.names]
+
+    @property
+    def back_end(self) -> BackEnd:
+        """Where they run."""
+        return self.chosen.back_end
+
+    @property
+    def deployment(self) -> Deployment:
+        """The back end made ready for them."""
+        return self.chosen.deployment
+
+    @property
+    def notices(self) -> list[Notice]:
+        """What the user should know of the choice."""
+        return [*self.chosen.notices, *self.deployment.notices]
 
     @property
     def is_partial(self) -> bool:
@@ -150,18 +160,23 @@ class Plan:
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; ``reaper`` hears of all it starts."""
-        nodes = [self.project.node(name) for name in self.names]
-        options: list[str] = []
-        if self.duration.sim_s is not None:
-            options += ["--duration-sim", repr(self.duration.sim_s)]
-        if self.is_verbose:
+        options = ["--in-memory"] if self.back_end.is_one_process else []
+        if self.request.end.sim_s is not None:
+            options += ["--duration-sim", repr(self.request.end.sim_s)]
+        if self.request.verbose:
             options.append("--debug")
-        if self.has_digests and self.backend == "in-process":  # elsewhere they are always kept
+        if self.request.digests and self.back_end.is_one_process:  # elsewhere always kept
             options.append("--digests")
-        if self.recording is not None:
+        if self.request.recording is not None:
             options.append("--record")
-        return self.back_end.launcher(
-            options, place(nodes) if self.is_placed else {}, self.pythons.paths, reaper
+        return self.deployment.launcher(
+            NodeProgram(
+                options,
+                place(self.nodes) if self.request.placement else {},
+                self.pythons.paths,
+                reaper,
+                as_asked(os.environ),
+            )
         )
 
 
@@ -178,28 +193,19 @@ def make_plan(
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
     """
     network = chosen_network(request.network, request.peers)
-    names = _chosen_names(project, request.nodes, request.backend)
-    back_end = choose_back_end(request.backend, project, names)
+    names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
-    is_process = back_end.name == "process"
-    pythons = Pythons.choose(nodes if is_process else [], project.folder, os.environ)
-    plan = Plan(
-        project,
-        names,
-        back_end,
-        request.duration,
-        request.is_verbose,
-        request.is_placed,
-        pythons,
-        has_digests=request.has_digests,
-        recording=request.recording,
-        network=network,
-        messages=messages,
-    )
-    if back_end.name == "in-process" and network.is_wide and plan.is_partial:
+    chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
+    back_end = chosen.back_end
+    if back_end.is_one_process:
+        _check_reach(project, names, back_end)
+    has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
+    pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
+    plan = Plan(project, names, chosen, request, pythons, network, messages)
+    if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
-            "--network with -n: the nodes of the in-process back end reach none elsewhere; use"
-            " --backend process"
+            f"--network with -n: the nodes of the {back_end.name} back end reach none elsewhere;"
+            " use --backend process"
         )
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
@@ -221,13 +227,13 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
             f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
             " install.py"
         )
-    if plan.is_placed:
+    if plan.request.placement:
         _check_cores(plan)
-    if plan.backend == "in-process":
-        nodes = [plan.project.node(name) for name in plan.names]
-        require_one_python(nodes, plan.project.folder, environ)
+    is_one_process = plan.back_end.is_one_process
+    if is_one_process:
+        require_one_python(plan.nodes, plan.project.folder, environ)
     is_local = plan.network.environment(environ)[RANGE_VARIABLE] == "LOCALHOST"
-    if plan.backend != "in-process" and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
+    if not is_one_process and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(
             f"{len(plan.names)} processes are more than find each other with discovery on this"
             f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or --network"
@@ -236,11 +242,11 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
 
 def _check_cores(plan: Plan) -> None:
     """A project may have been written for another machine: its cores are no mistake in it."""
-    usable, nodes = usable_cores(), [plan.project.node(name) for name in plan.names]
+    usable = usable_cores()
     problems = [
         f"{display_name(node.file)}:{line}:{column}: {pointer}: node '{node.name}' asks for"
         f" {_cores_in_words(missing)}"
-        for node in nodes
+        for node in plan.nodes
         if (missing := set(node.affinity) - usable)
         for pointer in [f"{node.pointer}/affinity"]
         for line, column in [place_of(node.file, pointer)]
@@ -257,32 +263,33 @@ def _cores_in_words(cores: Collection[int]) -> str:
     return f"core{'s' if len(cores) > 1 else ''} {', '.join(map(str, sorted(cores)))}"
 
 
-def _chosen_names(project: Project, wanted: Sequence[str], backend: str) -> tuple[str, ...]:
+def _chosen_names(project: Project, wanted: Sequence[str]) -> tuple[str, ...]:
     known = [node.name for node in project.nodes]
     for name in wanted:
         if name not in known:
             raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
-    chosen = tuple(name for name in known if not wanted or name in wanted)
-    if backend == "in-process":
-        for connection in project.connections:
-            ends = {connection.source_node, connection.destination_node}
-            if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
-                raise UsageError(
-                    f"-n leaves out one end of {connection}, which the in-process back end"
-                    " cannot reach; use --backend docker or process"
-                )
-    return chosen
+    return tuple(name for name in known if not wanted or name in wanted)
+
+
+def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -> None:
+    """Nodes that hand packets over in memory reach none elsewhere."""
+    for connection in project.connections:
+        ends = {connection.source_node, connection.destination_node}
+        if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
+            raise UsageError(
+                f"-n leaves out one end of {connection}, which the {back_end.name} back end"
+                " cannot reach; use --backend docker or process"
+            )
 
 
 def _nest_problems(plan: Plan) -> Sequence[Problem]:
-    return nest_conflicts(plan.project, plan.names) if plan.backend == "in-process" else ()
+    return nest_conflicts(plan.project, plan.names) if plan.back_end.is_one_process else ()
 
 
 def _time_problems(plan: Plan) -> Sequence[Problem]:
-    if plan.duration.sim_s is None:
+    if plan.request.end.sim_s is None:
         return ()
-    nodes = plan.project.nodes
-    owners = [node.name for node in nodes if node.owns_time and node.name in plan.names]
+    owners = [node.name for node in plan.nodes if node.owns_time]
     if len(owners) == 1:
         return ()
     return [

@@ -7,25 +7,44 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuros.api.back_end import default_back_end
 from neuros.api.live import LiveRun
 from neuros.api.loading import load_with_messages
 from neuros.api.plan import make_environments, make_plan
-from neuros.api.request import Request, parse_duration
+from neuros.api.request import Request
 from neuros.api.run import Run
 from neuros.api.validation import model_problems
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
+from neuros.options import option, takes
 from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
-from neuros.recording.recording_plan import Request as RecordingRequest
 
 _ENVIRONMENT = "environment"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartOptions(Request):
+    """The arguments of :meth:`Project.start`."""
+
+    seed: int | None = option(
+        help="for every variable with SEED in its name in the environment of a node"
+    )
+    show: bool = option(default=False, is_recorded=False, help="print what `neuros launch` prints")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(StartOptions):
+    """The arguments of :meth:`Project.run`."""
+
+    check: bool = option(
+        default=False, is_recorded=False, help="raise RunError unless the run ends normally"
+    )
 
 
 class Project:
@@ -103,7 +122,7 @@ class Project:
             ProjectError: with every problem there is.
             UsageError: if there is a seed, and no node takes one.
         """
-        self._load_for_run(settings, seed)
+        self._load_for_run(StartOptions(set=settings, seed=seed))
 
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""
@@ -127,41 +146,11 @@ class Project:
             raise ValueError(f"{form!r} is neither 'text' nor 'mermaid'")
         return drawn[form](self._loaded.project)
 
-    def run(
-        self,
-        *,
-        backend: str | None = None,
-        duration: float | str | None = None,
-        set: Mapping[str, Any] | None = None,
-        seed: int | None = None,
-        record: bool | Sequence[str] = False,
-        output: str | os.PathLike[str] | None = None,
-        nodes: Sequence[str] = (),
-        domain_id: int | None = None,
-        monitor_system_load: bool = False,
-        digests: bool = False,
-        show: bool = False,
-        check: bool = False,
-    ) -> Run:
+    @takes(RunOptions)
+    def run(self, options: RunOptions) -> Run:
         """Run it to its end; works in a notebook, in any thread, and several times at once.
 
         The files are read again. ``KeyboardInterrupt`` ends the run in order and then goes on.
-
-        Args:
-            backend: ``docker``, ``process``, ``in-process`` or ``auto``; ``None``: the environment
-                variable ``NEUROS_BACKEND``, else ``auto``.
-            duration: seconds from the first hook to a drained end; ``"30sim"``: simulated ones;
-                ``None``: until a node ends it.
-            set: values in the place of those in the files, besides :attr:`settings`.
-            seed: for every variable with SEED in its name in the ``environment`` of a node.
-            record: ``True``: every packet; or names of topics, outputs and connections.
-            output: the run folder, new or empty (else ``runs/<project>/<utc time>``).
-            nodes: start only these.
-            domain_id: the ROS domain.
-            monitor_system_load: write ``system_load.csv``.
-            digests: keep digests of packets with ``in-process``, too, at any cost.
-            show: print what ``neuros launch`` prints.
-            check: raise ``RunError`` unless it ends normally.
 
         Raises:
             ProjectError: if it is not valid, or not with ``set``.
@@ -169,56 +158,19 @@ class Project:
             EnvironmentFault: if something is missing on this machine.
             RunError: if ``check`` is set and the run did not end normally.
         """
-        live = self._prepared(
-            set,
-            seed,
-            show=show,
-            backend=backend,
-            duration=duration,
-            record=record,
-            output=output,
-            nodes=nodes,
-            domain_id=domain_id,
-            monitor_system_load=monitor_system_load,
-            digests=digests,
-        )
+        live = self._prepared(options)
         try:
             live.begin()
             run = live.wait()
         except BaseException:  # Ctrl+C may come between the two
             live.end()
             raise
-        return run.check() if check else run
+        return run.check() if options.check else run
 
-    def start(
-        self,
-        *,
-        backend: str | None = None,
-        duration: float | str | None = None,
-        set: Mapping[str, Any] | None = None,
-        seed: int | None = None,
-        record: bool | Sequence[str] = False,
-        output: str | os.PathLike[str] | None = None,
-        nodes: Sequence[str] = (),
-        domain_id: int | None = None,
-        monitor_system_load: bool = False,
-        digests: bool = False,
-        show: bool = False,
-    ) -> LiveRun:
-        """Start it and go on: the arguments and errors of :meth:`run`."""
-        live = self._prepared(
-            set,
-            seed,
-            show=show,
-            backend=backend,
-            duration=duration,
-            record=record,
-            output=output,
-            nodes=nodes,
-            domain_id=domain_id,
-            monitor_system_load=monitor_system_load,
-            digests=digests,
-        )
+    @takes(StartOptions)
+    def start(self, options: StartOptions) -> LiveRun:
+        """Start it and go on: the errors of :meth:`run`."""
+        live = self._prepared(options)
         live.begin()
         return live
 
@@ -226,27 +178,23 @@ class Project:
         counts = f"{len(self.nodes)} nodes, {len(self.connections)} connections"
         return f"<Project {self.name}: {counts}; {self.file}>"
 
-    def _prepared(
-        self, set: Mapping[str, Any] | None, seed: int | None, *, show: bool, **options: Any
-    ) -> LiveRun:
+    def _prepared(self, options: StartOptions) -> LiveRun:
         """A run that has yet to begin."""
-        request = _request(**options)
-        project, messages = self._load_for_run(set or {}, seed)
-        plan = make_plan(project, messages, request)
+        project, messages = self._load_for_run(options)
+        plan = make_plan(project, messages, options)
         make_environments(plan.pythons, messages, sys.stderr)
-        return LiveRun(plan, request, is_shown=show)
+        return LiveRun(plan, is_shown=options.show)
 
     def _load(self) -> Loaded:
-        return load_with_messages(self._path, _override_texts(self.settings))[0]
+        return load_with_messages(self._path, override_texts(self.settings))[0]
 
-    def _load_for_run(
-        self, settings: Mapping[str, Any], seed: int | None
-    ) -> tuple[Described, Messages]:
-        texts = _override_texts({**self.settings, **settings})
-        loaded, messages = load_with_messages(self._path, texts)
-        if seed is not None:
-            seeds = _seed_texts(loaded.project, seed)
-            loaded, messages = load_with_messages(self._path, [*texts, *seeds])
+    def _load_for_run(self, options: StartOptions) -> tuple[Described, Messages]:
+        texts = [*override_texts(self.settings), *override_texts(options.set)]
+        names = (options.namespace, options.remap)
+        loaded, messages = load_with_messages(self._path, texts, *names)
+        if options.seed is not None:
+            seeds = _seed_texts(loaded.project, options.seed)
+            loaded, messages = load_with_messages(self._path, [*texts, *seeds], *names)
         for warning in loaded.warnings:
             if warning not in self._said:
                 self._said.add(warning)
@@ -254,38 +202,10 @@ class Project:
         return loaded.project, messages
 
 
-def _request(
-    *,
-    backend: str | None,
-    duration: float | str | None,
-    record: bool | Sequence[str],
-    output: str | os.PathLike[str] | None,
-    nodes: Sequence[str],
-    domain_id: int | None,
-    monitor_system_load: bool,
-    digests: bool,
-) -> Request:
-    return Request(
-        backend=backend or default_back_end(os.environ),
-        nodes=tuple(nodes),
-        duration=parse_duration(None if duration is None else str(duration)),
-        domain_id=domain_id,
-        output=None if output is None else os.fspath(output),
-        has_digests=digests,
-        monitors_load=monitor_system_load,
-        recording=_recording(record),
-    )
-
-
-def _recording(record: bool | Sequence[str]) -> RecordingRequest | None:
-    if isinstance(record, bool):
-        return RecordingRequest(everything=True) if record else None
-    names = (record,) if isinstance(record, str) else tuple(record)
-    return RecordingRequest(everything=False, topics=names) if names else None
-
-
-def _override_texts(settings: Mapping[str, Any]) -> tuple[str, ...]:
+def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
     """As the texts of ``--set``: ``{"nodes.a.environment.RATE": 0.5}``. ``None`` removes a key."""
+    if not isinstance(settings, Mapping):
+        return tuple(settings or ())
     return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
 
 

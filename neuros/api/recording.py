@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.plan import Plan
-from neuros.api.request import Request
 from neuros.api.run_folder import run_folder_path
 from neuros.backends.reaper import Reaper
 from neuros.backends.recording import Recorded, RecorderProcess
@@ -93,21 +92,22 @@ class Recording:
         return topics
 
 
-def recording_of(plan: Plan, request: Request, environ: Mapping[str, str]) -> RecordingPlan | None:
+def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None:
     """What is recorded of a run, ``None``: nothing.
 
     Raises:
         UsageError: if something is to be recorded that is not there, or not in that folder.
     """
-    if plan.recording is None:
+    wanted = plan.request.recording
+    if wanted is None:
         return None
-    run = run_folder_path(request.output, plan.project.name)
-    _check_folder(plan.recording.storage, run)
-    is_open = plan.needs_known_domain or request.domain_id is not None
+    run = run_folder_path(plan.request.output, plan.project.name)
+    _check_folder(wanted.storage, run)
+    is_open = plan.needs_known_domain or plan.request.domain_id is not None
     return plan_recording(
         plan.project,
         plan.names,
-        plan.recording,
+        wanted,
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
         custom=_custom_data(plan.project),
     )

@@ -1,12 +1,272 @@
-"""Request for a run: the options of ``neuros launch``, as Python values."""
+"""Options of ``neuros launch`` and ``neuros sweep``, which are arguments of the Python API, too.
+
+Each field declares its flag, its argument, its help, and whether ``run.json`` has its value.
+"""
 
 from __future__ import annotations
 
+import os
 import re
-from dataclasses import dataclass, field
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neuros.errors import UsageError
-from neuros.recording.recording_plan import Request as RecordingRequest
+from neuros.options import like, option, options_of, positive_number
+
+if TYPE_CHECKING:
+    from neuros.recording.recording_plan import Request as RecordingRequest
+
+OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
+
+_RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
+
+
+def _back_ends() -> Iterable[str]:
+    from neuros.backends.registered import AUTO, BACK_ENDS
+
+    return [AUTO, *BACK_ENDS]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectOptions:
+    """Changes to a project, for every command that reads one."""
+
+    set: Mapping[str, Any] | Sequence[str] | None = option(
+        "--set",
+        is_repeatable=True,
+        metavar="PATH=VALUE",
+        help="change a key of the project: nodes.NAME.KEY...=VALUE,"
+        " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE; VALUE is JSON if it parses,"
+        " else text, and always text in environment; without VALUE the key is removed",
+    )
+    namespace: str | None = option(
+        "--namespace",
+        metavar="NS",
+        default_help="the project's",
+        page="external_nodes.md#two-copies-of-a-project",
+        help="put nodes, connections and relative topics into this namespace of the ROS graph, as"
+        " in /left, so that two copies of a project share a domain; / takes the project's away",
+    )
+    remap: Sequence[str] = option(
+        "--remap",
+        is_repeatable=True,
+        metavar="FROM:=TO",
+        help="rename an external topic, or a topic or service of a plugin, as in ROS;"
+        " NODE:FROM:=TO for one node alone",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request(ProjectOptions):
+    """How to run a project.
+
+    Raises:
+        UsageError: for values that make no sense.
+    """
+
+    nodes: Sequence[str] = option(
+        "-n",
+        "--node",
+        is_repeatable=True,
+        metavar="NAME",
+        default_help="all",
+        help="start only this node; the others may run elsewhere",
+    )
+    domain_id: int | None = option(
+        "-d",
+        "--domain-id",
+        parse=int,
+        metavar="ID",
+        page="command_line.md#ros-domain",
+        default_help="ROS_DOMAIN_ID; else 0 where the project has external topics, or -n or"
+        " --network is used; else the first free one of 1 to 101",
+        help="use this ROS domain",
+    )
+    network: bool = option(
+        "--network",
+        default=False,
+        page="network.md",
+        help="let the nodes find, and be found by, those on other machines of the network, all of"
+        " which can then read and send packets; without it they see this machine only",
+    )
+    peers: str | None = option(
+        "--peers",
+        metavar="HOST,...",
+        page="network.md",
+        help="name the other machines, by address or name, where multicast does not reach them;"
+        " implies --network",
+    )
+    backend: str | None = option(
+        "--backend",
+        default="auto",
+        variable="NEUROS_BACKEND",
+        suggestions=_back_ends,
+        metavar="NAME",
+        page="back_ends.md",
+        help="run nodes on this back end: each in a container (docker), each in a process"
+        " (process), or all in one process (in-process); auto: docker where an engine has the"
+        " images, else process; other distributions may add back ends",
+    )
+    backend_options: Mapping[str, Any] | None = option(
+        page="back_ends.md",
+        help="options of the back end, by name; on the command line they are flags",
+    )
+    duration: float | str | None = option(
+        "--duration",
+        metavar="SECONDS",
+        default_help="no limit",
+        help="end the run, drained, this long after the first hook started: 30, or 30sim in"
+        " simulated time",
+    )
+    output: str | os.PathLike[str] | None = option(
+        "-o",
+        "--output",
+        metavar="DIR",
+        default_help="runs/<project>/<utc time> in the current folder",
+        is_recorded=False,
+        help="write the run into this folder, which must be new or empty",
+    )
+    placement: bool = option(
+        "--no-placement",
+        default=True,
+        page="placement.md",
+        help="ignore affinity: the kernel chooses the cores of every node",
+    )
+    monitor_system_load: bool = option(
+        "-m",
+        "--monitor-system-load",
+        default=False,
+        page="command_line.md#system-load",
+        help="write processor, memory, network and threads, of the machine and by node, to"
+        " system_load.csv in the run folder, once per second",
+    )
+    digests: bool = option(
+        "--digests",
+        default=False,
+        page="command_line.md#neuros-verify",
+        help="keep a digest of every packet for `neuros verify` in process, too, where each packet"
+        " is serialised for it; other back ends always keep them, in-process does where all"
+        " connections are lossless and it costs under 2 %% of the processor time",
+    )
+    record: bool | Sequence[str] = option(
+        "-r",
+        "--record",
+        default=False,
+        group=_RECORDING,
+        page="recording.md",
+        help="record every connection, the external topics and /clock into RUN/bag",
+    )
+    topics: Sequence[str] = option(
+        "-t",
+        "--topic",
+        is_repeatable=True,
+        metavar="NAME",
+        group=_RECORDING,
+        page="recording.md",
+        help="record this, be it a ROS topic that no node has; without -r: only this",
+    )
+    exclude: Sequence[str] = option(
+        "--exclude",
+        is_repeatable=True,
+        metavar="NAME",
+        group=_RECORDING,
+        help="do not record this",
+    )
+    storage: str = option(
+        "--storage",
+        choices=("mcap", "sqlite3"),
+        default="mcap",
+        group=_RECORDING,
+        help="write the bag in this format",
+    )
+    progress: bool | None = option(
+        "--progress",
+        is_negatable=True,
+        is_recorded=False,
+        default_help="if it is known when the run ends",
+        page="command_line.md#progress",
+        help="show how far the run has come: in a terminal a line that stays, elsewhere a line"
+        " every 10 s",
+    )
+    verbose: bool = option(
+        "-v", "--verbose", default=False, is_recorded=False, help="show DEBUG records, too"
+    )
+
+    def __post_init__(self) -> None:
+        for each in options_of(self):
+            given = getattr(self, each.name)
+            if each.is_repeatable and isinstance(given, str):
+                object.__setattr__(self, each.name, (given,))
+            elif given is None and each.variable:
+                object.__setattr__(self, each.name, each.value(None))
+        _ = self.end, self.recording  # raise what is wrong with them
+
+    @property
+    def end(self) -> Duration:
+        """When to end the run."""
+        return parse_duration(self.duration)
+
+    @property
+    def recording(self) -> RecordingRequest | None:
+        """What is recorded, ``None``: nothing."""
+        everything = self.record is True
+        named = () if isinstance(self.record, bool) else self.record
+        topics = (*((named,) if isinstance(named, str) else named), *self.topics)
+        if not (everything or topics):
+            if self.exclude or self.storage != "mcap":
+                name = "--exclude" if self.exclude else "--storage"
+                raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+            return None
+        from neuros.recording.recording_plan import Request as RecordingRequest
+
+        return RecordingRequest(everything, topics, tuple(self.exclude), self.storage)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaunchOptions(Request):
+    """Options of the command line alone, besides those of every run."""
+
+    dashboard: bool = option(
+        "--dashboard",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md",
+        help="serve a page on 127.0.0.1 that shows the run in a browser: live graph, fields over"
+        " time, images, logs, load; it can pause, step and stop the run; its address is printed",
+    )
+    dashboard_port: int | None = option(
+        "--dashboard-port",
+        parse=int,
+        metavar="PORT",
+        is_recorded=False,
+        default_help="any free one",
+        help="serve the dashboard on this port; implies --dashboard",
+    )
+    node_graph: bool = option(
+        "-g",
+        "--node-graph",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md#rqt_graph-rviz-and-rerun",
+        help="show the graph of the run: rqt_graph where it can run, else the dashboard",
+    )
+    visualisations: bool = option(
+        "-z",
+        "--visualisations",
+        default=False,
+        is_recorded=False,
+        page="dashboard.md#rqt_graph-rviz-and-rerun",
+        help="show poses, images, scans and numbers: rviz2 where it can run, else Rerun in a"
+        " browser (pip install 'neuros[rerun]')",
+    )
+    dry_run: bool = option(
+        "--dry-run",
+        default=False,
+        is_recorded=False,
+        help="print what would be started, and start nothing",
+    )
 
 
 @dataclass(frozen=True)
@@ -17,50 +277,68 @@ class Duration:
     sim_s: float | None = None
 
 
-@dataclass(frozen=True)
-class Request:
-    """How to run a project; the defaults are those of ``neuros launch``.
-
-    Attributes:
-        backend: ``auto``, ``docker``, ``process`` or ``in-process``.
-        nodes: those to start, all if empty; the others may run elsewhere.
-        duration: when to end it.
-        domain_id: the ROS domain, chosen if ``None``.
-        network, peers: how far nodes look for others, as the options of the same names.
-        output: the run folder; ``None``: ``runs/<project>/<utc time>`` in the current folder.
-        is_placed: whether nodes get the cores that they ask for.
-        has_digests: whether digests of packets are kept in process, too.
-        monitors_load: whether to write what the run takes of the machine.
-        shows_progress: whether to show how far it has come; ``None``: if its end is known.
-        recording: what is recorded, ``None``: nothing.
-        is_verbose: whether DEBUG records are logged.
-    """
-
-    backend: str = "auto"
-    nodes: tuple[str, ...] = ()
-    duration: Duration = field(default_factory=Duration)
-    domain_id: int | None = None
-    network: bool = False
-    peers: str | None = None
-    output: str | None = None
-    is_placed: bool = True
-    has_digests: bool = False
-    monitors_load: bool = False
-    shows_progress: bool | None = None
-    recording: RecordingRequest | None = None
-    is_verbose: bool = False
-
-
-def parse_duration(text: str | None) -> Duration:
+def parse_duration(given: float | str | None) -> Duration:
     """``30``, ``0.5``, or ``30sim``.
 
     Raises:
         UsageError: for anything else.
     """
-    if text is None:
+    if given is None:
         return Duration()
-    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(sim)?", text.strip())
+    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(sim)?", str(given).strip())
     if match is None or float(match[1]) <= 0:
-        raise UsageError(f"--duration {text}: give seconds, as 30, or 30sim for simulated time")
+        raise UsageError(f"--duration {given}: give seconds, as 30, or 30sim for simulated time")
     seconds = float(match[1])
     return Duration(sim_s=seconds) if match[2] else Duration(wall_s=seconds)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Options of ``neuros sweep``, which are arguments of :func:`sweep`."""
+
+    set: Mapping[str, Any] | Sequence[str] | None = option(
+        "--set",
+        is_repeatable=True,
+        metavar="PATH=VALUE,...",
+        help="set a key of the project, as for launch, to one value or several; commas in brackets"
+        " and quotes do not separate",
+    )
+    seeds: Iterable[int] = option(
+        "--seeds",
+        parse=_seeds,
+        default=(),
+        metavar="SEED,...",
+        default_help="as in the files",
+        help="give these seeds to every variable with SEED in its name in the environment of a"
+        " node",
+    )
+    repeat: int = option(
+        "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"
+    )
+    jobs: int = option(
+        "--jobs",
+        parse=positive_number,
+        default=1,
+        metavar="N",
+        help="runs at once, which take processors from each other: not for real-time factors",
+    )
+    backend: str | None = like(Request, "backend")
+    duration: float | str | None = like(Request, "duration")
+    record: bool | Sequence[str] = like(Request, "record", group="")
+    output: str | os.PathLike[str] | None = option(
+        "-o",
+        "--output",
+        metavar="DIR",
+        default_help="runs/<project>/sweep-<utc time>",
+        help="write into a new folder, or go on with that of an earlier call",
+    )
+    on_row: OnRow | None = option(
+        help="called with the number of a run, of how many, and its row", is_recorded=False
+    )

@@ -12,8 +12,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+import os
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,7 +26,9 @@ from neuros.project.model import Folders, NodeFile
 from neuros.project.split import node_file_to_json, project_to_json
 
 
-def run_folder_path(output: str | None, project_name: str, time: str | None = None) -> Path:
+def run_folder_path(
+    output: str | os.PathLike[str] | None, project_name: str, time: str | None = None
+) -> Path:
     """Where a run goes: ``output``, else a folder of the project and ``time`` (now, in UTC)."""
     if output is not None:
         return Path(output).absolute()
@@ -34,7 +36,7 @@ def run_folder_path(output: str | None, project_name: str, time: str | None = No
     return Path.cwd() / "runs" / project_name / stamp
 
 
-def make_run_folder(output: str | None, project_name: str) -> Path:
+def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) -> Path:
     """Create the folder of a run.
 
     Raises:
@@ -43,7 +45,7 @@ def make_run_folder(output: str | None, project_name: str) -> Path:
     folder = run_folder_path(output, project_name)
     try:
         if output is not None and _is_taken(folder):
-            raise UsageError(f"-o {output}: is not an empty folder; name a new one")
+            raise UsageError(f"-o {os.fspath(output)}: is not an empty folder; name a new one")
         folder.mkdir(parents=True, exist_ok=output is not None)
     except OSError as error:
         raise UsageError(
@@ -75,7 +77,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
         for file in files:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
-            seen = plan.back_end.as_seen(file)
+            seen = plan.deployment.as_seen(file)
             path.write_text(_text(node_file_to_json(seen)), "utf-8")
     except FileExistsError as error:
         raise UsageError(
@@ -86,18 +88,6 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
     return files
-
-
-def write_record(record: Mapping[str, Any], run_folder: Path) -> None:
-    """Write ``run.json``, the whole of it or nothing. Raises ``OSError``."""
-    part = run_folder / ".run.json"
-    try:
-        part.write_text(_text(record), "utf-8")
-        part.replace(run_folder / "run.json")
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
 
 
 def _text(content: Mapping[str, Any]) -> str:

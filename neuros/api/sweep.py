@@ -6,21 +6,26 @@ import contextlib
 import csv
 import hashlib
 import io
+import itertools
 import json
 import os
+import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from neuros.analysis.run_record import consumed_percent
-from neuros.api.grid import Point, points_of, short_names
 from neuros.api.live import LiveRun
-from neuros.api.project import Project
+from neuros.api.project import Project, value_text
+from neuros.api.request import SweepOptions
 from neuros.api.run import Run, frame_of
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
+from neuros.options import takes
+from neuros.recording.run_file import RUN_FILE
 
 # A run that was interrupted, or could not write what it should, is made again.
 _FINISHED = (0, 1, 5)
@@ -31,6 +36,13 @@ CSV_NAME = "sweep.csv"
 _REASON_CHARACTERS = 50
 _COUNTS = (": sent", ": consumed")
 _SHARE = ": consumed / %"
+_MOST_CHARACTERS = 80
+# Columns of the table that are none of a value.
+_TAKEN = {
+    *("seed", "repeat", "exit_code", "reason"),
+    *("wall_s", "sim_s", "real_time_factor", "folder"),
+}
+_OPENING, _CLOSING = "[{", "]}"
 
 
 class Sweep:
@@ -54,7 +66,7 @@ class Sweep:
     def runs(self) -> list[Run]:
         """The runs that have begun, in the order of the rows."""
         folders = [Path(row["folder"]) for row in self.rows]
-        return [Run(folder) for folder in folders if (folder / "run.json").exists()]
+        return [Run(folder) for folder in folders if (folder / RUN_FILE).exists()]
 
     def __str__(self) -> str:
         return _table_of(self.rows)
@@ -63,34 +75,16 @@ class Sweep:
         return f"<Sweep of {len(self.rows)} runs in {self.folder}>"
 
 
-def sweep(
-    project: Project | str | os.PathLike[str],
-    *,
-    set: Mapping[str, Any] | None = None,
-    seeds: Sequence[int] = (),
-    repeat: int = 1,
-    jobs: int = 1,
-    backend: str | None = None,
-    duration: float | str | None = None,
-    record: bool | Sequence[str] = False,
-    output: str | os.PathLike[str] | None = None,
-    on_row: Callable[[int, int, Mapping[str, Any]], None] | None = None,
-) -> Sweep:
+@takes(SweepOptions)
+def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> Sweep:
     """Run a project with every combination of values, seeds and repetitions.
 
     What has finished in ``output`` already is not run again, so that a sweep can be gone on with.
     A run that fails is a row like the others. ``KeyboardInterrupt`` ends the runs that go on;
     what has finished is in the table on the disk.
 
-    Args:
-        project: the project, or its file.
-        set: by path as in ``--set`` a list of values, or a single one.
-        seeds: for every variable with SEED in its name in the ``environment`` of a node.
-        repeat: how often each combination is run.
-        jobs: how many runs go on at once; they take processors from each other.
-        backend, duration, record: of each run, as for :meth:`~neuros.api.project.Project.run`.
-        output: the folder; else ``runs/<project>/sweep-<utc time>``.
-        on_row: called with the number of a run, of how many, and its row.
+    ``set`` has, by path as in ``--set``, a list of values or a single one. Runs have the other
+    options of :meth:`~neuros.api.project.Project.run`.
 
     Raises:
         ProjectError: if the project is not valid with all values; nothing has been run then.
@@ -100,16 +94,28 @@ def sweep(
     """
     if not isinstance(project, Project):
         project = Project.from_file(project)
-    values = {path: _as_list(given) for path, given in (set or {}).items()}
-    points = points_of(values, [int(seed) for seed in seeds], repeat)
-    if jobs < 1:
-        raise UsageError(f"jobs {jobs}: give 1 or more")
+    values = _values(options.set)
+    points = points_of(values, [int(seed) for seed in options.seeds], options.repeat)
+    if options.jobs < 1:
+        raise UsageError(f"jobs {options.jobs}: give 1 or more")
     _check_all(project, points)
-    options = {"backend": backend, "duration": duration, "record": record}
-    folder = _sweep_folder(project, output, options)
+    folder = _sweep_folder(project, options)
     names = short_names(list(values))
     with _locked_folder(folder):
-        return _Sweeping(project, points, names, folder, options, on_row).run(jobs)
+        return _Sweeping(project, points, names, folder, options).run()
+
+
+def _values(given: Mapping[str, Any] | Sequence[str] | None) -> dict[str, list[Any]]:
+    """The values of each path, from Python or as texts of ``--set``."""
+    if isinstance(given, Mapping):
+        return {path: _as_list(each) for path, each in given.items()}
+    values: dict[str, list[Any]] = {}
+    for text in given or ():
+        path, listed = parse_values(text)
+        if path in values:
+            raise UsageError(f"--set {path}: is given twice; put the values behind one another")
+        values[path] = listed
+    return values
 
 
 class _Sweeping:
@@ -121,23 +127,21 @@ class _Sweeping:
         points: Sequence[Point],
         names: Mapping[str, str],
         folder: Path,
-        options: Mapping[str, Any],
-        on_row: Callable[[int, int, Mapping[str, Any]], None] | None,
+        options: SweepOptions,
     ) -> None:
         self._project = project
         self._names = names
         self._options = options
-        self._on_row = on_row
         self._sweep = Sweep(folder)
         self._points = {point.folder_name(names): point for point in points}
         self._rows: dict[str, dict[str, Any]] = {}
         self._live: dict[str, LiveRun] = {}
 
-    def run(self, jobs: int) -> Sweep:
+    def run(self) -> Sweep:
         waiting = [name for name in self._points if not self._take_finished(name)]
         try:
             while waiting or self._live:
-                while waiting and len(self._live) < jobs:
+                while waiting and len(self._live) < self._options.jobs:
                     self._start(waiting.pop(0))
                 self._collect()
         except BaseException:
@@ -169,7 +173,12 @@ class _Sweeping:
         point, folder = self._points[name], self._sweep.folder / name
         try:
             self._live[name] = self._project.start(
-                set=point.settings, seed=point.seed, output=folder, **self._options
+                set=point.settings,
+                seed=point.seed,
+                output=folder,
+                backend=self._options.backend,
+                duration=self._options.duration,
+                record=self._options.record,
             )
         except EnvironmentFault as error:
             self._note(name, _failed_row(point.values(self._names), error, folder))
@@ -191,8 +200,8 @@ class _Sweeping:
     def _note(self, name: str, row: dict[str, Any]) -> None:
         self._rows[name] = row
         self._save()
-        if self._on_row is not None:
-            self._on_row(len(self._rows), len(self._points), row)
+        if self._options.on_row is not None:
+            self._options.on_row(len(self._rows), len(self._points), row)
 
     def _save(self) -> None:
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
@@ -220,16 +229,14 @@ def _check_all(project: Project, points: Sequence[Point]) -> None:
         raise ProjectError(problems)
 
 
-def _sweep_folder(
-    project: Project, output: str | os.PathLike[str] | None, options: Mapping[str, Any]
-) -> Path:
+def _sweep_folder(project: Project, options: SweepOptions) -> Path:
     """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
     stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
-    folder = Path(output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
+    folder = Path(options.output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
     plan = {
         "project": str(project.file),
         "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
-        **{name: str(options[name]) for name in ("backend", "duration", "record")},
+        **{name: str(getattr(options, name)) for name in ("backend", "duration", "record")},
     }
     file = folder / _PLAN_NAME
     try:
@@ -349,3 +356,106 @@ def _cell(name: str, value: Any) -> str:
     if name == "reason" and len(text) > _REASON_CHARACTERS:
         return text[: _REASON_CHARACTERS - 3] + "..."
     return text
+
+
+# ---------------------------------------------------------------------- points
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run of a sweep.
+
+    Attributes:
+        settings: values by path.
+        seed: for all nodes that have one, ``None``: as in the files.
+        repeat: which repetition it is, from 1; ``None`` where there is one only.
+    """
+
+    settings: Mapping[str, Any]
+    seed: int | None = None
+    repeat: int | None = None
+
+    def values(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """What tells it from others; ``names``: of the columns, by path."""
+        found = {names[path]: value for path, value in self.settings.items()}
+        found |= {} if self.seed is None else {"seed": self.seed}
+        return found | ({} if self.repeat is None else {"repeat": self.repeat})
+
+    def folder_name(self, names: Mapping[str, str]) -> str:
+        """A name for its folder: readable, and never that of another point."""
+        settings = sorted((path, value_text(path, v)) for path, v in self.settings.items())
+        identity = (settings, self.seed, self.repeat)
+        digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:8]
+        text = "_".join(f"{name}={value}" for name, value in self.values(names).items()) or "run"
+        return f"{re.sub(r'[^A-Za-z0-9._=+-]', '-', text)[:_MOST_CHARACTERS]}-{digest}"
+
+
+def points_of(
+    values: Mapping[str, Sequence[Any]], seeds: Sequence[int], repeat: int
+) -> list[Point]:
+    """The grid; what is named last changes first.
+
+    Raises:
+        UsageError: if there is no value for something, or one twice.
+    """
+    if repeat < 1:
+        raise UsageError(f"repeat {repeat}: give 1 or more")
+    for name, given in {**values, "seeds": seeds}.items():
+        texts = [value_text(name, value) for value in given]
+        twice = {text for text in texts if texts.count(text) > 1}
+        if twice:
+            raise UsageError(f"{name}: {', '.join(sorted(twice))} is given twice")
+        if not texts and name != "seeds":
+            raise UsageError(f"{name}: give a value")
+    repeats: Sequence[int | None] = [None] if repeat == 1 else range(1, repeat + 1)
+    return [
+        Point(dict(zip(values, combination, strict=True)), seed, number)
+        for combination in itertools.product(*values.values())
+        for seed in (seeds or (None,))
+        for number in repeats
+    ]
+
+
+def short_names(paths: Sequence[str]) -> dict[str, str]:
+    """What to call paths: their last steps, as few as tell them apart."""
+    names = {}
+    for path in paths:
+        steps = path.split(".")
+        count = 2 if steps[-1] in _TAKEN else 1
+        while any(other != path and other.split(".")[-count:] == steps[-count:] for other in paths):
+            count += 1
+        names[path] = ".".join(steps[-count:])
+    return names
+
+
+def parse_values(text: str) -> tuple[str, list[Any]]:
+    """``PATH=1,2,3`` as on the command line: commas within brackets and quotes are no separators.
+
+    Raises:
+        UsageError: if it is not of this form.
+    """
+    path, equals, listed = text.partition("=")
+    if not (path and equals):
+        raise UsageError(f"--set {text}: is not of the form PATH=VALUE,VALUE,...")
+    is_text = path.split(".")[2:3] == ["environment"]
+    return path, [part if is_text else _json_or_text(part) for part in _split(listed)]
+
+
+def _split(text: str) -> Iterator[str]:
+    depth, in_quotes, start = 0, False, 0
+    for place, character in enumerate(text):
+        if character == '"':
+            in_quotes = not in_quotes
+        elif not in_quotes:
+            depth += (character in _OPENING) - (character in _CLOSING)
+            if character == "," and depth == 0:
+                yield text[start:place]
+                start = place + 1
+    yield text[start:]
+
+
+def _json_or_text(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

@@ -14,8 +14,13 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from neuros.backends.node_command import process_environment, script_failure, with_libraries
-from neuros.backends.placement import Cores, children_on
+from neuros.backends.node_command import (
+    NodeProcess,
+    process_environment,
+    script_failure,
+    with_libraries,
+)
+from neuros.backends.placement import children_on
 from neuros.errors import EnvironmentFault
 
 _NICENESS = 10
@@ -24,32 +29,20 @@ _NICENESS = 10
 class RunningProcess:
     """A node process that was started, and the nodes in it (:class:`neuros.ports.RunningNode`)."""
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        arguments: Sequence[str],
-        *,
-        log: Path,
-        folder: Path,
-        environment: Mapping[str, str],
-        cores: Cores | None = None,
-    ) -> None:
-        """Start it in ``folder``, on ``cores``; both its outputs are appended to ``log``.
-
-        Raises ``EnvironmentFault`` if that is impossible.
-        """
-        self._names = tuple(names)
-        self._log = log
+    def __init__(self, process: NodeProcess) -> None:
+        """Start it; raises ``EnvironmentFault`` if that is impossible."""
+        self._names = process.names
+        self._log = process.log
         try:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with open(log, "ab") as output, children_on(cores):
+            process.log.parent.mkdir(parents=True, exist_ok=True)
+            with open(process.log, "ab") as output, children_on(process.cores):
                 self._process = subprocess.Popen(
-                    list(arguments),
+                    process.command,
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
-                    cwd=folder,
-                    env=dict(environment),
+                    cwd=process.folder,
+                    env=process.environment,
                     start_new_session=True,
                 )
         except OSError as error:

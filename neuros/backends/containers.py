@@ -15,6 +15,9 @@ PACKAGE = Path(__file__).resolve().parents[1]
 OWN_FOLDER = PACKAGE.parent / FOLDER
 """NeuROS's own; they are part of the source checkout."""
 
+STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
+"""Those that the examples need."""
+
 _SLIP = 0.9
 """Similarity (difflib) of ``neuros_pyton`` and ``neuros_python``; of unlike names it is less."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")

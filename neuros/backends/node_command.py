@@ -15,9 +15,11 @@ import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from neuros.backends.placement import THREAD_VARIABLES
+from neuros.backends.placement import THREAD_VARIABLES, Cores, on_cores, thread_limits
+from neuros.ports import NodeProgram
 from neuros.project.model import NodeFile
 
 # One thread each: more threads than free cores make numerical libraries slower, not faster, and
@@ -50,6 +52,77 @@ _TAIL_BYTES = 8192
 _MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BOOTSTRAPPER = "ros_wheels_bootstrapper"
+
+
+PROCESS_LOG = "host.log"
+"""What a process for all nodes prints that comes from none of them."""
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """How to start a process that runs nodes.
+
+    Attributes:
+        names: of the nodes.
+        command: what becomes the node process; it runs the scripts of the nodes before.
+        environment: the whole of it.
+        log: where both its outputs are to be appended.
+        folder: the one to start it in.
+        cores: those that it is to have; empty: the kernel chooses.
+    """
+
+    names: tuple[str, ...]
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    log: Path
+    folder: Path
+    cores: Cores = ()
+
+    def __str__(self) -> str:
+        names = ", ".join(self.names)
+        what = f"one process for {names}" if self.log.name == PROCESS_LOG else f"process {names}"
+        return f"{what}{on_cores(self.cores)}: {shlex.join(self.command)} (log: {self.log})"
+
+
+def node_process(
+    program: NodeProgram, node: NodeFile, environment: Mapping[str, str]
+) -> NodeProcess:
+    """The process of one node; ``environment`` is that of the run, without the launcher's own."""
+    name = node.node.name
+    python = [str(program.pythons[name])] if name in program.pythons else []
+    cores = program.cores.get(name, ())
+    own = {**node_environment(node), **environment}
+    return _process(program.command(python), [node], own, cores, log_file(node))
+
+
+def common_process(
+    program: NodeProgram, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+) -> NodeProcess:
+    """One process for all nodes, which gives each its own environment."""
+    cores = tuple(sorted({core for each in program.cores.values() for core in each}))
+    log = nodes[0].folders.run / PROCESS_LOG
+    return _process(program.command(), nodes, environment, cores, log)
+
+
+def _process(
+    command: Sequence[str],
+    nodes: Sequence[NodeFile],
+    environment: Mapping[str, str],
+    cores: Cores,
+    log: Path,
+) -> NodeProcess:
+    limits = thread_limits([node.node for node in nodes]) if cores else {}
+    whole = with_messages(
+        process_environment(os.environ, {**limits, **environment}), nodes[0].messages
+    )
+    return NodeProcess(
+        tuple(node.node.name for node in nodes),
+        start_arguments(command, nodes),
+        start_environment(command, nodes, whole),
+        log,
+        nodes[0].folders.run,
+        cores,
+    )
 
 
 def node_folder(node: NodeFile) -> Path:

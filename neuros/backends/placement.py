@@ -52,13 +52,13 @@ def usable_cores() -> frozenset[int]:
 
 
 @contextlib.contextmanager
-def children_on(cores: Collection[int] | None) -> Iterator[None]:
+def children_on(cores: Collection[int]) -> Iterator[None]:
     """Processes that this thread starts inside get these cores, and so do all their threads.
 
     The mask is there before the first instruction of the child: scripts, imports and the threads
-    of DDS have it, too. ``None`` changes nothing. Raises ``OSError`` for a core that is not there.
+    of DDS have it, too. Without any nothing changes. Raises ``OSError`` for one that is not there.
     """
-    if cores is None:
+    if not cores:
         yield
         return
     before = os.sched_getaffinity(0)

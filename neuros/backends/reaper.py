@@ -118,14 +118,11 @@ class Reaper:
         """Have a file, socket or folder removed once all processes of the run are gone."""
         self._tell("remove", os.fspath(path.absolute()))
 
-    def watch_engine(self, engine_socket: str) -> None:
-        """Have the run's containers removed from that engine."""
-        self._tell("engine", engine_socket)
-
-    def watch_containers(self, engine_socket: str, folder: Path) -> None:
-        """Have the run's containers removed from that engine, and the folder that they share."""
-        self.watch_engine(engine_socket)
-        self.remove_later(folder)
+    def clean_with(self, module: str, argument: str) -> None:
+        """As :class:`neuros.ports.Reaper` says."""
+        file = Path(str(sys.modules[module].__file__))
+        depth = module.count(".") + (file.name == "__init__.py")
+        self._tell("clean", [module, str(file.parents[depth]), argument])
 
     def finish(self, grace_s: float = 0.0) -> None:
         """Leave the rest to the reaper and wait for it.

@@ -7,11 +7,14 @@ that, and for nothing else. So what takes longer to import, and only removes fil
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 from neuros.backends.run_processes import RunProcesses
 
@@ -34,7 +37,7 @@ class Orders:
         self.sessions: list[int] = []
         self.paths: list[str] = []
         self.locks: list[tuple[int, str]] = []
-        self.engines: list[str] = []
+        self.cleaners: list[tuple[str, str, str]] = []
         self.is_finished = False
 
     def take(self, order: str, value: object) -> None:
@@ -46,8 +49,9 @@ class Orders:
             self.locks.append((int(value[0]), str(value[1])))
         elif order == "grace" and isinstance(value, (int, float)):
             self.grace_s, self.is_finished = float(value), True
-        elif order == "engine" and isinstance(value, str):
-            self.engines.append(value)
+        elif order == "clean" and isinstance(value, list):
+            module, folder, argument = map(str, value)
+            self.cleaners.append((module, folder, argument))
 
 
 def main(run_id: str) -> None:
@@ -64,6 +68,8 @@ def main(run_id: str) -> None:
         orders.take(order, value)
         if order == "session" and isinstance(value, int):
             processes.add_session(value)
+        elif order == "clean":
+            _cleaners(orders)
     clean_up(run_id, orders, processes)
 
 
@@ -82,7 +88,6 @@ def _import_the_rest() -> None:
         import shutil  # noqa: F401
 
         import neuros.backends.domain
-        import neuros.backends.leftover_containers
         import neuros.backends.shared_memory  # noqa: F401
 
 
@@ -92,8 +97,8 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
         processes = RunProcesses(run_id)
         for pid in orders.sessions:
             processes.add_session(pid)
-    _end_all(processes, orders.grace_s, lambda: _resume_containers(run_id, orders))
-    _remove_containers(run_id, orders)
+    _end_all(processes, orders.grace_s, lambda: _resume(run_id, orders))
+    _remove_leftovers(run_id, orders)
 
     from pathlib import Path
 
@@ -128,20 +133,27 @@ def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]
         pause_s = min(_POLL_S, pause_s * 2)
 
 
-def _resume_containers(run_id: str, orders: Orders) -> None:
-    for engine in orders.engines:
-        from neuros.backends.leftover_containers import resume_containers
+def _cleaners(orders: Orders) -> list[tuple[Any, str]]:
+    """The modules that clean up, loaded when they are announced, each with its argument."""
+    found = []
+    for module, folder, argument in orders.cleaners:
+        if folder not in sys.path:
+            sys.path.append(folder)
+        with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
+            found.append((importlib.import_module(module), argument))
+    return found
 
-        resume_containers(engine, run_id)
+
+def _resume(run_id: str, orders: Orders) -> None:
+    for cleaner, argument in _cleaners(orders):
+        cleaner.resume(argument, run_id)
 
 
-def _remove_containers(run_id: str, orders: Orders) -> None:
-    """Containers that a killed launcher had asked for may still be on their way."""
-    for engine in orders.engines:
-        from neuros.backends.leftover_containers import remove_containers
-
-        settle_s = 0.0 if orders.is_finished else _SETTLE_S
-        remove_containers(engine, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
+def _remove_leftovers(run_id: str, orders: Orders) -> None:
+    """What a killed launcher had asked for may still be on its way."""
+    settle_s = 0.0 if orders.is_finished else _SETTLE_S
+    for cleaner, argument in _cleaners(orders):
+        cleaner.remove(argument, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
 
 
 def _kill(processes: Mapping[int, int]) -> None:

@@ -32,6 +32,7 @@ class Session:
         run: its id.
         folder: the run folder.
         namespace: of its nodes on the ROS graph, empty or as in ``/left``.
+        is_one_process: whether its nodes share a process.
         since: Unix time, in seconds.
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
@@ -47,6 +48,7 @@ class Session:
     since: float
     launcher: tuple[int, int]
     namespace: str = ""
+    is_one_process: bool = False
     control: str = ""
     user: int = field(default_factory=os.getuid)
 
@@ -65,7 +67,7 @@ class Session:
         """The state of each node: running, ending (its launcher has gone), or not running."""
         processes = RunProcesses(self.run)
         there = set(processes.nodes().values())
-        if self.backend == "in-process" and processes.alive():
+        if self.is_one_process and processes.alive():
             there = set(self.nodes)
         up = "running" if self.is_led else "ending"
         return {node: up if node in there else "not running" for node in self.nodes}

@@ -1,18 +1,12 @@
-"""The console script ``neuros``, and the program of ``python -m neuros.cli``.
+"""Program of ``python -m neuros.cli``; the command ``neuros`` is ``script/neuros``.
 
-Ctrl+C waits while the commands are imported: then they can end as they should.
+Ctrl+C waits while the command is imported: then that can end as it should.
 """
 
 import signal
 
-
-def console_script() -> None:
-    """Entry point of the installed ``neuros`` command."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    from neuros.cli.main import console_script as run
-
-    run()
-
-
 if __name__ == "__main__":
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    from neuros.cli.main import console_script
+
     console_script()

@@ -8,8 +8,10 @@ import math
 import sys
 from typing import Any
 
+from neuros.api.request import Request
 from neuros.distribution import ROOT
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.options import add_options, options_of, positive_number
 
 _BENCHMARK_EPILOG = """\
 exit codes:
@@ -45,23 +47,12 @@ def checkout_command(name: str) -> Any:
     return importlib.import_module(name)
 
 
-def positive_number(text: str) -> int:
-    """An argument that counts something. Raises ``ValueError``, which argparse reports."""
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
-
-
-def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    benchmark = commands.add_parser(
-        "benchmark",
-        help="measure what NeuROS costs, against the same thing without it",
-        description="Measure what NeuROS costs, side by side with the same thing without it.",
-        epilog=_BENCHMARK_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    benchmark.description = (
+        "Measure what NeuROS costs, side by side with the same thing without it."
     )
+    benchmark.epilog = _BENCHMARK_EPILOG
     add = benchmark.add_argument
     add("subjects", nargs="*", metavar="SUBJECT", help="what to measure (default: everything)")
     add("--list", action="store_true", help="show the subjects, and measure nothing")
@@ -93,16 +84,13 @@ def _benchmark(options: argparse.Namespace) -> int:
     return int(checkout_command("benchmarks.command").run(options))
 
 
-def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    reproduce = commands.add_parser(
-        "reproduce",
-        help="make the published experiments again",
-        description="Make a published experiment again, one run after the other, and write its"
-        " tables and figures, with the published numbers beside them.",
-        epilog=_REPRODUCE_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    reproduce.description = (
+        "Make a published experiment again, one run after the other, and write its"
+        " tables and figures, with the published numbers beside them."
     )
+    reproduce.epilog = _REPRODUCE_EPILOG
     add = reproduce.add_argument
     add(
         "experiment",
@@ -127,11 +115,7 @@ def add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         help="of a run: simulated seconds of whiskeye, else wall seconds (default: 20 for whiskeye"
         " and elevator, 60 for tick and voting)",
     )
-    add(
-        "--backend",
-        choices=("auto", "docker", "process", "in-process"),
-        help="where nodes run, as for launch (default: NEUROS_BACKEND, else auto)",
-    )
+    add_options(reproduce, [each for each in options_of(Request) if each.name == "backend"])
     add(
         "-o",
         "--output",

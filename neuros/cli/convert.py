@@ -24,16 +24,13 @@ exit codes:
 """
 
 
-def add_convert(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    convert = commands.add_parser(
-        "convert",
-        help="turn a robot or world in SDF, or a robot in URDF, into a MuJoCo model",
-        description="Turn a robot or a world in SDF (1.4 to 1.11), or a robot in URDF, into a"
-        " MuJoCo model (MJCF), and list what has no counterpart there.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_convert(convert: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    convert.description = (
+        "Turn a robot or a world in SDF (1.4 to 1.11), or a robot in URDF, into a"
+        " MuJoCo model (MJCF), and list what has no counterpart there."
     )
+    convert.epilog = _EPILOG
     convert.add_argument(
         "file", metavar="FILE", help="an SDF or URDF file, or a folder with a model.config"
     )

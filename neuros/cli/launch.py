@@ -1,4 +1,7 @@
-"""``neuros launch``: a run with its console, its signals, and its exit code."""
+"""``neuros launch``: a run with its console, its signals, and its exit code.
+
+What runs projects is imported late: ``--help`` and completion read this module, too.
+"""
 
 from __future__ import annotations
 
@@ -7,79 +10,93 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-from neuros.api.execution import Execution, run_domain
-from neuros.api.plan import Plan, make_plan
-from neuros.api.recording import recording_of
-from neuros.api.request import Request, parse_duration
-from neuros.api.run_folder import folders_of, run_folder_path
-from neuros.cli.environments import make_shown_environments
-from neuros.cli.projects import load_with_messages
-from neuros.cli.views import Views
-from neuros.errors import UsageError
-from neuros.recording.recording_plan import Request as RecordingRequest
+from neuros.api.request import LaunchOptions
+from neuros.backends.registered import AUTO, BACK_ENDS
+from neuros.cli import EXIT_CODES
+from neuros.cli.projects import add_project, load_with_messages
+from neuros.errors import NeurosError
+from neuros.options import add_options, parsed_as, values_of
+
+if TYPE_CHECKING:
+    from neuros.api.plan import Plan
 
 
-def launch(options: argparse.Namespace) -> int:
+def add_launch(launch: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    launch.description = "Run a project: start its nodes, connect them, wait until all have ended."
+    launch.epilog = EXIT_CODES
+    add_project(launch, LaunchOptions)
+    launch.set_defaults(command=_launch)
+
+
+def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
+    """Add the options of the back end that the arguments name; for ``--help``, of all."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--backend", nargs="?")
+    first.add_argument("-h", "--help", action="store_true")
+    asked, _ = first.parse_known_args(arguments)
+    for name in BACK_ENDS if asked.help else {_back_end_of(asked)} - {AUTO}:
+        try:
+            back_end = BACK_ENDS.load(name)
+        except NeurosError as error:
+            if not asked.help:
+                raise
+            launch.add_argument_group(f"back end {name}", str(error))
+            continue
+        group = launch.add_argument_group(f"back end {name}", f"each node in {back_end.place}")
+        add_options(group, [replace(each, group="") for each in back_end.options])
+
+
+def _back_end_of(parsed: argparse.Namespace) -> str:
+    return str(parsed.backend or os.environ.get("NEUROS_BACKEND") or AUTO)
+
+
+def _back_end_options(parsed: argparse.Namespace) -> dict[str, Any]:
+    """The options of the back end that were given."""
+    name = _back_end_of(parsed)
+    values = {} if name == AUTO else values_of(BACK_ENDS.load(name).options, parsed)
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with _signals_noted() as (signals, waker):
-        request = _request(options)
-        project, messages = load_with_messages(options)
-        plan = make_plan(project, messages, request, is_tried=not options.dry_run)
+        from neuros.api.execution import Execution
+        from neuros.api.plan import make_plan
+        from neuros.cli.environments import make_shown_environments
+        from neuros.cli.views import Views
+
+        options = parsed_as(LaunchOptions, parsed)
+        options = replace(options, backend_options=_back_end_options(parsed))
+        project, messages = load_with_messages(parsed)
+        plan = make_plan(project, messages, options, is_tried=not options.dry_run)
         if options.dry_run:
-            return _dry_run(plan, request)
+            return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
         views = Views(options, plan)
-        run = Execution(plan, request, sys.stdout, signals, waker, views=views)
+        run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
 
 
-def _request(options: argparse.Namespace) -> Request:
-    """What the options ask for. Raises ``UsageError``."""
-    return Request(
-        backend=options.backend,
-        nodes=tuple(options.node),
-        duration=parse_duration(options.duration),
-        domain_id=options.domain_id,
-        network=options.network,
-        peers=options.peers,
-        output=options.output,
-        is_placed=not options.no_placement,
-        has_digests=options.digests,
-        monitors_load=options.monitor_system_load,
-        shows_progress=options.progress,
-        recording=_recording_request(options),
-        is_verbose=options.verbose,
-    )
+def _dry_run(plan: Plan) -> int:
+    from neuros.api.execution import run_domain
+    from neuros.api.recording import recording_of
+    from neuros.api.run_folder import folders_of, run_folder_path
 
-
-def _recording_request(options: argparse.Namespace) -> RecordingRequest | None:
-    """What the command line has recorded, ``None``: nothing. Raises ``UsageError``."""
-    if options.record or options.record_topics:
-        return RecordingRequest(
-            everything=options.record,
-            topics=tuple(options.record_topics),
-            exclude=tuple(options.exclude),
-            storage=options.storage,
-        )
-    if options.exclude or options.storage != "mcap":
-        name = "--exclude" if options.exclude else "--storage"
-        raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
-    return None
-
-
-def _dry_run(plan: Plan, request: Request) -> int:
-    recording = recording_of(plan, request, os.environ)
-    folder = run_folder_path(request.output, plan.project.name, "<utc time>")
-    with run_domain(plan, request, recording) as domain:
-        print(f"back end {plan.backend}; {domain.reason}; run folder {folder}")
+    recording = recording_of(plan, os.environ)
+    folder = run_folder_path(plan.request.output, plan.project.name, "<utc time>")
+    with run_domain(plan, recording) as domain:
+        print(f"back end {plan.back_end.name}; {domain.reason}; run folder {folder}")
     messages = plan.messages.describe() if plan.messages else ()
     for line in (*plan.pythons.notices, *plan.pythons.describe(), *messages):
         print(line)
-    for _, notice in plan.back_end.notices:
+    for _, notice in plan.notices:
         print(notice)
     for line in plan.launcher().describe(plan.node_files(folders_of(plan, folder))):
         print(line)

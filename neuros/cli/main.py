@@ -1,18 +1,6 @@
-"""``neuros``: the parser, the commands, and the exit codes.
+"""``neuros``: the commands, their parser, and their errors.
 
-=== ===========================================================
-0   ended normally
-1   a node failed or had to be killed, a deadlock, or a lossless connection lost a packet
-2   wrong usage of the command line
-3   invalid project
-4   something is missing on this machine (package, engine, image), or what was to be recorded
-    could not be written
-5   a budget of the project was broken
-130 ended by Ctrl+C
-143 ended by SIGTERM, or because the terminal was closed
-=== ===========================================================
-
-Heavy imports are late: ``neuros --help`` must not wait for them.
+Only the module of the command that runs is imported: every node starts through this one.
 """
 
 from __future__ import annotations
@@ -22,29 +10,73 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, NamedTuple
 
-from neuros.cli.checkout import add_benchmark, add_reproduce
-from neuros.cli.convert import add_convert
-from neuros.cli.dashboard import add_dashboard
-from neuros.cli.launch_options import (
-    EXIT_CODES,
-    add_launch,
-    add_project,
-    add_recorder,
-    launch_project,
-)
-from neuros.cli.replay import add_replay
-from neuros.cli.runs import add_bag, add_report, add_sessions, add_verify
-from neuros.cli.setup import add_build, add_containers, add_doctor
-from neuros.cli.sweep import add_sweep
-from neuros.cli.views import add_view
+from neuros.cli import EXIT_CODES
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.project.suggest import did_you_mean
 
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
+
+
+class Command(NamedTuple):
+    """A command: its module, which has ``add_<command>(parser)``, and its line in the help.
+
+    With ``prepare_<command>(parser, arguments)`` the module adds options that depend on others.
+
+    Without help it is one that NeuROS starts itself.
+    """
+
+    module: str
+    help: str = ""
+
+    def add_to(self, commands: Any, name: str, *, is_whole: bool) -> None:
+        """Add it to the parser; ``is_whole``: with its options."""
+        if not self.help:
+            parser = commands.add_parser(name, add_help=False)
+        else:
+            parser = commands.add_parser(name, help=self.help, formatter_class=_Formatter)
+        if is_whole:
+            module = import_module(f"neuros.cli.{self.module}")
+            getattr(module, f"add_{name.replace('-', '_')}")(parser)
+            parser.prepare = getattr(module, f"prepare_{name}", None)
+
+
+COMMANDS = {
+    "launch": Command("launch", "run a project"),
+    "validate": Command("projects", "check a project without running it"),
+    "graph": Command("projects", "show the nodes and connections of a project"),
+    "build": Command("setup", "build message packages"),
+    "ps": Command("runs", "show the runs of this user"),
+    "stop": Command("runs", "stop a run, as Ctrl+C does"),
+    "sweep": Command("sweep", "run a project with many values and seeds, and make one table"),
+    "verify": Command("runs", "compare the packets of two runs"),
+    "report": Command("runs", "say what limited a run, and draw figures of it"),
+    "compare": Command("runs", "show the figures of runs side by side"),
+    "bag": Command("runs", "show or complete what a run has recorded"),
+    "replay": Command("replay", "run one node of a run once more, or publish recorded topics"),
+    "convert": Command("convert", "turn a robot or world in SDF or URDF into a MuJoCo model"),
+    "doctor": Command("setup", "check this machine, and prove that packets arrive"),
+    "containers": Command("setup", "build, list and remove the images that nodes run in"),
+    "benchmark": Command("checkout", "measure what NeuROS costs, against the same without it"),
+    "reproduce": Command("checkout", "make the published experiments again"),
+    "node": Command("node"),
+    "import-plugin": Command("projects"),
+    "recorder": Command("recorder"),
+    "replayed": Command("replay"),
+    "dashboard": Command("views"),
+    "view": Command("views"),
+}
+
+
+class _Formatter(argparse.HelpFormatter):
+    """Fills paragraphs, and leaves lists of exit codes as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if "\n" in text else super()._fill_text(text, width, indent)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -53,9 +85,13 @@ class _Parser(argparse.ArgumentParser):
     argparse hands it up to the first parser, whose usage has commands only.
     """
 
-    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+    prepare: Callable[[argparse.ArgumentParser, Sequence[str]], None] | None = None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does, but nothing stays unknown."""
-        options, unknown = super().parse_known_args(*args, **kwargs)
+        if self.prepare is not None:
+            self.prepare(self, args)
+        options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             hint = did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
             unknown_text = f"unrecognized arguments: {' '.join(unknown)}"
@@ -70,13 +106,16 @@ def console_script() -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command; returns its exit code. Errors are written for the user."""
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what fits: this ends the process
+        _complete(os.environ.get("COMP_LINE", ""))
     _open_standard_streams()
     if not arguments:
-        parser().print_help(sys.stderr)
+        parser("").print_help(sys.stderr)
         return EXIT_USAGE
     try:
-        options = parser().parse_args(arguments)
-        if options.command is not launch_project:  # that has Ctrl+C wait until it can heed it
+        command = _command_in(arguments)
+        options = parser(command).parse_args(arguments)
+        if command != "launch":  # that has Ctrl+C wait until it can heed it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
         if sys.stdout is not None:
@@ -104,118 +143,40 @@ def main(arguments: Sequence[str]) -> int:
         return 0
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole grammar of the command line."""
-    result: argparse.ArgumentParser = _Parser(
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The parser of the command line; ``command``: with the options of this one alone."""
+    result = _Parser(
         prog="neuros",
         description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
         epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Formatter,
     )
     result.add_argument("--version", action="version", version=f"neuros {__version__}")
     commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    add_launch(commands)
-    _add_validate(commands)
-    _add_graph(commands)
-    add_build(commands)
-    add_sessions(commands)
-    add_sweep(commands)
-    add_verify(commands)
-    add_report(commands)
-    add_bag(commands)
-    add_replay(commands)
-    add_convert(commands)
-    add_doctor(commands)
-    add_containers(commands)
-    add_benchmark(commands)
-    add_reproduce(commands)
-    _add_node(commands)
-    _add_import_plugin(commands)
-    add_recorder(commands)
-    add_dashboard(commands)
-    add_view(commands)
+    for name, each in COMMANDS.items():
+        each.add_to(commands, name, is_whole=command in (None, name))
     return result
 
 
-def _add_validate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    validate = commands.add_parser(
-        "validate",
-        help="check a project without running it",
-        description="Check a project and list every problem with its file, line and column."
-        " Plugins are read, and not run.",
-    )
-    add_project(validate)
-    validate.add_argument(
-        "--import",
-        dest="imports",
-        action="store_true",
-        help="import the plugin of each node, too, as its process would: their code is run, but no"
-        " hook",
-    )
-    validate.set_defaults(command=_validate)
+def _command_in(words: Sequence[str]) -> str:
+    return next((word for word in words if not word.startswith("-")), "")
 
 
-def _add_graph(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    graph = commands.add_parser(
-        "graph",
-        help="show the nodes and connections of a project",
-        description="Show the nodes and connections of a project without running it.",
-    )
-    add_project(graph)
-    graph.add_argument(
-        "--format",
-        choices=("text", "mermaid", "svg"),
-        help="for the terminal, a Mermaid diagram for Markdown, or a picture (default: text, unless"
-        " the name of the file ends in .mmd or .svg)",
-    )
-    graph.add_argument("-o", "--output", metavar="FILE", help="write it there, not to the terminal")
-    graph.set_defaults(command=_graph)
+def _complete(line: str) -> None:
+    """Answer a shell that completes a command line of ``neuros`` or ``launch.py``."""
+    import argcomplete
 
-
-def _add_node(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """What containers and processes run; it is started by ``launch``, not by people."""
-    node = commands.add_parser("node", add_help=False)
-    node.add_argument("node_files", nargs="+")
-    node.add_argument("--in-memory", action="store_true")
-    node.add_argument("--duration-sim", type=float)
-    node.add_argument("--digests", action="store_true")
-    node.add_argument("--debug", action="store_true")
-    node.add_argument("--record", action="store_true")
-    node.set_defaults(command=_node)
-
-
-def _add_import_plugin(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """What ``validate --import`` runs for each node."""
-    command = commands.add_parser("import-plugin", add_help=False)
-    command.add_argument("name")
-    command.add_argument("project")
-    command.add_argument("--set", action="append", default=[])
-    command.add_argument("--answer", type=int, required=True)
-    command.set_defaults(command=_import_plugin)
-
-
-def _validate(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import validate
-
-    return validate(options)
-
-
-def _import_plugin(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import import_plugin
-
-    return import_plugin(options)
-
-
-def _graph(options: argparse.Namespace) -> int:
-    from neuros.cli.projects import write_graph
-
-    return write_graph(options)
-
-
-def _node(options: argparse.Namespace) -> int:
-    from neuros.cli.node import run_node
-
-    return run_node(options)
+    program, *words = line.split() or [""]
+    is_launch = program.endswith("launch.py")
+    completed = parser("launch" if is_launch else _command_in(words))
+    if is_launch:
+        completed = next(
+            action.choices["launch"]
+            for action in completed._actions
+            if isinstance(action, argparse._SubParsersAction)
+        )
+    hidden = [name for name, command in COMMANDS.items() if not command.help]
+    argcomplete.autocomplete(completed, exclude=hidden)
 
 
 def _complain(text: str) -> None:

@@ -27,7 +27,18 @@ _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to 
 _STANDARD = (0, 1, 2)
 
 
-def run_node(options: argparse.Namespace) -> int:
+def add_node(node: argparse.ArgumentParser) -> None:
+    """Add the arguments of the program; ``launch`` starts it, in a container or a process."""
+    node.add_argument("node_files", nargs="+")
+    node.add_argument("--in-memory", action="store_true")
+    node.add_argument("--duration-sim", type=float)
+    node.add_argument("--digests", action="store_true")
+    node.add_argument("--debug", action="store_true")
+    node.add_argument("--record", action="store_true")
+    node.set_defaults(command=_run_node)
+
+
+def _run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
     leave = _Leave()
     atexit.register(leave)  # first, so that it comes last, after what plugins have registered

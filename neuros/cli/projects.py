@@ -1,4 +1,7 @@
-"""``neuros validate`` and ``neuros graph``, and the loading of the project that a command names."""
+"""``neuros validate`` and ``neuros graph``, and the project that a command names.
+
+What reads projects is imported late: ``--help`` and completion read this module, too.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +9,38 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from neuros.api.loading import load_with_messages as load_by_path
-from neuros.api.validation import import_problems, model_problems
+from neuros.api.request import ProjectOptions
 from neuros.errors import NeurosError, ProjectError, UsageError
-from neuros.messages.needed import Messages
-from neuros.project.model import Project
+from neuros.options import add_options, options_of
+
+if TYPE_CHECKING:
+    from neuros.messages.needed import Messages
+    from neuros.project.model import Project
 
 EXIT_NODE = 1
 _GRAPH_SUFFIXES = {".svg": "svg", ".mmd": "mermaid", ".mermaid": "mermaid"}
 
 
-def project_path(options: argparse.Namespace) -> Path:
+def add_project(command: argparse.ArgumentParser, declared_in: type = ProjectOptions) -> None:
+    """Add what names a project, and the options that a dataclass declares."""
+    command.add_argument(
+        "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
+    )
+    command.add_argument(
+        "-p", "--project", dest="project_option", metavar="PROJECT", help="the same, as an option"
+    )
+    add_options(command, options_of(declared_in))
+
+
+def project_path(parsed: argparse.Namespace) -> Path:
     """The project that was named, once.
 
     Raises:
         UsageError: if none or two were named.
     """
-    named = {path for path in (options.project, options.project_option) if path is not None}
+    named = {path for path in (parsed.project, parsed.project_option) if path is not None}
     if not named:
         raise UsageError("name a project: a file, or a folder with a project.json")
     if len(named) > 1:
@@ -31,37 +48,48 @@ def project_path(options: argparse.Namespace) -> Path:
     return Path(named.pop())
 
 
-def load(options: argparse.Namespace, *, reads_plugins: bool = True) -> Project:
-    """Load the project as :func:`load_with_messages` does."""
-    return load_with_messages(options, reads_plugins=reads_plugins)[0]
-
-
 def load_with_messages(
-    options: argparse.Namespace, *, reads_plugins: bool = True
+    parsed: argparse.Namespace, *, reads_plugins: bool = True
 ) -> tuple[Project, Messages]:
     """Load the project and find its message packages; warnings go to standard error.
 
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
-    loaded, messages = load_by_path(
-        project_path(options),
-        options.set,
-        options.namespace,
-        options.remap,
-        reads_plugins=reads_plugins,
-    )
+    from neuros.api.loading import load_with_messages as load
+
+    path = project_path(parsed)
+    changes = (parsed.set, parsed.namespace, parsed.remap)
+    loaded, messages = load(path, *changes, reads_plugins=reads_plugins)
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return loaded.project, messages
 
 
-def validate(options: argparse.Namespace) -> int:
-    """Check a project, and say that it is valid."""
-    project, messages = load_with_messages(options)
+def add_validate(validate: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    validate.description = (
+        "Check a project and list every problem with its file, line and column. Plugins are read,"
+        " and not run."
+    )
+    add_project(validate)
+    validate.add_argument(
+        "--import",
+        dest="imports",
+        action="store_true",
+        help="import the plugin of each node, too, as its process would: their code is run, but no"
+        " hook",
+    )
+    validate.set_defaults(command=_validate)
+
+
+def _validate(parsed: argparse.Namespace) -> int:
+    from neuros.api.validation import import_problems, model_problems
+
+    project, messages = load_with_messages(parsed)
     problems = model_problems(project)
-    if not problems and options.imports:
-        problems = import_problems(project, messages, project_path(options), options.set)
+    if not problems and parsed.imports:
+        problems = import_problems(project, messages, project_path(parsed), parsed.set)
     if problems:
         raise ProjectError(problems)
     print(
@@ -71,7 +99,16 @@ def validate(options: argparse.Namespace) -> int:
     return 0
 
 
-def import_plugin(options: argparse.Namespace) -> int:
+def add_import_plugin(command: argparse.ArgumentParser) -> None:
+    """Add the arguments of what ``validate --import`` runs for each node."""
+    command.add_argument("name")
+    command.add_argument("project")
+    command.add_argument("--set", action="append", default=[])
+    command.add_argument("--answer", type=int, required=True)
+    command.set_defaults(command=_import_plugin)
+
+
+def _import_plugin(options: argparse.Namespace) -> int:
     """Import the plugin of one node as a run would; what is wrong with it is the answer."""
     from neuros.testing import PluginHarness
 
@@ -88,18 +125,28 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def write_graph(options: argparse.Namespace) -> int:
-    """Write the graph of a project to the terminal, or to a file.
+def add_graph(graph: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    graph.description = "Show the nodes and connections of a project without running it."
+    add_project(graph)
+    graph.add_argument(
+        "--format",
+        choices=("text", "mermaid", "svg"),
+        help="for the terminal, a Mermaid diagram for Markdown, or a picture (default: text, unless"
+        " the name of the file ends in .mmd or .svg)",
+    )
+    graph.add_argument("-o", "--output", metavar="FILE", help="write it there, not to the terminal")
+    graph.set_defaults(command=_graph)
 
-    Raises:
-        UsageError: if the file cannot be written.
-    """
+
+def _graph(options: argparse.Namespace) -> int:
+    """Write the graph of a project. Raises ``UsageError`` if the file cannot be written."""
     from neuros.project.graph import graph_mermaid, graph_text
     from neuros.project.graph_svg import graph_svg
 
     makers = {"text": graph_text, "mermaid": graph_mermaid, "svg": graph_svg}
     kind = options.format or _GRAPH_SUFFIXES.get(Path(options.output or "").suffix, "text")
-    text = makers[kind](load(options, reads_plugins=False))
+    text = makers[kind](load_with_messages(options, reads_plugins=False)[0])
     if options.output is None:
         print(text)
         return 0

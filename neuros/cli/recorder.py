@@ -29,7 +29,13 @@ _POLL_S = 0.1
 _ORPHANED_S = 4.0
 
 
-def run_recorder(options: argparse.Namespace) -> int:
+def add_recorder(recorder: argparse.ArgumentParser) -> None:
+    """Add the arguments of the program; ``launch`` starts it, not people."""
+    recorder.add_argument("run")
+    recorder.set_defaults(command=_run_recorder)
+
+
+def _run_recorder(options: argparse.Namespace) -> int:
     """Record a run until its launcher says, or is, at its end; or complete its bag."""
     run = Path(options.run)
     problems = _Problems()

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
 
 
-def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    replay = commands.add_parser(
-        "replay",
-        help="run one node of a run once more, or publish recorded topics",
-        description="With --node: run one node once more on exactly what it received, and compare"
+def add_replay(replay: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    replay.description = (
+        "With --node: run one node once more on exactly what it received, and compare"
         " what it sends, packet by packet. With --topic: publish recorded topics on the ROS graph,"
-        " spaced as they were sent.",
-        epilog="exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
-        " 4 the node needs what this machine does not have",
+        " spaced as they were sent."
+    )
+    replay.epilog = (
+        "exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
+        " 4 the node needs what this machine does not have"
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")
@@ -88,12 +88,10 @@ def add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     add("-d", "--domain-id", type=int, metavar="ID", help="default: ROS_DOMAIN_ID, else 0")
     replay.set_defaults(command=_replay)
-    _add_replayed(commands)
 
 
-def _add_replayed(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """What ``replay --node`` becomes; it is not started by people."""
-    replayed = commands.add_parser("replayed", add_help=False)
+def add_replayed(replayed: argparse.ArgumentParser) -> None:
+    """Add the arguments of what ``replay --node`` becomes; people do not start it."""
     replayed.add_argument("node_file")
     replayed.add_argument("--run", required=True)
     replayed.add_argument("--pdb", action="store_true")
@@ -167,11 +165,10 @@ def _replay_node(options: argparse.Namespace) -> int:
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.cache import message_cache
-    from neuros.replay.containers import as_on_this_machine, ran_in_container
+    from neuros.replay.containers import as_on_this_machine
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
-    if ran_in_container(run):
-        file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
+    file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
     require_messages(file)
     if not file.node.plugin.is_file():
         raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
@@ -197,10 +194,11 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
         EnvironmentFault: if it cannot be made.
     """
     from neuros.backends.environments.pythons import Pythons
+    from neuros.backends.registered import ran_in_one_process
     from neuros.cli.environments import make_shown_environments
     from neuros.replay.containers import not_here, ran_in_container
 
-    own = [] if run.record.get("backend") == "in-process" else [file.node]
+    own = [] if ran_in_one_process(run.record) else [file.node]
     try:
         pythons = Pythons.choose(own, file.folders.project, dict(os.environ))
         ended = make_shown_environments(pythons, [])

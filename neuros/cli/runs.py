@@ -28,20 +28,19 @@ _GIVE_UP_S = 30.0
 _POLL_S = 0.05
 
 
-def add_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add both commands to the parser."""
-    ps = commands.add_parser(
-        "ps",
-        help="show the runs of this user",
-        description="Show the nodes of all runs of this user on this machine; for root, of all"
-        " users.",
+def add_ps(ps: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    ps.description = (
+        "Show the nodes of all runs of this user on this machine; for root, of all users."
     )
     ps.set_defaults(command=_ps)
-    stop = commands.add_parser(
-        "stop",
-        help="stop a run, as Ctrl+C does",
-        description="Stop runs of this user, as Ctrl+C in their terminal does, and wait for it."
-        " Root stops a run of another user by its id alone.",
+
+
+def add_stop(stop: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    stop.description = (
+        "Stop runs of this user, as Ctrl+C in their terminal does, and wait until they have ended."
+        " Root stops a run of another user by its id alone."
     )
     stop.add_argument(
         "runs",
@@ -136,24 +135,24 @@ def _await_end(chosen: Sequence[Session]) -> None:
         time.sleep(_POLL_S)
 
 
-def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands."""
-    report = commands.add_parser(
-        "report",
-        help="what limited a run, and figures of it",
-        description="Say what limited the speed of a run, and write a page (HTML, one file) with"
-        " figures, and the figures themselves (PNG).",
+def add_report(report: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    report.description = (
+        "Say what limited the speed of a run, and write a page (HTML, one file) with figures, and"
+        " the figures themselves (PNG)."
     )
     report.add_argument("run", metavar="RUN", type=Path, help="a run folder")
     report.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="where to write (default: RUN/report)"
     )
     report.set_defaults(command=_report)
-    compare = commands.add_parser(
-        "compare",
-        help="runs side by side",
-        description="Print the figures of several runs side by side. What is no run is named and"
-        " left out (exit code 2).",
+
+
+def add_compare(compare: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    compare.description = (
+        "Print the figures of several runs side by side. What is no run is named and left out"
+        " (exit code 2)."
     )
     compare.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     compare.add_argument(
@@ -262,15 +261,13 @@ def _write(folder: Path, files: dict[str, bytes]) -> None:
         ) from error
 
 
-def add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command."""
-    verify = commands.add_parser(
-        "verify",
-        help="compare the packets of two runs",
-        description="Say whether two runs carried the same packets, or where they parted first:"
-        " connection, packet, and, where both were recorded, field.",
-        epilog="exit codes: 0 identical, 1 different, 2 nothing to compare",
+def add_verify(verify: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    verify.description = (
+        "Say whether two runs carried the same packets, or where they parted first:"
+        " connection, packet, and, where both were recorded, field."
     )
+    verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
     verify.add_argument("run_b", metavar="RUN_B", type=Path, help="another one")
     verify.set_defaults(command=_verify)
@@ -295,13 +292,9 @@ def _verify(options: argparse.Namespace) -> int:
     return 0
 
 
-def add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    bag = commands.add_parser(
-        "bag",
-        help="show or complete what a run has recorded",
-        description="Show what a run has recorded, or complete the bag of a run that was cut off.",
-    )
+def add_bag(bag: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    bag.description = "Show what a run has recorded, or complete the bag of a run that was cut off."
     actions = bag.add_subparsers(title="actions", metavar="ACTION", required=True)
     info = actions.add_parser("info", help="show the topics of a bag")
     info.add_argument("run", metavar="RUN", help="the run folder, or a bag")

@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuros.backends.containers import OWN_FOLDER, STANDARD
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
     from neuros.backends.docker.recipes import Recipe
-    from neuros.doctor.machine_checks import Finding
 
-STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
-"""What the examples need."""
 _CONTAINERS_EPILOG = """\
 exit codes:
   0    done
@@ -33,15 +31,15 @@ exit codes:
 """
 
 
-def add_build(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    build = commands.add_parser(
-        "build",
-        help="build message packages",
-        description="Build the ROS packages with messages, services and actions of a workspace"
-        " that are not built yet, and those of NeuROS's own. Launching a project does it, too.",
-        epilog="exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
-        " with its line, 4 no compiler, or it fails",
+def add_build(build: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    build.description = (
+        "Build the ROS packages with messages, services and actions of a workspace"
+        " that are not built yet, and those of NeuROS's own. Launching a project does it, too."
+    )
+    build.epilog = (
+        "exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
+        " with its line, 4 no compiler, or it fails"
     )
     build.add_argument("packages", nargs="*", metavar="PACKAGE", help="these only (default: all)")
     build.add_argument(
@@ -90,15 +88,10 @@ def _build(options: argparse.Namespace) -> int:
     return 0
 
 
-def add_containers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    containers = commands.add_parser(
-        "containers",
-        help="build, list and remove the images that nodes run in",
-        description="Build, list and remove the images that nodes run in.",
-        epilog=_CONTAINERS_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_containers(containers: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    containers.description = "Build, list and remove the images that nodes run in."
+    containers.epilog = _CONTAINERS_EPILOG
     actions = containers.add_subparsers(title="actions", metavar="ACTION", required=True)
     build = actions.add_parser("build", help="build what is missing or out of date")
     build.add_argument(
@@ -175,7 +168,6 @@ def _build_images(options: argparse.Namespace) -> int:
 
 
 def _list_images(options: argparse.Namespace) -> int:
-    from neuros.backends.containers import OWN_FOLDER
     from neuros.backends.docker.engine import connect
     from neuros.backends.docker.inventory import inventory
     from neuros.backends.docker.recipes import names_in
@@ -225,7 +217,6 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
-    from neuros.backends.containers import OWN_FOLDER
     from neuros.backends.docker.recipes import names_in
     from neuros.distribution import WORKSPACE
     from neuros.project.load import load_project
@@ -264,16 +255,13 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"
 
 
-def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the grammar."""
-    doctor = commands.add_parser(
-        "doctor",
-        help="check this machine, and prove that packets arrive",
-        description="Check what runs need of this machine, and prove with packets between two"
-        " nodes that they can talk, on each back end that there is.",
-        epilog=_DOCTOR_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_doctor(doctor: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    doctor.description = (
+        "Check what runs need of this machine, and prove with packets between two"
+        " nodes that they can talk, on each back end that there is."
     )
+    doctor.epilog = _DOCTOR_EPILOG
     doctor.add_argument(
         "--no-delivery", action="store_true", help="only look: start no nodes and no containers"
     )
@@ -281,31 +269,11 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from neuros.doctor.machine_checks import State
+    from neuros.doctor.checks import findings
+    from neuros.ports import State
 
     is_well = True
-    for finding in _findings(proves=not options.no_delivery):
+    for finding in findings(os.environ, proves=not options.no_delivery):
         print(finding, flush=True)  # the proofs take seconds
         is_well &= finding.state is not State.BAD
     return 0 if is_well else 4
-
-
-def _findings(*, proves: bool) -> Iterator[Finding]:
-    from neuros.doctor.delivery import prove_delivery
-    from neuros.doctor.machine_checks import (
-        State,
-        look_at_containers,
-        look_at_machine,
-        prove_rendering,
-    )
-
-    yield from look_at_machine(os.environ)
-    yield prove_rendering(os.environ)
-    has_base = False
-    for finding in look_at_containers(STANDARD, os.environ):
-        has_base |= finding.state is State.GOOD and finding.text.startswith("neuros_python:")
-        yield finding
-    if not proves:
-        return
-    for backend in ("in-process", "process", *(["docker"] if has_base else [])):
-        yield prove_delivery(backend)

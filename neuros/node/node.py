@@ -114,9 +114,7 @@ class NodeRuntime:
             on_first_hook=lambda: tell(FirstHook(self.name)),
             on_initialised=on_initialised,
         )
-        self.reports = NodeReports(
-            file, middleware, self._transport, self._time, sampler, clock
-        )
+        self.reports = NodeReports(file, middleware, self._transport, self._time, sampler, clock)
         node, tap = file.node, self._effects.tap
         arrivals = {
             c: tap(Way.RECEIVED, node.input(c.destination_input), c)

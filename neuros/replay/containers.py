@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from neuros.analysis.run_record import PastRun
-from neuros.backends.docker.layout import outside
+from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, NeurosError
+from neuros.ports import BackEnd
 from neuros.project.model import Folders, NodeFile
 
 _FEW = 5
@@ -17,25 +18,30 @@ _INSTALLERS = {"pip", "setuptools", "wheel"}  # nothing that a node computes dep
 
 
 def ran_in_container(run: PastRun) -> bool:
-    """Whether the nodes of a run had containers of their own."""
-    return run.record.get("backend") == "docker"
+    """Whether the nodes of a run had Pythons of their own, as those of containers."""
+    return _back_end(run).has_own_pythons
 
 
 def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path, messages: Path) -> NodeFile:
-    """The node with the paths of this machine; ``file`` is the one from its container.
+    """The node with the paths of this machine; ``file`` has those that it saw in its run.
 
     Args:
         messages: the folder with built message packages.
     """
     folders = Folders(Path(run.record["file"]).parent, workspace, run.folder)
-    return outside(file, folders, messages)
+    return _back_end(run).on_this_machine(file, folders, messages)
+
+
+def _back_end(run: PastRun) -> BackEnd:
+    """Raises ``UsageError`` if its distribution is not installed, ``EnvironmentFault``."""
+    return BACK_ENDS.load(run.record["backend"])
 
 
 def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
-    """The error for something that a node had in its container and this machine lacks."""
+    """The error for something that a node had where it ran and this machine lacks."""
     return EnvironmentFault(
-        f"replay: in {run.folder} '{name}' ran in a container, a replay is a process of this"
-        f" machine, and here it lacks something: {cause}"
+        f"replay: in {run.folder} '{name}' ran in {_back_end(run).place}, a replay is a process of"
+        f" this machine, and here it lacks something: {cause}"
     )
 
 
@@ -68,8 +74,5 @@ def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
     if not rows:
         return ""
     more = f" and {len(rows) - _FEW} more" if len(rows) > _FEW else ""
-    nodes = run.record["expanded_project"]["nodes"]
-    (container,) = (node["container"] for node in nodes if node["name"] == name)
-    docker = run.record["docker"]  # None where the engine had gone away
-    image = docker["images"][container]["name"] if docker else container
-    return f"the node ran in image {image} with {', '.join(rows[:_FEW])}{more}"
+    place = _back_end(run).place_in(run.record, name)
+    return f"the node ran in {place} with {', '.join(rows[:_FEW])}{more}"

@@ -267,7 +267,7 @@ def test_what_was_recorded_tells_the_field(folders: tuple[Path, Path]) -> None:
         ("[]", "is broken: it holds no object"),
         ('{"format": 2}', "is broken"),
         ('{"format": 2, "connections": [{}]}', "is broken"),
-        ('{"project": "old"}', "has format 1, and this version of NeuROS reads format 2"),
+        ('{"project": "old"}', "has format None, and this version of NeuROS reads format 2"),
         ('{"format": 3}', "use the version that the run was made with"),
     ],
 )

@@ -13,6 +13,7 @@ from neuros.backends.docker.launcher import how_it_ended
 from neuros.backends.docker.layout import as_here, inside, outside
 from neuros.backends.docker.settings import DDS_SETTINGS, User, container_settings, user_for
 from neuros.errors import EnvironmentFault
+from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
 from neuros.project.resources import Access, Resources
 
@@ -30,8 +31,11 @@ def node_file(**keys: Any) -> NodeFile:
     return NodeFile(node, (), HERE)
 
 
-def settings(file: NodeFile, user: User | None = None, **options: Any) -> dict[str, Any]:
-    return container_settings(file, IMAGE, user or User(1000, 1001), (), RUN, **options)
+def settings(
+    file: NodeFile, user: User | None = None, cores: tuple[int, ...] = (), **options: Any
+) -> dict[str, Any]:
+    program = NodeProgram(cores={"snn": cores})
+    return container_settings(file, IMAGE, user or User(1000, 1001), program, RUN, **options)
 
 
 def mounts(found: dict[str, Any]) -> dict[str, tuple[str, bool]]:

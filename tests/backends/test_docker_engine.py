@@ -20,8 +20,8 @@ from docker.context import ContextAPI
 from docker.errors import APIError
 from urllib3.exceptions import ProtocolError
 
-from neuros.api.back_end import _without_limits
 from neuros.backends.docker import engine as engine_module
+from neuros.backends.docker.back_end import without_limits
 from neuros.backends.docker.engine import Abilities, connect, engine_faults
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
@@ -180,7 +180,7 @@ class TestAbilities:
             return Node(name, "c", Path("/p.py"), resources=Resources(**limits))
 
         nodes = [node("a", mem_bytes=1 << 30), node("b", pids=9), node("c")]
-        ((severity, text),) = _without_limits(nodes, {"mem_bytes", "cpus"})
+        ((severity, text),) = without_limits(nodes, {"mem_bytes", "cpus"})
         assert severity == "WARN"
         assert text.startswith("resources of a: this Docker engine has no control groups")
-        assert _without_limits(nodes, ()) == ()
+        assert without_limits(nodes, ()) == ()

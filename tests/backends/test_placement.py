@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.backends.child_processes import RunningProcess
+from neuros.backends.node_command import NodeProcess
 from neuros.backends.placement import (
     THREAD_VARIABLES,
     children_on,
@@ -43,18 +44,12 @@ def test_thread_pools_have_as_many_threads_as_the_node_asks_for_cores() -> None:
 
 
 # ------------------------------------------------------------------ processes
-def _mask_of(tmp_path: Path, cores: tuple[int, ...] | None) -> set[int]:
+def _mask_of(tmp_path: Path, cores: tuple[int, ...]) -> set[int]:
     program = "import json, os; print(json.dumps(sorted(os.sched_getaffinity(0))))"
     log = tmp_path / "log"
     log.unlink(missing_ok=True)
-    host = RunningProcess(
-        ["a"],
-        ["python3", "-S", "-c", program],
-        log=log,
-        folder=tmp_path,
-        environment=os.environ,
-        cores=cores,
-    )
+    command = ["python3", "-S", "-c", program]
+    host = RunningProcess(NodeProcess(("a",), command, os.environ, log, tmp_path, cores))
     assert host.wait(10) == "exit code 0"
     return set(json.loads(log.read_text()))
 
@@ -63,7 +58,7 @@ def test_a_process_has_its_cores_and_the_launcher_keeps_its_own(tmp_path: Path) 
     before = usable_cores()
     for core in before:
         assert _mask_of(tmp_path, (core,)) == {core}
-    assert _mask_of(tmp_path, None) == before
+    assert _mask_of(tmp_path, ()) == before
     assert usable_cores() == before
 
 

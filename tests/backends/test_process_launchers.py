@@ -15,6 +15,7 @@ from neuros.backends.child_processes import RunningProcess
 from neuros.backends.node_command import process_environment
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
 from neuros.errors import EnvironmentFault
+from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
 
 # A host that says all that it was given.
@@ -52,13 +53,22 @@ class Run:
         self, program: str, nodes: Sequence[NodeFile], in_process: bool = False
     ) -> list[RunningProcess]:
         kind = InProcessLauncher if in_process else ProcessLauncher
-        launcher = kind(command(program), self.pids.append)
+        launcher = kind(NodeProgram(program=command(program), reaper=self))
         self.hosts += launcher.start(nodes, {"NEUROS_RUN_ID": "1234", "SHARED": "run"})
         return self.hosts
 
     def end(self, program: str, nodes: Sequence[NodeFile], in_process: bool = False) -> list[str]:
         """Start and wait: how the hosts ended."""
         return [host.wait(10) or "" for host in self.start(program, nodes, in_process)]
+
+    def watch(self, pid: int) -> None:
+        self.pids.append(pid)
+
+    def remove_later(self, path: Path) -> None:
+        raise AssertionError(path)
+
+    def clean_with(self, module: str, argument: str) -> None:
+        raise AssertionError(module)
 
     def log(self, path: str) -> str:
         return (self.folder / path).read_text()
@@ -186,15 +196,20 @@ def _is_alive(pid: int) -> bool:
 
 
 def test_a_program_that_does_not_exist_is_a_fault_and_the_others_do_not_stay(run: Run) -> None:
-    def fail(pid: int) -> None:
-        run.pids.append(pid)
-        if len(run.pids) == 2:
-            raise RuntimeError
+    class Failing(Run):
+        def watch(self, pid: int) -> None:
+            run.pids.append(pid)
+            if len(run.pids) == 2:
+                raise RuntimeError
 
+    nowhere = NodeProgram(program=["/nowhere/python"])
     with pytest.raises(EnvironmentFault, match="snn"):
-        ProcessLauncher(["/nowhere/python"]).start([run.node("snn")], {})
+        ProcessLauncher(nowhere).start([run.node("snn")], {})
+    failing = Failing(run.folder)
     with pytest.raises(RuntimeError):
-        ProcessLauncher(command(SLEEP), fail).start([run.node("a"), run.node("b")], {})
+        ProcessLauncher(NodeProgram(program=command(SLEEP), reaper=failing)).start(
+            [run.node("a"), run.node("b")], {}
+        )
     assert not any(map(_is_alive, run.pids))
 
 
@@ -253,18 +268,19 @@ def test_terminate_during_a_script_ends_both(run: Run) -> None:
 
 def test_what_would_be_started_can_be_described(run: Run) -> None:
     nodes = [run.node("snn"), run.node("robot")]
-    lines = ProcessLauncher(["python", "-m", "host"]).describe(nodes)
+    program = NodeProgram(program=["python", "-m", "host"])
+    lines = ProcessLauncher(program).describe(nodes)
     assert lines[0] == (
         f"process snn: python -m host '{run.folder}/snn/node.json' (log: {run.folder}/snn/node.log)"
     )
     assert len(lines) == 2
-    (line,) = InProcessLauncher(["python", "-m", "host"]).describe(nodes)
+    (line,) = InProcessLauncher(program).describe(nodes)
     assert line.startswith("one process for snn, robot: python -m host '")
-    placed = {"snn": (1,), "robot": (0, 2)}
-    lines = ProcessLauncher(["python"], placement=placed).describe(nodes)
+    placed = NodeProgram(program=["python"], cores={"snn": (1,), "robot": (0, 2)})
+    lines = ProcessLauncher(placed).describe(nodes)
     assert [line.partition(":")[0] for line in lines] == [
         "process snn on core 1",
         "process robot on cores 0, 2",
     ]
-    (line,) = InProcessLauncher(["python"], placement=placed).describe(nodes)
+    (line,) = InProcessLauncher(placed).describe(nodes)
     assert line.startswith("one process for snn, robot on cores 0, 1, 2: ")

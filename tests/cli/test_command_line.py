@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from neuros.api.back_end import BackEnd
 from neuros.api.plan import Plan, check_machine
-from neuros.api.request import Duration, parse_duration
+from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
+from neuros.backends.registered import choose
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
@@ -298,7 +298,7 @@ def test_ctrl_c_without_a_run_is_no_traceback(
         os.kill(os.getpid(), signal.SIGINT)
         return 0
 
-    monkeypatch.setattr("neuros.cli.main._validate", interrupted)
+    monkeypatch.setattr("neuros.cli.projects._validate", interrupted)
     assert main(["validate", "."]) == 130
 
 
@@ -342,7 +342,8 @@ def test_a_given_run_folder_is_taken_exactly(tmp_path: Path) -> None:
 def plan_of(count: int, backend: str) -> Plan:
     nodes = tuple(Node(f"node{i}", "neuros_python", Path("plugin.py")) for i in range(count))
     project = Project("many", nodes, (), Path("project.json"))
-    return Plan(project, tuple(n.name for n in nodes), BackEnd(backend), Duration(), False)
+    chosen = choose(backend, project, nodes, {})
+    return Plan(project, tuple(n.name for n in nodes), chosen, Request())
 
 
 def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_named() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 from pathlib import Path
 
@@ -20,11 +19,6 @@ time_s,unix_time_s,core0_percent,memory_used_bytes,a.cpu_percent,a.memory_bytes,
 2.0,1700000002,60.0,1000000,,,
 3.0,1700000003,
 """
-OLD = {
-    "project": "old",
-    "connections": [{"connection": "a.out -> b.in", "sent": 3, "received": 3, "consumed": 3}],
-    "nodes": {"a": {"report": None}, "b": {"report": None}},
-}
 PNG = b"\x89PNG\r\n"
 
 
@@ -86,15 +80,6 @@ def test_a_run_without_anything_is_no_failure(
     out = capsys.readouterr().out
     assert out.startswith("What limits this run cannot be told")
     assert "missing: run.json" in out
-
-
-def test_an_older_run_has_the_figures_that_it_has_data_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "run.json").write_text(json.dumps(OLD))
-    assert main(["report", str(tmp_path)]) == 0
-    assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {"graph", "packets"}
-    assert "missing: run.json has format 1" in capsys.readouterr().out
 
 
 def test_what_is_no_run_is_a_wrong_usage(

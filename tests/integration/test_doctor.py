@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from neuros.cli.main import main
-from neuros.doctor.delivery import PROJECT, prove_delivery
-from neuros.doctor.machine_checks import State
+from neuros.doctor.checks import PROJECT, prove_delivery
+from neuros.ports import State
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])

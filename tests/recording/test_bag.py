@@ -230,7 +230,7 @@ def test_what_has_gone_since_the_run_ended_is_said(
     spool(tmp_path, "a", [(at, None, number(at)) for at in range(1, 1001)])
     neuros.bag.open(tmp_path).close()
     topics = {NUMBER.name: {"recorded": 1000}}
-    (tmp_path / "run.json").write_text(json.dumps({"recording": {"topics": topics}}))
+    (tmp_path / "run.json").write_text(json.dumps({"format": 2, "recording": {"topics": topics}}))
     with neuros.bag.open(tmp_path) as bag:
         assert bag.missing == {}
     assert main(["bag", "info", str(tmp_path)]) == 0

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from neuros.doctor.machine_checks import State, prove_rendering
+from neuros.doctor.checks import prove_rendering
 from neuros.installation import machine
+from neuros.ports import State
 from neuros.simulators.mujoco import cameras
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,7 +196,7 @@ class TestDoctor:
     def test_opengl_that_is_not_there_need_not_be(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("neuros.doctor.machine_checks.offscreen_opengl", lambda: "")
+        monkeypatch.setattr("neuros.doctor.checks.offscreen_opengl", lambda: "")
         finding = prove_rendering(without(EGL + OSMESA, tmp_path))
         assert finding.state is State.ABSENT
         assert "neither EGL" in finding.text

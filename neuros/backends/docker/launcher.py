@@ -8,11 +8,10 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import requests
@@ -20,15 +19,17 @@ from docker import DockerClient
 from docker.errors import DockerException
 
 from neuros.backends.child_processes import signal_in_words
+from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_socket
 from neuros.backends.docker.images import Image, images_for
+from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import container_settings, shared_memory, user_for
-from neuros.backends.leftover_containers import RUN_LABEL
 from neuros.backends.node_command import last_line, log_file, node_folder, script_failure
-from neuros.backends.placement import Cores, on_cores
+from neuros.backends.placement import on_cores
 from neuros.backends.run_processes import RUN_ID, RunProcesses
 from neuros.backends.shared_memory import hold
 from neuros.errors import EnvironmentFault
+from neuros.ports import NodeProgram
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import NodeFile
 from neuros.project.resources import memory_text
@@ -79,27 +80,14 @@ def find_containers(names: Iterable[str], project_folder: Path | None) -> Contai
 class DockerLauncher:
     """Starts one container per node (:class:`neuros.ports.Launcher`).
 
-    Args:
-        options: of the command ``node``, as ``--debug``.
-        on_started: is told the socket of the engine, and a folder that is to be removed in the end,
-            before the first container is made.
-        placement: the cores of each node, by name; the kernel places those that are not in it.
+    Its reaper hears of the engine, and of the folder that the containers share, before the first
+    of them is made.
     """
 
-    def __init__(
-        self,
-        containers: Containers,
-        options: Sequence[str] = (),
-        on_started: Callable[[str, Path], None] | None = None,
-        placement: Mapping[str, Cores] = MappingProxyType({}),
-        environ: Mapping[str, str] = os.environ,
-    ) -> None:
+    def __init__(self, containers: Containers, program: NodeProgram) -> None:
         self._engine = containers.engine
         self._images = containers.images
-        self._options = tuple(options)
-        self._on_started = on_started
-        self._placement = placement
-        self._environ = environ
+        self._program = program
         self._is_rootless = containers.abilities.is_rootless
 
     def start(
@@ -107,8 +95,10 @@ class DockerLauncher:
     ) -> Sequence[RunningContainer]:
         """Start a container per node, side by side, all or none. Raises ``EnvironmentFault``."""
         folder = shared_memory(environment.get(RUN_ID, ""))
-        if self._on_started:
-            self._on_started(engine_socket(self._engine), folder)
+        socket = engine_socket(self._engine)
+        if self._program.reaper:
+            self._program.reaper.clean_with(leftovers.__name__, socket)
+            self._program.reaper.remove_later(folder)
         try:
             folder.mkdir(mode=0o700)
             hold(folder)
@@ -167,19 +157,18 @@ class DockerLauncher:
         return container_settings(
             file,
             self._images[file.node.container],
-            user_for(file, self._environ, is_rootless=self._is_rootless),
-            self._options,
+            user_for(file, self._program.environ, is_rootless=self._is_rootless),
+            self._program,
             environment,
             others=[path for path in in_run_folder if path != node_folder(file)],
-            cores=self._placement.get(file.node.name),
             launcher_pid=os.getpid(),
         )
 
     def _description(self, file: NodeFile) -> str:
         node, image = file.node, self._images[file.node.container]
-        command = shlex.join([*image.start, "-m", "neuros.cli", "node", *self._options])
+        command = shlex.join(self._program.command(image.start))
         facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
-        where = on_cores(self._placement.get(node.name))
+        where = on_cores(self._program.cores.get(node.name))
         return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
 
 

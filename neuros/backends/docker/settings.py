@@ -18,7 +18,7 @@ from typing import Any
 from neuros.backends.containers import PACKAGE
 from neuros.backends.docker.images import Image
 from neuros.backends.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
-from neuros.backends.leftover_containers import RUN_LABEL
+from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.node_command import (
     DEFAULTS,
     log_file,
@@ -31,6 +31,7 @@ from neuros.backends.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.backends.run_processes import RUN_ID
 from neuros.control import CONTROL_VARIABLE
 from neuros.errors import EnvironmentFault
+from neuros.ports import NodeProgram
 from neuros.project.model import NodeFile
 
 # Discovery stays on this machine, so that nodes have to share its network. Large packets go through
@@ -106,28 +107,26 @@ def container_settings(
     file: NodeFile,
     image: Image,
     user: User,
-    options: Sequence[str],
+    program: NodeProgram,
     environment: Mapping[str, str],
     *,
     others: Sequence[Path] = (),
-    cores: Cores | None = None,
     launcher_pid: int = 0,
 ) -> dict[str, Any]:
     """The arguments of ``docker.containers.create`` for a node.
 
     Args:
         file: the node with the paths of this machine.
-        options: of the command ``node``, as ``--debug``.
         environment: what the run adds to that of each node.
         others: what is in the run folder and not the node's own; it can only read that.
         launcher_pid: said in a label.
     """
     node, resources = file.node, file.node.resources
-    run_id = environment.get(RUN_ID, "")
+    run_id, cores = environment.get(RUN_ID, ""), program.cores.get(node.name)
     settings: dict[str, Any] = {
         "image": image.id,
         "name": container_name(file, run_id),
-        "entrypoint": start_command(file, image, options),
+        "entrypoint": start_command(file, image, program),
         "command": [],
         "environment": _environment(file, user, environment, cores),
         "working_dir": str(FOLDERS.run),
@@ -169,13 +168,12 @@ def shared_memory(run_id: str) -> Path:
     return SHARED_MEMORY / f"neuros_{run_id}"
 
 
-def start_command(file: NodeFile, image: Image, options: Sequence[str]) -> list[str]:
+def start_command(file: NodeFile, image: Image, program: NodeProgram) -> list[str]:
     """The command of a container, in place of the image's own."""
     seen = inside(file)
-    command = [*image.start, "-m", "neuros.cli", "node", *options]
     return [
         *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
-        *start_arguments(command, [seen]),
+        *start_arguments(program.command(image.start), [seen]),
     ]
 
 

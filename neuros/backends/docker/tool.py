@@ -11,11 +11,12 @@ from typing import Any
 import requests
 from docker.errors import DockerException, ImageNotFound
 
+from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import connect, engine_faults, engine_socket
-from neuros.backends.leftover_containers import RUN_LABEL
-from neuros.backends.reaper import Reaper
+from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault
+from neuros.ports import Reaper
 
 IMAGE = "neuros_tools"
 _X11 = Path("/tmp/.X11-unix")
@@ -71,7 +72,7 @@ class ToolContainer:
 
     def announce(self, reaper: Reaper) -> None:
         """Have it removed if the launcher is killed."""
-        reaper.watch_engine(engine_socket(self._engine))
+        reaper.clean_with(leftovers.__name__, engine_socket(self._engine))
 
     def finish(self) -> None:
         """End it with the run."""

@@ -26,6 +26,7 @@ from neuros.backends.docker.settings import container_name, shared_memory
 from neuros.backends.run_processes import RUN_ID, environ_of
 from neuros.backends.sessions import Session, reaper_environment
 from neuros.errors import EnvironmentFault
+from neuros.ports import NodeProgram
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split
@@ -469,8 +470,7 @@ def test_a_name_that_is_taken_is_said_and_nothing_is_left(
         (tmp_path / node.node.name).mkdir()
         (tmp_path / node.node.name / "node.json").touch()
     containers = find_containers(["neuros_python"], None)
-    folders: list[Path] = []
-    launcher = DockerLauncher(containers, on_started=lambda _, folder: folders.append(folder))
+    launcher = DockerLauncher(containers, NodeProgram())
     taken = containers.engine.containers.create(
         containers.images["neuros_python"].id, ["true"], name=container_name(b, run_id)
     )
@@ -481,8 +481,7 @@ def test_a_name_that_is_taken_is_said_and_nothing_is_left(
     finally:
         taken.remove()
         containers.engine.close()
-        for folder in folders:
-            folder.rmdir()
+        shared_memory(run_id).rmdir()
 
 
 # ------------------------------------------------------------------ packets

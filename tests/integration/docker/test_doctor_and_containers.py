@@ -7,9 +7,10 @@ import os
 import pytest
 
 from containers import require_containers
+from neuros.backends.docker.back_end import look_at_containers
 from neuros.cli.main import main
-from neuros.doctor.delivery import prove_delivery
-from neuros.doctor.machine_checks import State, look_at_containers
+from neuros.doctor.checks import prove_delivery
+from neuros.ports import State
 
 
 @pytest.fixture(autouse=True)

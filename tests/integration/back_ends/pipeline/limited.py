@@ -1,4 +1,4 @@
-"""Takes a number every 10 ms at most, although it could see others in between."""
+"""Takes a number every 20 ms at most, although it could see others in between."""
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise, neuros_tick
 
@@ -8,7 +8,7 @@ def begin(node):
     node.set_user_data([])
 
 
-@neuros_tick(seconds=0.01, outputs="permit")
+@neuros_tick(seconds=0.02, outputs="permit")
 def permit(node):
     return node.make_packet("permit")
 

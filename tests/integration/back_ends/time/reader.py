@@ -1,8 +1,8 @@
-"""Reads the clock."""
+"""Reads the clock, and leaves a file where it has."""
 
 from neuros.hooks import neuros_function
 
 
 @neuros_function(inputs="clock")
 def read(node, clock):
-    pass
+    (node.run_dir / "seen").touch()

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
-from neuros.doctor import machine_checks
-from neuros.doctor.machine_checks import Finding, State, bad
+from neuros.backends.docker.back_end import look_at_containers
+from neuros.doctor import checks
+from neuros.ports import Finding, State
 
 
 def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:
-    return {finding.subject: finding for finding in machine_checks.look_at_machine(environ or {})}
+    return {finding.subject: finding for finding in checks.look_at_machine(environ or {})}
 
 
 def test_nothing_is_wrong_with_a_machine_that_runs_the_tests() -> None:
@@ -41,7 +42,7 @@ def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
 def test_shared_memory_that_is_missing_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(machine_checks, "SHARED_MEMORY", tmp_path / "none")
+    monkeypatch.setattr(checks, "SHARED_MEMORY", tmp_path / "none")
     assert findings()["memory"].state is State.BAD
     assert str(tmp_path / "none") in findings()["memory"].text
 
@@ -77,7 +78,7 @@ def test_a_gpu_tool_that_fails_is_a_problem(
 
 
 def test_a_finding_is_one_line_with_its_remedy() -> None:
-    assert str(bad("ROS 2", "not installed", "run ./install.py")) == (
+    assert str(Finding.bad("ROS 2", "not installed", "run ./install.py")) == (
         "PROBLEM  ROS 2        not installed: run ./install.py"
     )
 
@@ -86,7 +87,7 @@ def test_a_finding_is_one_line_with_its_remedy() -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_without_an_engine_one_line_says_why_and_nothing_is_wrong(tmp_path: Path) -> None:
     environ = {"DOCKER_HOST": f"unix://{tmp_path}/none.sock"}
-    (finding,) = machine_checks.look_at_containers(["neuros_python"], environ)
+    (finding,) = look_at_containers(["neuros_python"], environ)
     assert finding.state is State.ABSENT
     assert finding.subject == "Docker"
     assert f"{tmp_path}/none.sock" in finding.text

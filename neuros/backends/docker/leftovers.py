@@ -23,7 +23,7 @@ _RESUME_TIMEOUT_S = 1.0
 _POLL_S = 0.05
 
 
-def remove_containers(engine_socket: str, run_id: str, *, settle_s: float, give_up_s: float) -> int:
+def remove(engine_socket: str, run_id: str, *, settle_s: float, give_up_s: float) -> int:
     """Kill and remove what carries the label of a run, until nothing does; how many are left.
 
     ``settle_s``: how long nothing must have been there, since what a killed launcher had asked
@@ -53,7 +53,7 @@ def remove_containers(engine_socket: str, run_id: str, *, settle_s: float, give_
     return len(left)
 
 
-def resume_containers(engine_socket: str, run_id: str) -> None:
+def resume(engine_socket: str, run_id: str) -> None:
     """Resume the paused containers of a run.
 
     A paused process (``docker pause``) cannot end, and with control groups of version 1 no signal

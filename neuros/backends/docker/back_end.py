@@ -1,0 +1,155 @@
+"""The back end ``docker``: one container per node."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuros.backends.containers import STANDARD
+from neuros.backends.docker.layout import as_here, inside, outside
+from neuros.errors import EnvironmentFault
+from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, Notice
+from neuros.project.model import Folders, Node, NodeFile, Project
+
+if TYPE_CHECKING:
+    from neuros.backends.docker.launcher import Containers
+
+# What faults of the engine end with; it is no news where nodes run without containers.
+_WITHOUT = ", or run without containers: --backend process"
+
+
+class Docker(BackEnd):
+    """Takes part in ``auto`` before processes: where an engine answers and has the images."""
+
+    name = "docker"
+    place = "a container"
+    rank = 100
+    has_own_pythons = True
+
+    def prepare(
+        self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
+    ) -> Deployment:
+        if find_spec("docker") is None:
+            raise EnvironmentFault("the Python package docker is not installed: run install.py")
+        # The Docker SDK is slow to import.
+        from neuros.backends.docker.launcher import find_containers
+
+        names = dict.fromkeys(node.container for node in nodes)
+        return _Containers(find_containers(names, project.folder), nodes)
+
+    def why_not(self, fault: EnvironmentFault) -> str:
+        reason, *others = super().why_not(fault).split(" (and ")
+        return " (and ".join([reason.removesuffix(_WITHOUT), *others])
+
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        return look_at_containers(STANDARD, environ)
+
+    def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
+        return outside(file, folders, messages)
+
+    def place_in(self, record: Mapping[str, Any], node: str) -> str:
+        nodes = record["expanded_project"]["nodes"]
+        (container,) = (each["container"] for each in nodes if each["name"] == node)
+        engine = record["docker"]  # None where the engine had gone away
+        return f"image {engine['images'][container]['name'] if engine else container}"
+
+    def provenance(self, record: Mapping[str, Any]) -> Mapping[str, str]:
+        images = ((record.get("docker") or {}).get("images") or {}).values()
+        return {"images": ", ".join(image["name"] for image in images)}
+
+
+BACK_END = Docker()
+
+
+class _Containers(Deployment):
+    """Containers for nodes: the engine and their images."""
+
+    def __init__(self, containers: Containers, nodes: Sequence[Node]) -> None:
+        self._containers = containers
+        self.notices = [
+            *(("WARN", each.notice) for each in containers.images.values() if each.notice),
+            *without_limits(nodes, containers.abilities.unkept),
+            *_without_display(nodes, os.environ),
+        ]
+
+    def launcher(self, program: NodeProgram) -> Launcher:
+        from neuros.backends.docker.launcher import DockerLauncher
+
+        return DockerLauncher(self._containers, program)
+
+    def as_seen(self, file: NodeFile) -> NodeFile:
+        return inside(file)
+
+    def as_here(self, text: str, folders: Folders) -> str:
+        return as_here(text, folders)
+
+    def record(self) -> Mapping[str, Any]:
+        try:
+            return {"docker": self._containers.record()}
+        except EnvironmentFault:  # the engine has gone away, of which the run has ended
+            return {"docker": None}
+
+
+def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[Notice]:
+    """One line on limits that the engine does not keep."""
+    asking = [
+        node.name
+        for node in nodes
+        if any(getattr(node.resources, limit) is not None for limit in unkept)
+    ]
+    if not asking:
+        return ()
+    return [
+        (
+            "WARN",
+            f"resources of {', '.join(asking)}: this Docker engine has no control groups for them"
+            " (docker info), so they do not hold",
+        )
+    ]
+
+
+def _without_display(nodes: Sequence[Node], environ: Mapping[str, str]) -> Sequence[Notice]:
+    """One line on nodes that ask for a display where there is none."""
+    asking = [node.name for node in nodes if node.access.display]
+    if not asking or environ.get("DISPLAY"):
+        return ()
+    return [("WARN", f"{', '.join(asking)} asks for a display, and DISPLAY is not set: no windows")]
+
+
+def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
+    """The engine and, if it answers, the images of containers of NeuROS's own."""
+    if find_spec("docker") is None:
+        yield Finding.absent("Docker", "its Python package is not installed", "run ./install.py")
+        return
+    from neuros.backends.docker.engine import connect, engine_faults
+    from neuros.backends.docker.images import image_for
+
+    try:
+        engine = connect(environ)
+    except EnvironmentFault as fault:
+        yield Finding.absent("Docker", str(fault))
+        return
+    with closing(engine):
+        try:
+            with engine_faults("the engine"):
+                version = engine.version()
+        except EnvironmentFault as fault:
+            yield Finding.bad("Docker", str(fault))
+            return
+        text = f"engine {version['Version']}, API {version['ApiVersion']}"
+        yield Finding.good("Docker", text)
+        for name in names:
+            try:
+                image = image_for(name, None, engine)
+            except EnvironmentFault as fault:
+                yield Finding.absent("image", str(fault))
+                continue
+            python = "{}.{}".format(*image.python_version)
+            if image.notice:
+                yield Finding.absent("image", image.notice)
+            else:
+                yield Finding.good("image", f"{image.name}, Python {python}")

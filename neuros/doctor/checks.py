@@ -1,0 +1,223 @@
+"""Report of ``neuros doctor``: what this machine has, what back ends find, and proof of delivery.
+
+The proof is a project of two nodes, run as any other. That nodes see each other's topics proves
+nothing: shared memory that is not shared loses every packet without a word. So one node sends
+images, the other answers with what it has read in them.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+from neuros.api.loading import load_with_messages
+from neuros.backends.domain import choose_domain
+from neuros.backends.placement import usable_cores
+from neuros.backends.registered import BACK_ENDS
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
+from neuros.ports import BackEnd, Finding
+from neuros.recording.run_file import read_run_file
+
+PROJECT = Path(__file__).with_name("delivery")
+SHARED_MEMORY = Path("/dev/shm")
+_LEAST_SHARED_BYTES = 64 * 2**20
+"""What Docker gives a container, too, if it is not asked for more."""
+_EXTRAS = (
+    ("MuJoCo", "mujoco", "./install.py --extras mujoco"),
+    ("NEST", "nest-simulator", "./install.py --extras nest"),
+    ("Matplotlib", "matplotlib", "./install.py --extras plot"),
+)
+_GPU_TIMEOUT_S = 10.0
+_RENDERING_TIMEOUT_S = 60.0
+_DELIVERY_TIMEOUT_S = 60.0
+
+
+def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
+    """All findings, one after another.
+
+    Args:
+        proves: whether to start nodes on each back end that can be used.
+    """
+    yield from look_at_machine(environ)
+    yield prove_rendering(environ)
+    back_ends: list[BackEnd] = []
+    try:
+        for name in BACK_ENDS:
+            try:
+                back_ends.append(BACK_ENDS.load(name))
+            except EnvironmentFault as fault:
+                yield Finding.bad("back end", str(fault))
+    except EnvironmentFault as fault:  # two distributions share a name
+        yield Finding.bad("back end", str(fault))
+    for back_end in back_ends:
+        yield from back_end.checks(environ)
+    if not proves:
+        return
+    project = load_with_messages(PROJECT)[0].project
+    for back_end in sorted(back_ends, key=lambda each: each.rank or 0):
+        try:
+            back_end.prepare(project, project.nodes, {})
+        except EnvironmentFault as fault:
+            yield Finding.absent(
+                "delivery", f"{back_end.name}: not tried: {back_end.why_not(fault)}"
+            )
+        else:
+            yield prove_delivery(back_end.name)
+
+
+def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
+    """All findings about this machine, one after another."""
+    yield _python()
+    yield _package("ROS 2", "ros-jazzy-rclpy") or Finding.bad(
+        "ROS 2", "not installed", "run ./install.py"
+    )
+    for subject, distribution, remedy in _EXTRAS:
+        yield _package(subject, distribution) or Finding.absent(subject, "not installed", remedy)
+    yield Finding.good("cores", f"{len(usable_cores())} usable")
+    yield _shared_memory(SHARED_MEMORY)
+    yield _domain(environ)
+    yield _display(environ)
+    yield _gpu()
+
+
+def _python() -> Finding:
+    text = f"{platform.python_version()} ({sys.executable})"
+    try:
+        Machine.here().require_support()
+    except EnvironmentFault as fault:
+        return Finding.bad("Python", text, str(fault))
+    return Finding.good("Python", text)
+
+
+def _package(subject: str, distribution: str) -> Finding | None:
+    """``None`` if it is not installed."""
+    try:
+        return Finding.good(subject, f"{distribution} {metadata.version(distribution)}")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _shared_memory(folder: Path) -> Finding:
+    subject = "memory"
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return Finding.bad(
+            subject,
+            f"{folder} cannot be written",
+            "packets go between processes through it; mount a tmpfs there",
+        )
+    free_bytes = shutil.disk_usage(folder).free
+    text = f"{free_bytes / 2**20:.0f} MiB free in {folder}"
+    if free_bytes < _LEAST_SHARED_BYTES:
+        return Finding.bad(subject, text, "images need more; end other runs, or mount it larger")
+    return Finding.good(subject, text)
+
+
+def _domain(environ: Mapping[str, str]) -> Finding:
+    try:
+        with choose_domain(None, environ, False) as domain:
+            return Finding.good("domain", f"{domain.reason} would be used")
+    except (EnvironmentFault, UsageError) as error:
+        return Finding.bad("domain", str(error))
+
+
+def _display(environ: Mapping[str, str]) -> Finding:
+    for variable in ("WAYLAND_DISPLAY", "DISPLAY"):
+        if environ.get(variable):
+            return Finding.good("display", f"{variable}={environ[variable]}")
+    return Finding.absent("display", "none; figures go to files, and viewers do not open")
+
+
+def prove_rendering(environ: Mapping[str, str]) -> Finding:
+    """Render one picture with the OpenGL that simulated cameras would use."""
+    subject = "cameras"
+    if find_spec("mujoco") is None:
+        return Finding.absent(subject, "not tried without MuJoCo")
+    program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
+    command = [sys.executable, "-c", program]
+    try:
+        done = subprocess.run(
+            command,
+            env=dict(environ),
+            capture_output=True,
+            text=True,
+            timeout=_RENDERING_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Finding.bad(
+            subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl()
+        )
+    if done.returncode == 0:
+        return Finding.good(subject, f"a picture was rendered with {done.stdout.strip()}")
+    rows = done.stderr.strip().splitlines() or [f"rendering ends with {done.returncode}"]
+    is_expected = bool(environ.get("MUJOCO_GL") or offscreen_opengl())
+    return (Finding.bad if is_expected else Finding.absent)(subject, rows[-1])
+
+
+def _gpu() -> Finding:
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return Finding.absent("GPU", "no nvidia-smi; everything runs on the processor")
+    command = [program, "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(
+            command, capture_output=True, text=True, timeout=_GPU_TIMEOUT_S, check=True
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        return Finding.bad("GPU", f"nvidia-smi fails ({error})", "mend the driver")
+    return Finding.good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))
+
+
+def prove_delivery(backend: str, project: Path = PROJECT) -> Finding:
+    """Run the project on a back end; it ends by itself when all images have come back."""
+    subject = "delivery"
+    with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
+        run = Path(folder) / "run"
+        command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
+        command += ["--backend", backend, "-o", str(run)]
+        with subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        ) as launcher:
+            try:
+                output, _ = launcher.communicate(timeout=_DELIVERY_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                launcher.terminate()
+                output, _ = launcher.communicate()
+                return Finding.bad(
+                    subject, f"{backend}: no end after {_DELIVERY_TIMEOUT_S:g} s", _last(output)
+                )
+            except BaseException:
+                launcher.terminate()
+                raise
+        if launcher.returncode:
+            return Finding.bad(subject, f"{backend}: failed", _last(output))
+        return _judge(backend, read_run_file(run))
+
+
+def _judge(backend: str, record: dict[str, object]) -> Finding:
+    connections = record["connections"]
+    assert isinstance(connections, list)
+    counts = [f"{c['consumed']} of {c['sent']} on {c['connection']}" for c in connections]
+    is_whole = all(c["sent"] and c["consumed"] == c["sent"] for c in connections)
+    text = f"{backend}: packets arrived: {', '.join(counts)}"
+    return (Finding.good if is_whole else Finding.bad)("delivery", text)
+
+
+def _last(output: str) -> str:
+    """What the launcher has said last, which is why it ended."""
+    rows = [row for row in output.splitlines() if row.strip()]
+    return rows[-1] if rows else "it said nothing"

@@ -1,0 +1,139 @@
+"""A back end from another distribution: found by its name, and as good as ours."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from neuros.testing.back_ends import BackEndChecks, Launched, finish, launcher
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+DISTRIBUTION = Path(__file__).parents[1] / "distributions" / "neuros_nice"
+CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
+
+
+def install(site: Path, name: str, back_ends: Mapping[str, str]) -> None:
+    """Put the metadata of a distribution where Python finds them, as pip does."""
+    info = site / f"{name.replace('-', '_')}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    rows = [f"{key} = {value}\n" for key, value in back_ends.items()]
+    (info / "entry_points.txt").write_text("".join(["[neuros.backends]\n", *rows]))
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder in which Python finds the distribution, for programs that are started."""
+    site = tmp_path_factory.mktemp("site")
+    project = tomllib.loads((DISTRIBUTION / "pyproject.toml").read_text())["project"]
+    install(site, project["name"], project["entry-points"]["neuros.backends"])
+    paths = [str(site), str(DISTRIBUTION), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+    return site
+
+
+class TestNice(BackEndChecks):
+    back_end = "nice"
+    options = ("--nice-level", "3")
+
+    def test_its_options_its_notices_and_its_record_are_those_of_the_run(
+        self, run: Callable[..., Launched]
+    ) -> None:
+        launched = run("pipeline")
+        assert "nodes have the nice level 3" in launched.output
+        assert launched.record["nice"] == {"level": 3}
+
+
+def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "neuros.cli", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+
+
+def test_help_names_it_and_its_options() -> None:
+    shown = " ".join(neuros("launch", "--help").stdout.split())
+    assert "back end nice: each node in a process of low priority" in shown
+    assert "--nice-level LEVEL how much lower, 1 to 19 (default: 10)" in shown
+
+
+def test_the_doctor_looks_at_what_it_needs() -> None:
+    assert "ok       nice " in neuros("doctor", "--no-delivery").stdout
+
+
+def test_another_back_end_does_not_take_its_options() -> None:
+    refused = neuros("launch", str(CLOCK), "--backend", "process", "--nice-level", "3")
+    assert refused.returncode == 2
+    assert "unrecognized arguments: --nice-level 3" in refused.stderr
+
+
+def test_a_name_that_is_none_is_refused_with_all_that_there_are() -> None:
+    refused = neuros("launch", str(CLOCK), "--backend", "nic")
+    assert refused.returncode == 2
+    assert refused.stderr == (
+        "neuros: back end 'nic': choose one of auto, docker, process, in-process, nice (did you"
+        " mean 'nice'?)\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "why"),
+    [
+        ("no_such_module:BACK_END", "cannot be loaded: ModuleNotFoundError"),
+        ("neuros_nice:NO_SUCH_NAME", "cannot be loaded: AttributeError"),
+        ("neuros_nice:Nice", "is no BackEnd, but <class 'neuros_nice.Nice'>"),
+        ("neuros_nice:BACK_END", "calls itself 'nice'"),
+    ],
+)
+def test_what_is_broken_is_named_with_its_distribution(
+    installed: Path, value: str, why: str
+) -> None:
+    install(installed, "bad", {"x": value})
+    refused = neuros("launch", str(CLOCK), "--backend", "x")
+    assert refused.returncode == 4
+    assert f"back end 'x' of the distribution bad ({value}) {why}" in refused.stderr
+    assert "pip uninstall bad" in refused.stderr
+
+
+def test_auto_passes_over_what_is_broken_and_says_so(installed: Path, tmp_path: Path) -> None:
+    install(installed, "bad", {"x": "no:X"})
+    folder = tmp_path / "run"
+    described = finish(launcher(CLOCK, folder, "--backend", "auto", "--dry-run"), folder)
+    assert described.exit_code == 0, described.output
+    assert "back end 'x' of the distribution bad (no:X) cannot be loaded" in described.output
+
+
+def test_a_name_that_two_distributions_have_is_refused(installed: Path) -> None:
+    install(installed, "twin", {"process": "twin:X"})
+    refused = neuros("launch", str(CLOCK), "--backend", "auto")
+    assert refused.returncode == 4
+    assert "both neuros and twin have a back end 'process'" in refused.stderr
+
+
+def test_a_launch_by_name_asks_no_metadata() -> None:
+    """Searching those of all distributions takes some 10 ms."""
+    program = (
+        "import sys, neuros.backends.registered as r; r.BACK_ENDS.load('process');"
+        " assert 'importlib.metadata' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-S", "-c", program], check=False).returncode == 0
+
+
+def test_auto_takes_it_in_no_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no rank."""
+    monkeypatch.setenv("DOCKER_HOST", f"unix://{tmp_path}/none.sock")
+    said = neuros("launch", str(CLOCK), "--backend", "auto", "--dry-run").stdout
+    assert said.startswith("back end process;")
+    assert "each node runs in a process, not in a container: no Docker engine answers" in said
