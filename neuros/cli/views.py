@@ -211,7 +211,8 @@ def _run_dashboard(_: argparse.Namespace) -> int:
 
 async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
     from neuros.backends.control_sockets import connect_by
-    from neuros.control import TO_OBSERVERS, ControlLink
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
     from neuros.viewers.dashboard.live_metrics import LiveRun
     from neuros.viewers.dashboard.pages import Pages
     from neuros.viewers.dashboard.server import Dashboard
