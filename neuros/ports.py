@@ -228,6 +228,35 @@ class Middleware(Protocol):
         """Let what was sent last leave, then give up everything."""
 
 
+class TransportKind(ABC):
+    """A way to carry packets. Registered as an entry point of the group ``neuros.transports``.
+
+    Attributes:
+        name: that of the entry point, which a back end names.
+    """
+
+    name: str
+
+    @abstractmethod
+    def middleware(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        digests: bool,
+        record: bool,
+        debug: bool,
+    ) -> Middleware:
+        """The middleware of a process with these nodes.
+
+        Args:
+            on_failure: takes what fails outside of hooks.
+            digests: whether to keep a digest of every packet, whatever that costs.
+            record: whether packets are recorded.
+            debug: whether to log DEBUG records.
+        """
+
+
 class NodeContext(Protocol):
     """The ``node`` that hooks receive, as far as simulators need it."""
 
@@ -479,13 +508,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of ``neuros doctor``.
-
-    Attributes:
-        subject: what was looked at, "Python".
-        text: what was found.
-        remedy: what to do about it, where there is something to do.
-    """
+    """One line of ``neuros doctor``: what was looked at, what was found, and what to do about it."""
 
     state: State
     subject: str
@@ -520,6 +543,7 @@ class BackEnd(ABC):
         place: where it runs a node, as in "each node in *a container*".
         rank: ``--backend auto`` takes the usable one with the highest; ``None``: never this one.
         options: of ``neuros launch`` with this back end.
+        transport: the name of the transport that its nodes use.
         is_one_process: whether all nodes share a process. They take turns then, and hand packets
             over in memory, where ROS tools and other launchers do not see them.
         has_own_pythons: whether nodes run on Pythons that it brings (those of images), and not on
@@ -530,6 +554,7 @@ class BackEnd(ABC):
     place: str
     rank: int | None = None
     options: Sequence[Option] = ()
+    transport = "ros"
     is_one_process = False
     has_own_pythons = False
 
@@ -558,9 +583,7 @@ class BackEnd(ABC):
     def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
         """The inverse of :meth:`Deployment.as_seen`, for a run that is over.
 
-        Args:
-            folders: those of this machine.
-            messages: the folder with built message packages of this machine.
+        ``messages`` is the folder with built message packages of this machine.
         """
         return file
 

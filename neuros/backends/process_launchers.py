@@ -30,6 +30,7 @@ class OneProcess(BackEnd):
 
     name = "in-process"
     place = "one process with all others"
+    transport = "memory"
     is_one_process = True
 
     def prepare(
