@@ -508,7 +508,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of ``neuros doctor``: what was looked at, what was found, and what to do about it."""
+    """One line of ``neuros doctor``: what was looked at, what was found, what to do."""
 
     state: State
     subject: str

@@ -67,19 +67,24 @@ def test_what_is_none_is_not_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 def compared_names(tree: ast.AST) -> set[str]:
-    """The names of parts with which something is compared."""
-    return {
-        constant.value
-        for node in ast.walk(tree)
-        if isinstance(node, (ast.Compare, ast.MatchValue))
-        for constant in ast.walk(node)
-        if isinstance(constant, ast.Constant) and constant.value in NAMES
-    }
+    """The names of parts with which something is compared, alone or in a tuple, list or set."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.MatchValue):
+            operands = [node.value]
+        elif isinstance(node, ast.Compare):
+            operands = [node.left, *node.comparators]
+        else:
+            continue
+        every = [part for each in operands for part in getattr(each, "elts", [each])]
+        found |= {each.value for each in every if isinstance(each, ast.Constant)} & NAMES
+    return found
 
 
 def test_a_comparison_is_found() -> None:
     assert compared_names(ast.parse("if plan.back_end.name == 'docker': pass")) == {"docker"}
     assert compared_names(ast.parse("is_it = name in ('process', 'x')")) == {"process"}
+    assert compared_names(ast.parse("is_it = find('docker') is None")) == set()
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
