@@ -249,11 +249,8 @@ class TransportKind(ABC):
     ) -> Middleware:
         """The middleware of a process with these nodes.
 
-        Args:
-            on_failure: takes what fails outside of hooks.
-            digests: whether to keep a digest of every packet, whatever that costs.
-            record: whether packets are recorded.
-            debug: whether to log DEBUG records.
+        ``on_failure`` takes what fails outside of hooks; ``digests``: keep one of every packet,
+        whatever that costs; ``record``: packets are recorded; ``debug``: log DEBUG records.
         """
 
 
@@ -428,11 +425,10 @@ class Reaper(Protocol):
     def clean_with(self, module: str, argument: str) -> None:
         """Have a module clean up what is no process of this machine: containers, jobs.
 
-        The module needs the standard library only, and has two functions. ``resume(argument,
-        run_id)`` lets paused nodes go on, so that they can end. ``remove(argument, run_id,
-        settle_s=..., give_up_s=...)`` ends and removes what is left, until there was nothing for
-        ``settle_s`` seconds (a killed launcher may just have asked for more), or after
-        ``give_up_s``.
+        It needs the standard library only, and has two functions. ``resume(argument, run_id)``
+        lets paused nodes go on, so that they can end. ``remove(argument, run_id, settle_s=...,
+        give_up_s=...)`` ends and removes what is left, until there was nothing for ``settle_s``
+        seconds (a killed launcher may just have asked for more), or after ``give_up_s``.
         """
 
 
@@ -466,10 +462,7 @@ Notice: TypeAlias = tuple[str, str]
 
 
 class Deployment(ABC):
-    """A back end made ready for some nodes of a project.
-
-    The methods have defaults for nodes that see the files of this machine as the launcher does.
-    """
+    """A back end made ready for some nodes; defaults are for nodes that see files as we do."""
 
     notices: Sequence[Notice] = ()
 
@@ -533,6 +526,16 @@ class Finding:
     def __str__(self) -> str:
         remedy = f": {self.remedy}" if self.remedy else ""
         return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
+
+
+class SimulatorKind(ABC):
+    """A simulator. Registered as an entry point of the group ``neuros.simulators``."""
+
+    name: str
+
+    @abstractmethod
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        """What ``neuros doctor`` finds of it: its version, or how to install it; what it needs."""
 
 
 class BackEnd(ABC):

@@ -13,6 +13,7 @@ from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd
 from neuros.registry import OWN
+from neuros.simulators.registered import SIMULATORS
 from neuros.transport.registered import TRANSPORTS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,9 +30,9 @@ def test_our_back_ends_can_be_loaded_and_say_what_help_needs(name: str) -> None:
     assert back_end.place
 
 
-@pytest.mark.parametrize("name", [*TRANSPORTS])
-def test_our_transports_can_be_loaded(name: str) -> None:
-    assert TRANSPORTS.load(name).name == name
+def test_our_transports_and_simulators_can_be_loaded() -> None:
+    for registry in (TRANSPORTS, SIMULATORS):
+        assert [registry.load(name).name for name in registry] == [*registry]
 
 
 def test_the_build_takes_our_parts_from_where_they_are_read() -> None:
