@@ -45,6 +45,7 @@ class Option:
         parse: makes the value of the text; its ``ValueError`` is a usage error.
         metavar: what stands for the value in help texts.
         choices: the values that are allowed, or a function that returns them.
+        suggestions: what a shell completes, a function; other values are allowed.
         is_repeatable: whether it may be given several times; its value is a tuple.
         is_negatable: whether ``--x`` has a ``--no-x``; its default may then be ``None``.
         variable: an environment variable that holds its default.
@@ -61,6 +62,7 @@ class Option:
     parse: Callable[[str], Any] | None = None
     metavar: str | None = None
     choices: Sequence[str] | Callable[[], Iterable[str]] | None = None
+    suggestions: Callable[[], Iterable[str]] | None = None
     is_repeatable: bool = False
     is_negatable: bool = False
     variable: str | None = None
@@ -188,8 +190,8 @@ def takes(
 
 
 def _argument_help(option: Option) -> str:
-    flag = f" (``{option.flags[-1]}``)" if option.flags else ""
-    return f"    {option.name}{flag}: {option.full_help}."
+    flag = f"``{option.flags[-1]}``: " if option.flags else ""
+    return f"    {option.name}: {flag}{option.full_help}."
 
 
 def add_options(
@@ -205,7 +207,15 @@ def add_options(
             if each.group not in groups:
                 groups[each.group] = parser.add_argument_group(each.group)
             target = groups[each.group]
-        target.add_argument(*each.flags, dest=each.name, help=each.full_help, **_keywords(each))
+        keywords = _keywords(each)
+        action = target.add_argument(*each.flags, dest=each.name, help=each.full_help, **keywords)
+        if each.suggestions is not None:
+            vars(action)["completer"] = _completer(each.suggestions)
+
+
+def _completer(suggestions: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
+    """What argcomplete calls."""
+    return lambda **_: [*suggestions()]
 
 
 def _keywords(option: Option) -> dict[str, Any]:

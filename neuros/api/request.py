@@ -23,6 +23,12 @@ OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 _RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
 
 
+def _back_ends() -> Iterable[str]:
+    from neuros.backends.registered import AUTO, BACK_ENDS
+
+    return [AUTO, *BACK_ENDS]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions:
     """Changes to a project, for every command that reads one."""
@@ -96,6 +102,7 @@ class Request(ProjectOptions):
         "--backend",
         default="auto",
         variable="NEUROS_BACKEND",
+        suggestions=_back_ends,
         metavar="NAME",
         page="back_ends.md",
         help="run nodes on this back end: each in a container (docker), each in a process"
@@ -183,7 +190,9 @@ class Request(ProjectOptions):
         help="show how far the run has come: in a terminal a line that stays, elsewhere a line"
         " every 10 s",
     )
-    verbose: bool = option("-v", "--verbose", default=False, help="show DEBUG records, too")
+    verbose: bool = option(
+        "-v", "--verbose", default=False, is_recorded=False, help="show DEBUG records, too"
+    )
 
     def __post_init__(self) -> None:
         for each in options_of(self):

@@ -53,6 +53,23 @@ def thrown(seed: int, faces: int = 6) -> list[int]:
 # ------------------------------------------------------------------ results
 
 
+def test_a_run_takes_the_options_of_launch_and_records_them(tmp_path: Path) -> None:
+    run = project(tmp_path).run(
+        backend="in-process", namespace="/left", placement=False, duration="9", seed=3, nodes=[]
+    )
+    assert run.record["namespace"] == "/left"
+    asked = run.record["options"]
+    told = {"backend": "in-process", "placement": False, "duration": "9", "seed": 3, "nodes": []}
+    assert asked == asked | told
+    assert not {"output", "verbose", "show", "check", "progress"} & {*asked}
+    assert "duration: ``--duration``: end the run" in (neuros.Project.run.__doc__ or "")
+
+
+def test_an_argument_that_there_is_none_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="'duratoin'"):
+        project(tmp_path).run(duratoin=1)  # type: ignore[call-arg]
+
+
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = ["process", "in-process", pytest.param("docker", marks=ACCEPTANCE)]
 

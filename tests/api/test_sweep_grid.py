@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.api.grid import Point, parse_values, points_of, short_names
+from neuros.api.sweep import Point, parse_values, points_of, short_names
 from neuros.errors import UsageError
 
 RATE = "nodes.robot.environment.RATE"
