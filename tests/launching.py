@@ -70,7 +70,7 @@ class Running:
         self.process = process
         self._cwd = cwd
         self._before = before
-        self._output = b""
+        self._output = bytearray()
 
     @property
     def output(self) -> str:
@@ -83,6 +83,10 @@ class Running:
         while text not in self.output:
             if not self._read(deadline_s):
                 raise AssertionError(f"{text!r} was not printed:\n{self.output}")
+
+    def read(self, timeout_s: float) -> bool:
+        """Read what comes next; False at the end of the output, and where nothing comes in time."""
+        return self._read(time.monotonic() + timeout_s)
 
     def signal(self, number: int) -> None:
         """Send a signal to the launcher alone."""

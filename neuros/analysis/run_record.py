@@ -38,6 +38,9 @@ class Ended(Protocol):
     @property
     def running_s(self) -> float | None: ...
 
+    @property
+    def real_time_factor(self) -> float | None: ...
+
 
 def run_record(
     project: Project,
@@ -60,9 +63,7 @@ def run_record(
         "sim_s": sim_s,
         "running_s": all_ran_s,
         "paused_s": ended.paused_s,
-        "real_time_factor": None
-        if sim_s is None or not ended.running_s
-        else sim_s / ended.running_s,
+        "real_time_factor": ended.real_time_factor,
         "timeline": {
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },

@@ -11,7 +11,6 @@ import contextlib
 import os
 import socket
 from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from neuros.control import CONTROL_VARIABLE
@@ -76,6 +75,8 @@ def connect(address: str) -> ControlStream:
     scheme, _, place = address.partition(":")
     if scheme == _SCHEME:
         return _connect_unix(Path(place))
+    from importlib.metadata import entry_points
+
     found = {each.name: each for each in entry_points(group=_GROUP)}
     if scheme not in found:
         known = ", ".join([_SCHEME, *found])

@@ -14,7 +14,7 @@ import contextlib
 import selectors
 import socket
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from neuros.control import (
     FROM_NODES,
@@ -207,28 +207,22 @@ class PauseState:
             self.send(Step(count, is_driven))
 
 
+@dataclass
 class Observers:
     """The observers of one run.
 
     Args:
-        is_driven: whether some node starts hooks unasked, and so drives the project.
-        end: ends the run, drained: ``end(reason)``.
+        _is_driven: whether some node starts hooks unasked, and so drives the project.
+        _end: ends the run, drained: ``end(reason)``.
     """
 
-    def __init__(
-        self,
-        channels: Channels,
-        pause: PauseState,
-        is_driven: Callable[[], bool],
-        end: Callable[[str], None],
-    ) -> None:
-        self._channels = channels
-        self._pause = pause
-        self._is_driven = is_driven
-        self._end = end
-        self._links: dict[int, ControlLink] = {}  # by their numbers, which are not given out again
-        self._count = 0
-        self._told: PhaseChanged | None = None
+    _channels: Channels
+    _pause: PauseState
+    _is_driven: Callable[[], bool]
+    _end: Callable[[str], None]
+    _links: dict[int, ControlLink] = field(default_factory=dict)  # numbers are not given out again
+    _count: int = 0
+    _told: PhaseChanged | None = None
 
     def take(self, link: ControlLink, message: Message) -> None:
         """Take a message from or for an observer."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -101,6 +102,25 @@ class Outcome:
             start_s = max(owners, default=self.ending_s)
         return max(0.0, self.ending_s - start_s)
 
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated seconds per second of :attr:`running_s`.
+
+        What a simulator did while other nodes were still initialising does not count.
+        """
+        times = {
+            name: report.sim_time
+            for name, report in self.reports.items()
+            if report.sim_time is not None
+        }
+        running_s = self.running_s
+        if not times or not running_s or self.ending_s is None:
+            return None
+        owner = max(times, key=times.__getitem__)
+        # Running time leaves pauses out, points of a timeline do not.
+        start_s = self.ending_s - running_s - self.paused_s
+        return (times[owner] - _simulated(self.timelines.get(owner, ()), start_s)) / running_s
+
     def take(self, report: Report, now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
         name = report.node
@@ -133,6 +153,19 @@ class Outcome:
             self.exit_code, self.reason = exit_code, reason
 
 
+def _simulated(timeline: Sequence[Sequence[float]], wall_s: float) -> float:
+    """The simulated time at a wall time, between two points linearly; 0 before the first one."""
+    after = bisect_right(timeline, wall_s, key=lambda point: point[1])
+    if after == 0:
+        return 0.0
+    (sim_s, since_s), following = timeline[after - 1], timeline[after:]
+    if not following:
+        return float(sim_s)
+    next_sim_s, next_s = following[0]
+    return float(sim_s + (next_sim_s - sim_s) * (wall_s - since_s) / (next_s - since_s))
+
+
+@dataclass
 class Processes:
     """Processes that the back end has started, judged by the reports of their nodes.
 
@@ -140,12 +173,11 @@ class Processes:
         killed: the names of all nodes whose processes were killed.
     """
 
-    def __init__(self, detector: StallDetector, outcome: Outcome) -> None:
-        self._detector = detector
-        self._outcome = outcome
-        self._running: list[RunningNode] = []
-        self._has_told_failure: set[str] = set()
-        self.killed: set[str] = set()
+    _detector: StallDetector
+    _outcome: Outcome
+    _running: list[RunningNode] = field(default_factory=list)
+    _has_told_failure: set[str] = field(default_factory=set)
+    killed: set[str] = field(default_factory=set)
 
     def add(self, started: Sequence[RunningNode]) -> None:
         """These run from now on."""

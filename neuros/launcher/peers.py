@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from neuros.control import Report
 from neuros.project.model import Connection, NodeFile
 
-Books = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
-"""``books[node]["outgoing" or "incoming"][connection]``: counters, as in a node's metrics."""
+Counters = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
+"""``counters[node]["outgoing" or "incoming"][connection]``: counters, as in a node's metrics."""
 
 RUNNING, DRAINING, DRAINED, STOPPING, OVER = "running", "draining", "drained", "stopping", "over"
 _BEGUN = (RUNNING, DRAINING, DRAINED)
@@ -41,7 +41,7 @@ class PeerState:
         exit_code, reason: how it ends, from when it is to end on.
         origin: the machine on which the cause of that lies.
         drain_s: for how long it drains at most.
-        books: of the connections between peers, when drained or over.
+        counters: of the connections between peers, when drained or over.
     """
 
     run: str
@@ -52,7 +52,7 @@ class PeerState:
     reason: str = ""
     origin: str = ""
     drain_s: float = 0.0
-    books: Books = field(default_factory=dict)
+    counters: Counters = field(default_factory=dict)
 
     def to_text(self) -> str:
         """As it travels."""
@@ -77,7 +77,7 @@ def state_from(text: str) -> PeerState | None:
         return None
 
 
-def books_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -> Books:
+def counters_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -> Counters:
     """The counters of connections to peers, from the reports of the nodes here."""
     keys = {str(connection) for connection in crossing}
     return {
@@ -90,9 +90,11 @@ def books_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -> B
     }
 
 
-def count(books: Books, node: str, part: str, connection: Connection, what: str) -> int | None:
+def count(
+    counters: Counters, node: str, part: str, connection: Connection, what: str
+) -> int | None:
     """One counter, ``None`` where it is not known."""
-    found = books.get(node, {}).get(part, {}).get(str(connection), {}).get(what)
+    found = counters.get(node, {}).get(part, {}).get(str(connection), {}).get(what)
     return None if found is None else int(found)
 
 
@@ -161,9 +163,9 @@ class Peers:
         Others count it as drained only while the counters of both ends are equal. A packet under
         way shows in them (Mattern's counters, see :mod:`neuros.launcher.quiescence`).
         """
-        books = books_of(probes, self._crossing)
-        if (self._own.phase, self._own.books) != (DRAINED, books):
-            self._utter(phase=DRAINED, books=books)
+        counters = counters_of(probes, self._crossing)
+        if (self._own.phase, self._own.counters) != (DRAINED, counters):
+            self._utter(phase=DRAINED, counters=counters)
         return all(self._agrees(state) for state in self._living())
 
     def unsettle(self) -> None:
@@ -179,7 +181,7 @@ class Peers:
         """All nodes here have made their final report; returns whether they may go."""
         if self._over_s is None:
             self._over_s = now_s
-            self._utter(phase=OVER, books=books_of(reports, self._crossing))
+            self._utter(phase=OVER, counters=counters_of(reports, self._crossing))
         return not self._unfinished() or now_s - self._over_s >= _PATIENCE_S
 
     # ------------------------------------------------------------------ hearing
@@ -223,10 +225,10 @@ class Peers:
         reason = f"the project ended elsewhere ({worst.origin}): {worst.reason}"
         return End(worst.exit_code, reason, worst.drain_s)
 
-    def books(self) -> Mapping[str, Mapping[str, Any]]:
+    def counters(self) -> Mapping[str, Mapping[str, Any]]:
         """Counters of nodes elsewhere on connections to here, of peers that are over."""
         over = [state for state in self._others.values() if state.phase == OVER]
-        return {node: metrics for state in over for node, metrics in state.books.items()}
+        return {node: metrics for state in over for node, metrics in state.counters.items()}
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Remarks for the user now, as ``(severity, text)``."""
@@ -268,12 +270,12 @@ class Peers:
     def _agrees(self, other: PeerState) -> bool:
         if other.phase != DRAINED:
             return False
-        books = {**self._own.books, **other.books}
+        counters = {**self._own.counters, **other.counters}
         return all(
-            count(books, c.source_node, "outgoing", c, sent)
-            == count(books, c.destination_node, "incoming", c, arrived)
+            count(counters, c.source_node, "outgoing", c, sent)
+            == count(counters, c.destination_node, "incoming", c, arrived)
             for c in self._crossing
-            if c.is_reliable and _ends(c) & other.books.keys()
+            if c.is_reliable and _ends(c) & other.counters.keys()
             for sent, arrived in (("sent", "received"), ("acknowledged", "acknowledged"))
         )
 

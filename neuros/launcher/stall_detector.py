@@ -40,7 +40,7 @@ class StallDetector:
     def __init__(self, names: Sequence[str], now_s: float, run_folder: Path) -> None:
         self._names = tuple(names)
         self._run_folder = run_folder
-        self._hosts: dict[str, str] = {}  # by node, the first node of its process
+        self._first_of_process: dict[str, str] = {}  # by node
         self._silent = set(names)
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
@@ -55,7 +55,7 @@ class StallDetector:
     def greet(self, names: Sequence[str]) -> None:
         """These nodes' process is there."""
         self._silent.difference_update(names)
-        self._hosts.update(dict.fromkeys(names, names[0]))
+        self._first_of_process.update(dict.fromkeys(names, names[0]))
 
     def report(self, report: Report, now_s: float) -> None:
         """Take a report."""
@@ -149,7 +149,7 @@ class StallDetector:
             if now_s - heard_s < LONG_S or name in self._named_as_mute or name in without:
                 continue
             self._named_as_mute.add(name)
-            held = held_stack(self._run_folder / self._hosts.get(name, name))
+            held = held_stack(self._folder(name))
             if held is None:
                 yield (
                     "WARN",
@@ -172,7 +172,7 @@ class StallDetector:
 
     def threads_of(self, name: str) -> str:
         """The threads of a node's process if that has not reported for seconds."""
-        return held_threads(self._run_folder / self._hosts.get(name, name))
+        return held_threads(self._folder(name))
 
     def silent_s(self, name: str, now_s: float) -> float:
         """For how long a node has not reported."""
@@ -191,9 +191,13 @@ class StallDetector:
         hook = self.executing(name)
         return f", last seen executing '{hook}'" if hook else ""
 
+    def _folder(self, name: str) -> Path:
+        """The folder with the stack file of a node's process."""
+        return self._run_folder / self._first_of_process.get(name, name)
+
     def _held(self, name: str) -> Stack | None:
         """The stack of a node that holds Python's global lock."""
-        held = held_stack(self._run_folder / self._hosts.get(name, name))
+        held = held_stack(self._folder(name))
         return held if held is not None and held.node == name else None
 
     def _is_named(self, name: str) -> bool:

@@ -112,7 +112,7 @@ class NodeRuntime:
             on_initialised=on_initialised,
         )
         self.reports = NodeReports(
-            file, middleware, self._transport, self._time, self._effects, self._sampler, clock
+            file, middleware, self._transport, self._time, self._sampler, clock
         )
 
     @property

@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from neuros import control
+import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
 from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeStatus, Probed, Report
@@ -11,7 +12,6 @@ from neuros.engine.engine import Engine
 from neuros.engine.explain import explain
 from neuros.engine.snapshot import snapshot, steadily
 from neuros.hooks import HookKind, HookSpec
-from neuros.node.effects import NodeEffects
 from neuros.node.packet_log import PacketLog
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
@@ -23,32 +23,18 @@ _MAIN = threading.main_thread()
 _LAST_SENT = 16
 
 
+@dataclass
 class NodeReports:
-    """State and counters of one running node.
+    """State and counters of one running node; ``_clock`` is monotonic, in nanoseconds."""
 
-    Args:
-        clock: monotonic clock in nanoseconds.
-    """
-
-    def __init__(
-        self,
-        file: NodeFile,
-        middleware: Middleware,
-        transport: Transport,
-        time: SimulatedTime,
-        effects: NodeEffects,
-        sampler: Sampler,
-        clock: Callable[[], int],
-    ) -> None:
-        self._file = file
-        self._middleware = middleware
-        self._transport = transport
-        self._time = time
-        self._effects = effects
-        self._sampler = sampler
-        self._clock = clock
-        self._engine: Engine | None = None
-        self._packet_log: PacketLog | None = None
+    _file: NodeFile
+    _middleware: Middleware
+    _transport: Transport
+    _time: SimulatedTime
+    _sampler: Sampler
+    _clock: Callable[[], int]
+    _engine: Engine | None = None
+    _packet_log: PacketLog | None = None
 
     def open(self, engine: Engine, logger: Logger) -> None:
         """There is an engine to report of; what is special about it is logged."""

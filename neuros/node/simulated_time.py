@@ -9,6 +9,8 @@ from typing import Any
 from neuros.project.model import Node
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+_FINE_S = 60.0
+_FINE_INTERVAL_S = 0.1
 
 
 class SimulatedTime:
@@ -88,12 +90,21 @@ class Timeline:
 
     def __init__(self) -> None:
         self._next_s = 0.0
+        self._next_wall_s = -math.inf
+        self._fine_until_s: float | None = None
         self._points: list[tuple[float, float]] = []
 
     def note(self, sim_s: float, wall_s: float) -> None:
-        """It is ``sim_s`` now; the first reading in each simulated second is kept."""
-        if sim_s >= self._next_s:
+        """It is ``sim_s`` now; the first reading in each simulated second is kept.
+
+        In the first minute there is a reading each tenth of a second besides: the other nodes
+        initialise then, and the real-time factor begins when the last one has.
+        """
+        if self._fine_until_s is None:
+            self._fine_until_s = wall_s + _FINE_S
+        if sim_s >= self._next_s or self._next_wall_s <= wall_s < self._fine_until_s:
             self._next_s = math.floor(sim_s) + 1.0
+            self._next_wall_s = wall_s + _FINE_INTERVAL_S
             self._points.append((sim_s, wall_s))
 
     def take(self) -> list[tuple[float, float]]:

@@ -19,7 +19,11 @@ from neuros.project.resources import Access, Resources
 
 HERE = Folders(Path("/home/me/robot"), Path("/opt/ws"), Path("/home/me/runs/1"))
 IMAGE = Image("sha256:1234", "neuros_python", ("/opt/neuros/bin/python",), (3, 11))
-RUN = {"NEUROS_RUN_ID": "0123456789abcdef", "ROS_LOG_DIR": "/home/me/runs/1"}
+RUN = {
+    "NEUROS_RUN_ID": "0123456789abcdef",
+    "ROS_LOG_DIR": "/home/me/runs/1",
+    "NEUROS_CONTROL": "unix:/home/me/runs/1/control.sock",
+}
 
 
 def node_file(**keys: Any) -> NodeFile:
@@ -156,6 +160,7 @@ def test_the_environment_is_that_of_the_node_and_little_of_the_users() -> None:
     assert found["NEUROS_RUN_ID"] == "0123456789abcdef"
     assert found["NEUROS_RUN_DIR"] == "/neuros/run/snn"
     assert found["ROS_LOG_DIR"] == "/neuros/run"
+    assert found["NEUROS_CONTROL"] == "unix:/neuros/run/control.sock"
     assert found["HOME"] == "/tmp"
     assert "TOKEN" not in found
 

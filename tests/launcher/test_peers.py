@@ -64,7 +64,7 @@ def sent(number: int, acknowledged: int | None = None) -> dict[str, Report]:
 
 
 def received(number: int) -> dict[str, Any]:
-    """The books of ``b``."""
+    """The counters of ``b``."""
     counters = {"received": number, "acknowledged": number}
     return {"b": {"outgoing": {}, "incoming": {str(HERE_TO_THERE): counters}}}
 
@@ -181,9 +181,9 @@ def test_it_is_drained_when_both_launchers_are_and_nothing_is_between(launcher: 
     assert not launcher.peers.settle(sent(3)), "the peer has not heard of it yet"
     assert said_last(launcher).phase == DRAINED
     drained = replace(ELSEWHERE, phase=DRAINED)
-    launcher.hears("b", replace(drained, number=2, books=received(2)))
+    launcher.hears("b", replace(drained, number=2, counters=received(2)))
     assert not launcher.peers.settle(sent(3)), "a packet is under way"
-    launcher.hears("b", replace(drained, number=3, books=received(3)))
+    launcher.hears("b", replace(drained, number=3, counters=received(3)))
     assert not launcher.peers.settle(sent(3, acknowledged=2)), "an acknowledgement is"
     assert launcher.peers.settle(sent(3))
 
@@ -205,18 +205,18 @@ def test_a_peer_that_has_stopped_is_not_asked(launcher: Launcher) -> None:
     assert launcher.peers.settle(sent(3))
 
 
-# ------------------------------------------------------------------ the books
+# ------------------------------------------------------------------ the counters
 
 
 def test_each_launcher_waits_for_the_final_counters_of_its_peer(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
     assert not launcher.peers.finish(sent(3), 10.0)
     assert said_last(launcher).phase == OVER
-    assert said_last(launcher).books["a"]["outgoing"][str(HERE_TO_THERE)]["sent"] == 3
-    assert launcher.peers.books() == {}
-    launcher.hears("b", replace(ELSEWHERE, number=2, phase=OVER, books=received(3)))
+    assert said_last(launcher).counters["a"]["outgoing"][str(HERE_TO_THERE)]["sent"] == 3
+    assert launcher.peers.counters() == {}
+    launcher.hears("b", replace(ELSEWHERE, number=2, phase=OVER, counters=received(3)))
     assert launcher.peers.finish(sent(3), 10.1)
-    assert launcher.peers.books() == received(3)
+    assert launcher.peers.counters() == received(3)
 
 
 def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> None:

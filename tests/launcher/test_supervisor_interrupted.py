@@ -230,9 +230,10 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
 def test_a_node_that_is_not_understood_makes_the_run_fail(
     run: Run, message: str, complaint: str
 ) -> None:
-    outcome = run(a=f"host.up_last(); {message}; host.serve()", b=WELL_BEHAVED)
+    outcome = run(a=f"host.up_last(); {message}; {message}; host.serve()", b=WELL_BEHAVED)
     assert outcome.exit_code == 1
     assert outcome.reason.startswith(f"control channel: the process of a {complaint}")
+    assert outcome.failures == [outcome.reason], "it is said once"
     assert all(map(outcome.has_final_report, "ab"))
 
 

@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
+import pytest
+
 from neuros.node.simulated_time import Timeline
 
+LATER_S = 61.0
+"""When a timeline is as coarse as it stays."""
 
-def test_the_first_reading_of_every_simulated_second_is_kept() -> None:
+
+@pytest.fixture
+def timeline() -> Timeline:
+    """One that is past its first minute."""
     timeline = Timeline()
+    timeline.note(0.0, 0.0)
+    assert timeline.take() == [(0.0, 0.0)]
+    return timeline
+
+
+def test_the_first_reading_of_every_simulated_second_is_kept(timeline: Timeline) -> None:
     for step in range(11):
-        timeline.note(step * 0.25, 100.0 + step)
-    assert timeline.take() == [(0.0, 100.0), (1.0, 104.0), (2.0, 108.0)]
+        timeline.note(step * 0.25, LATER_S + step)
+    assert timeline.take() == [(1.0, LATER_S + 4), (2.0, LATER_S + 8)]
 
 
-def test_what_was_taken_does_not_come_again() -> None:
+def test_in_the_first_minute_so_is_one_each_tenth_of_a_second() -> None:
     timeline = Timeline()
-    timeline.note(0.0, 1.0)
-    assert timeline.take() == [(0.0, 1.0)]
-    timeline.note(0.5, 2.0)
-    timeline.note(1.5, 3.0)
-    assert timeline.take() == [(1.5, 3.0)]
+    for step in range(6):
+        timeline.note(0.0, 0.0625 * step)
+    assert timeline.take() == [(0.0, 0.0), (0.0, 0.125), (0.0, 0.25)]
 
 
-def test_seconds_that_are_jumped_over_have_no_point() -> None:
-    timeline = Timeline()
-    timeline.note(0.0, 1.0)
-    timeline.note(7.5, 2.0)
-    timeline.note(7.9, 3.0)
-    timeline.note(8.1, 4.0)
-    assert timeline.take() == [(0.0, 1.0), (7.5, 2.0), (8.1, 4.0)]
+def test_what_was_taken_does_not_come_again(timeline: Timeline) -> None:
+    timeline.note(0.5, LATER_S)
+    timeline.note(1.5, LATER_S + 1)
+    assert timeline.take() == [(1.5, LATER_S + 1)]
+    assert timeline.take() == []
+
+
+def test_seconds_that_are_jumped_over_have_no_point(timeline: Timeline) -> None:
+    timeline.note(7.5, LATER_S)
+    timeline.note(7.9, LATER_S + 1)
+    timeline.note(8.1, LATER_S + 2)
+    assert timeline.take() == [(7.5, LATER_S), (8.1, LATER_S + 2)]
