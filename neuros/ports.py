@@ -234,6 +234,32 @@ class Middleware(Protocol):
         """Let what was sent last leave, then give up everything."""
 
 
+class TransportKind(ABC):
+    """A way to carry packets. Registered as an entry point of the group ``neuros.transports``.
+
+    Attributes:
+        name: that of the entry point, which a back end names.
+    """
+
+    name: str
+
+    @abstractmethod
+    def middleware(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        digests: bool,
+        record: bool,
+        debug: bool,
+    ) -> Middleware:
+        """The middleware of a process with these nodes.
+
+        ``on_failure`` takes what fails outside of hooks; ``digests``: keep one of every packet,
+        whatever that costs; ``record``: packets are recorded; ``debug``: log DEBUG records.
+        """
+
+
 class NodeContext(Protocol):
     """The ``node`` that hooks receive, as far as simulators need it."""
 
@@ -405,11 +431,10 @@ class Reaper(Protocol):
     def clean_with(self, module: str, argument: str) -> None:
         """Have a module clean up what is no process of this machine: containers, jobs.
 
-        The module needs the standard library only, and has two functions. ``resume(argument,
-        run_id)`` lets paused nodes go on, so that they can end. ``remove(argument, run_id,
-        settle_s=..., give_up_s=...)`` ends and removes what is left, until there was nothing for
-        ``settle_s`` seconds (a killed launcher may just have asked for more), or after
-        ``give_up_s``.
+        It needs the standard library only, and has two functions. ``resume(argument, run_id)``
+        lets paused nodes go on, so that they can end. ``remove(argument, run_id, settle_s=...,
+        give_up_s=...)`` ends and removes what is left, until there was nothing for ``settle_s``
+        seconds (a killed launcher may just have asked for more), or after ``give_up_s``.
         """
 
 
@@ -443,10 +468,7 @@ Notice: TypeAlias = tuple[str, str]
 
 
 class Deployment(ABC):
-    """A back end made ready for some nodes of a project.
-
-    The methods have defaults for nodes that see the files of this machine as the launcher does.
-    """
+    """A back end made ready for some nodes; defaults are for nodes that see files as we do."""
 
     notices: Sequence[Notice] = ()
 
@@ -485,13 +507,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of ``neuros doctor``.
-
-    Attributes:
-        subject: what was looked at, "Python".
-        text: what was found.
-        remedy: what to do about it, where there is something to do.
-    """
+    """One line of ``neuros doctor``: what was looked at, what was found, what to do."""
 
     state: State
     subject: str
@@ -518,6 +534,16 @@ class Finding:
         return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
 
 
+class SimulatorKind(ABC):
+    """A simulator. Registered as an entry point of the group ``neuros.simulators``."""
+
+    name: str
+
+    @abstractmethod
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        """What ``neuros doctor`` finds of it: its version, or how to install it; what it needs."""
+
+
 class BackEnd(ABC):
     """Where nodes run. Registered as an entry point of the group ``neuros.backends``.
 
@@ -526,6 +552,7 @@ class BackEnd(ABC):
         place: where it runs a node, as in "each node in *a container*".
         rank: ``--backend auto`` takes the usable one with the highest; ``None``: never this one.
         options: of ``neuros launch`` with this back end.
+        transport: the name of the transport that its nodes use.
         is_one_process: whether all nodes share a process. They take turns then, and hand packets
             over in memory, where ROS tools and other launchers do not see them.
         has_own_pythons: whether nodes run on Pythons that it brings (those of images), and not on
@@ -536,6 +563,7 @@ class BackEnd(ABC):
     place: str
     rank: int | None = None
     options: Sequence[Option] = ()
+    transport = "ros"
     is_one_process = False
     has_own_pythons = False
 
@@ -564,9 +592,7 @@ class BackEnd(ABC):
     def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
         """The inverse of :meth:`Deployment.as_seen`, for a run that is over.
 
-        Args:
-            folders: those of this machine.
-            messages: the folder with built message packages of this machine.
+        ``messages`` is the folder with built message packages of this machine.
         """
         return file
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neuros.backends.child_processes import RunningProcess
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
-from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
+from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor

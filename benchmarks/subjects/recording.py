@@ -13,7 +13,7 @@ from benchmarks.in_turn import speed_with
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
 from benchmarks.subjects.whiskeye import WHISKEYE
-from neuros.backends.recording import RecorderProcess
+from neuros.backends.sidecars import RecorderProcess
 from neuros.recording.recorder import Recorder
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
 from neuros.recording.spool import SpoolWriter

@@ -160,7 +160,9 @@ class Plan:
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; ``reaper`` hears of all it starts."""
-        options = ["--in-memory"] if self.back_end.is_one_process else []
+        options = ["--transport", self.back_end.transport]
+        if self.back_end.is_one_process:
+            options.append("--one-process")
         if self.request.end.sim_s is not None:
             options += ["--duration-sim", repr(self.request.end.sim_s)]
         if self.request.verbose:

@@ -16,7 +16,7 @@ from typing import Any
 from neuros.api.plan import Plan
 from neuros.api.run_folder import run_folder_path
 from neuros.backends.reaper import Reaper
-from neuros.backends.recording import Recorded, RecorderProcess
+from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.project.model import Project

@@ -13,6 +13,7 @@ import contextlib
 import os
 import re
 import shlex
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -190,6 +191,14 @@ def script_failure(log: Path) -> str | None:
     """The failed script that the last line of a log names, ``None`` if it names none."""
     match = _SCRIPT_FAILED.fullmatch(last_line(log))
     return match and f"script {match['script']} of '{match['node']}' failed: {match['how']}"
+
+
+def signal_in_words(number: int) -> str:
+    """The effect of a signal on a process, in words."""
+    try:
+        return f"killed by {signal.Signals(number).name}"
+    except ValueError:  # a real-time signal
+        return f"killed by signal {number}"
 
 
 def last_line(log: Path) -> str:

@@ -1,13 +1,29 @@
-"""The back ends ``process`` and ``in-process``: a node process per node, or one for all."""
+"""The back ends ``process`` and ``in-process``: a node process per node, or one for all.
+
+A node process leads a session of its own, so that Ctrl+C reaches only the launcher, and writes its
+log itself, so that nothing passes through the launcher and nothing is lost when that dies.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
+import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros.backends.child_processes import RunningProcess, end_now
-from neuros.backends.node_command import PROCESS_LOG, NodeProcess, common_process, node_process
+from neuros.backends.node_command import (
+    PROCESS_LOG,
+    NodeProcess,
+    common_process,
+    node_process,
+    script_failure,
+    signal_in_words,
+)
+from neuros.backends.placement import children_on
+from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
 
@@ -30,6 +46,7 @@ class OneProcess(BackEnd):
 
     name = "in-process"
     place = "one process with all others"
+    transport = "memory"
     is_one_process = True
 
     def prepare(
@@ -105,3 +122,75 @@ class InProcessLauncher(ProcessLauncher):
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[NodeProcess]:
         return [common_process(self._program, nodes, environment)] if nodes else []
+
+
+class RunningProcess:
+    """A node process that was started, and the nodes in it (:class:`neuros.ports.RunningNode`)."""
+
+    def __init__(self, process: NodeProcess) -> None:
+        """Start it; raises ``EnvironmentFault`` if that is impossible."""
+        self._names = process.names
+        self._log = process.log
+        try:
+            process.log.parent.mkdir(parents=True, exist_ok=True)
+            with open(process.log, "ab") as output, children_on(process.cores):
+                self._process = subprocess.Popen(
+                    process.command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    cwd=process.folder,
+                    env=process.environment,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            nodes = ", ".join(self._names)
+            raise EnvironmentFault(f"cannot start the process of {nodes}: {error}") from error
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._names
+
+    @property
+    def pid(self) -> int:
+        """Its process id, which is also that of its process group and session."""
+        return self._process.pid
+
+    def poll(self) -> str | None:
+        """``None`` while it runs, then how it ended, in words."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        return (script_failure(self._log) if code == 1 else None) or _in_words(code)
+
+    @property
+    def is_abandoned(self) -> bool:
+        return False
+
+    def wait(self, timeout_s: float) -> str | None:
+        """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout_s)
+        return self.poll()
+
+    def terminate(self) -> None:
+        self._process.terminate()
+
+    def kill(self) -> None:
+        """Kill it and its whole process group."""
+        # Once it has been reaped, its number may be another's.
+        if self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+
+
+def end_now(processes: Sequence[RunningProcess]) -> None:
+    """Kill processes and wait until they are gone."""
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.wait(5.0)
+
+
+def _in_words(code: int) -> str:
+    return f"exit code {code}" if code >= 0 else signal_in_words(-code)

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuros.backends.child_processes import start_sidecar
 from neuros.backends.docker.tool import ToolContainer, find_tool_image
 from neuros.backends.reaper import Reaper
+from neuros.backends.sidecars import start_sidecar
 
 _END_S = 2.0
 _MOST_WAIT_S = 5.0

@@ -22,6 +22,7 @@ from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
+from neuros.transport.registered import TRANSPORTS
 
 _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
 _STANDARD = (0, 1, 2)
@@ -30,7 +31,8 @@ _STANDARD = (0, 1, 2)
 def add_node(node: argparse.ArgumentParser) -> None:
     """Add the arguments of the program; ``launch`` starts it, in a container or a process."""
     node.add_argument("node_files", nargs="+")
-    node.add_argument("--in-memory", action="store_true")
+    node.add_argument("--transport", default="ros")
+    node.add_argument("--one-process", action="store_true")
     node.add_argument("--duration-sim", type=float)
     node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
@@ -46,23 +48,20 @@ def _run_node(options: argparse.Namespace) -> int:
     files = node_files_from_json(json.loads(Path(p).read_text()) for p in options.node_files)
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    if not options.in_memory:  # else it is the launcher's Python
+    if not options.one_process:  # else it is the launcher's Python
         note_versions(files[0].folders.run / files[0].node.name)
 
     def make_middleware(
         files: Sequence[NodeFile], on_failure: Callable[[BaseException], None]
     ) -> Middleware:
-        from neuros.transport.ros_process import RosProcess
-
-        middleware = RosProcess(
+        middleware = TRANSPORTS.load(options.transport).middleware(
             files,
             on_failure,
-            in_memory=options.in_memory,
             digests=options.digests,
             record=options.record,
             debug=options.debug,
         )
-        leave.has_leftovers = lambda: middleware.has_leftovers
+        leave.has_leftovers = lambda: bool(getattr(middleware, "has_leftovers", False))
         return middleware
 
     leave.exit_code = NodeProcess(
@@ -71,7 +70,7 @@ def _run_node(options: argparse.Namespace) -> int:
         partial(connect_by, os.environ),
         open_recorder=_recorders(files[0].folders.run) if options.record else None,
         duration_sim_s=options.duration_sim,
-        own_logs=options.in_memory,
+        own_logs=options.one_process,
     ).run()
     return leave.exit_code
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.backends.recording import END
+from neuros.backends.sidecars import END
 from neuros.errors import NeurosError
 from neuros.recording.recorder import Recorder
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, Topic, load_plan

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from neuros.api.execution import Shown
     from neuros.api.plan import Plan
     from neuros.api.request import LaunchOptions
-    from neuros.backends.dashboard import DashboardProcess
     from neuros.backends.reaper import Reaper
-    from neuros.backends.rerun import RerunProcesses
+    from neuros.backends.sidecars import DashboardProcess, RerunProcesses
     from neuros.backends.tools import Tool
     from neuros.viewers.dashboard.server import Sources
 
@@ -62,7 +61,7 @@ class Views:
                 self._take_rerun(reason)
         self._dashboard: DashboardProcess | None = None
         if options.dashboard or options.dashboard_port is not None or self._opens_graph:
-            from neuros.backends.dashboard import DashboardProcess
+            from neuros.backends.sidecars import DashboardProcess
 
             self._dashboard = DashboardProcess(options.dashboard_port or 0)
 
@@ -104,7 +103,7 @@ class Views:
         return None
 
     def _take_rerun(self, reason: str) -> None:
-        from neuros.backends.rerun import RerunProcesses
+        from neuros.backends.sidecars import RerunProcesses
 
         if find_spec("rerun") is None:
             raise EnvironmentFault(
@@ -168,7 +167,7 @@ def add_view(view: argparse.ArgumentParser) -> None:
 
 def _run_view(_: argparse.Namespace) -> int:
     from neuros.backends.control_sockets import connect_by
-    from neuros.backends.rerun import await_server
+    from neuros.backends.sidecars import await_server
     from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
     from neuros.viewers.rerun_feed import RerunFeed

@@ -14,8 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from importlib import metadata
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
 
 from neuros.api.loading import load_with_messages
@@ -23,21 +22,17 @@ from neuros.backends.domain import choose_domain
 from neuros.backends.placement import usable_cores
 from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
-from neuros.ports import BackEnd, Finding
+from neuros.installation.machine import Machine
+from neuros.ports import Finding, State
 from neuros.recording.run_file import read_run_file
+from neuros.registry import Part, Registry
+from neuros.simulators.registered import SIMULATORS, installed
 
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")
 _LEAST_SHARED_BYTES = 64 * 2**20
 """What Docker gives a container, too, if it is not asked for more."""
-_EXTRAS = (
-    ("MuJoCo", "mujoco", "./install.py --extras mujoco"),
-    ("NEST", "nest-simulator", "./install.py --extras nest"),
-    ("Matplotlib", "matplotlib", "./install.py --extras plot"),
-)
 _GPU_TIMEOUT_S = 10.0
-_RENDERING_TIMEOUT_S = 60.0
 _DELIVERY_TIMEOUT_S = 60.0
 
 
@@ -48,16 +43,11 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
         proves: whether to start nodes on each back end that can be used.
     """
     yield from look_at_machine(environ)
-    yield prove_rendering(environ)
-    back_ends: list[BackEnd] = []
-    try:
-        for name in BACK_ENDS:
-            try:
-                back_ends.append(BACK_ENDS.load(name))
-            except EnvironmentFault as fault:
-                yield Finding.bad("back end", str(fault))
-    except EnvironmentFault as fault:  # two distributions share a name
-        yield Finding.bad("back end", str(fault))
+    simulators, broken = _parts(SIMULATORS)
+    back_ends, broken_too = _parts(BACK_ENDS)
+    yield from (*broken, *broken_too)
+    for simulator in simulators:
+        yield from simulator.checks(environ)
     for back_end in back_ends:
         yield from back_end.checks(environ)
     if not proves:
@@ -74,14 +64,27 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
             yield prove_delivery(back_end.name)
 
 
+def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:
+    """What can be loaded, and what is wrong with the rest."""
+    parts: list[Part] = []
+    broken: list[Finding] = []
+    try:
+        for name in registry:
+            try:
+                parts.append(registry.load(name))
+            except EnvironmentFault as fault:
+                broken.append(Finding.bad(registry.noun, str(fault)))
+    except EnvironmentFault as fault:  # two distributions share a name
+        broken.append(Finding.bad(registry.noun, str(fault)))
+    return parts, broken
+
+
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     """All findings about this machine, one after another."""
     yield _python()
-    yield _package("ROS 2", "ros-jazzy-rclpy") or Finding.bad(
-        "ROS 2", "not installed", "run ./install.py"
-    )
-    for subject, distribution, remedy in _EXTRAS:
-        yield _package(subject, distribution) or Finding.absent(subject, "not installed", remedy)
+    ros = installed("ROS 2", "ros-jazzy-rclpy", "run ./install.py")
+    yield ros if ros.state is State.GOOD else replace(ros, state=State.BAD)
+    yield installed("Matplotlib", "matplotlib", "./install.py --extras plot")
     yield Finding.good("cores", f"{len(usable_cores())} usable")
     yield _shared_memory(SHARED_MEMORY)
     yield _domain(environ)
@@ -96,14 +99,6 @@ def _python() -> Finding:
     except EnvironmentFault as fault:
         return Finding.bad("Python", text, str(fault))
     return Finding.good("Python", text)
-
-
-def _package(subject: str, distribution: str) -> Finding | None:
-    """``None`` if it is not installed."""
-    try:
-        return Finding.good(subject, f"{distribution} {metadata.version(distribution)}")
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _shared_memory(folder: Path) -> Finding:
@@ -134,33 +129,6 @@ def _display(environ: Mapping[str, str]) -> Finding:
         if environ.get(variable):
             return Finding.good("display", f"{variable}={environ[variable]}")
     return Finding.absent("display", "none; figures go to files, and viewers do not open")
-
-
-def prove_rendering(environ: Mapping[str, str]) -> Finding:
-    """Render one picture with the OpenGL that simulated cameras would use."""
-    subject = "cameras"
-    if find_spec("mujoco") is None:
-        return Finding.absent(subject, "not tried without MuJoCo")
-    program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
-    command = [sys.executable, "-c", program]
-    try:
-        done = subprocess.run(
-            command,
-            env=dict(environ),
-            capture_output=True,
-            text=True,
-            timeout=_RENDERING_TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return Finding.bad(
-            subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl()
-        )
-    if done.returncode == 0:
-        return Finding.good(subject, f"a picture was rendered with {done.stdout.strip()}")
-    rows = done.stderr.strip().splitlines() or [f"rendering ends with {done.returncode}"]
-    is_expected = bool(environ.get("MUJOCO_GL") or offscreen_opengl())
-    return (Finding.bad if is_expected else Finding.absent)(subject, rows[-1])
 
 
 def _gpu() -> Finding:

@@ -275,7 +275,7 @@ def test_a_run_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.Mon
         raise OSError("too many of them")
 
     monkeypatch.setattr(
-        "neuros.backends.child_processes.subprocess.Popen", _popen_but_not_for_hosts(fail)
+        "neuros.backends.process_launchers.subprocess.Popen", _popen_but_not_for_hosts(fail)
     )
     with pytest.raises(EnvironmentFault, match="cannot start the process of thrower"):
         made.run(backend="in-process", output="run")

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuros.backends.child_processes import RunningProcess
 from neuros.backends.node_command import NodeProcess
 from neuros.backends.placement import (
     THREAD_VARIABLES,
@@ -19,6 +18,7 @@ from neuros.backends.placement import (
     thread_limits,
     usable_cores,
 )
+from neuros.backends.process_launchers import RunningProcess
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 

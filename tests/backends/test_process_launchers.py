@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.child_processes import RunningProcess
 from neuros.backends.node_command import process_environment
-from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher
+from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile

@@ -13,6 +13,7 @@ import pytest
 from neuros.backends.docker.back_end import look_at_containers
 from neuros.doctor import checks
 from neuros.ports import Finding, State
+from neuros.simulators.registered import SIMULATORS
 
 
 def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:
@@ -32,11 +33,11 @@ def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", version)
-    found = findings()
-    assert found["ROS 2"].state is State.BAD
-    assert "./install.py" in found["ROS 2"].remedy
-    assert found["MuJoCo"].state is State.ABSENT
-    assert "--extras mujoco" in found["MuJoCo"].remedy
+    ros, nest = findings()["ROS 2"], next(iter(SIMULATORS.load("nest").checks({})))
+    assert ros.state is State.BAD
+    assert "./install.py" in ros.remedy
+    assert nest.state is State.ABSENT
+    assert "--extras nest" in nest.remedy
 
 
 def test_shared_memory_that_is_missing_is_named(

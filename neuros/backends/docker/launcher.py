@@ -18,13 +18,18 @@ import requests
 from docker import DockerClient
 from docker.errors import DockerException
 
-from neuros.backends.child_processes import signal_in_words
 from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_socket
 from neuros.backends.docker.images import Image, images_for
 from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import container_settings, shared_memory, user_for
-from neuros.backends.node_command import last_line, log_file, node_folder, script_failure
+from neuros.backends.node_command import (
+    last_line,
+    log_file,
+    node_folder,
+    script_failure,
+    signal_in_words,
+)
 from neuros.backends.placement import on_cores
 from neuros.backends.run_processes import RUN_ID, RunProcesses
 from neuros.backends.shared_memory import hold
