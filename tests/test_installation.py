@@ -21,8 +21,14 @@ import pytest
 from neuros.cli.main import parser
 from neuros.errors import EnvironmentFault
 from neuros.installation import command
-from neuros.installation.command import build_arguments, build_containers, build_documentation
-from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
+from neuros.installation.command import (
+    Environment,
+    build_arguments,
+    build_containers,
+    build_documentation,
+    extras_of,
+    shared_memory_as_found,
+)
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress

@@ -29,7 +29,7 @@ from neuros.backends.environments.choice import (
 from neuros.backends.environments.requirements import unmet
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted, system_install
-from neuros.installation.packages import PIP_INSTALL, explain_machine, run_pip
+from neuros.installation.packages import explain_machine, find_uv, run_installs
 from neuros.installation.progress import Progress
 from neuros.project.model import Node
 
@@ -257,21 +257,20 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
     # With hashes, pip refuses what has none: then what NeuROS needs comes first, by itself.
     calls = [[*wanted, *needs]]
     if choice.requirements.has_hashes:
-        calls = [needs, wanted]
+        calls = [needs, ["--require-hashes", *wanted]]
     if not needs:
         raise _fault(choice, f"neuros itself is not installed for {sys.executable}: run install.py")
     progress.step(f"installing {choice.requirements.file} (log: {entry.log})")
-    for arguments in calls:
-        output = run_pip(
-            [str(entry.future_python), *PIP_INSTALL, *arguments],
-            entry.folder,
-            entry.log,
-            progress,
-            {**clean_environment(os.environ), **run_environment},
-        )
-        if output is not None:
-            cause = why_pip_failed(output, dotted(choice.version), needs)
-            raise _fault(choice, f"{cause} (log: {entry.log})")
+    environ = {**clean_environment(os.environ), **run_environment}
+    # uv does not see what a layer finds in this environment, and would install all of it again.
+    uv = None if choice.is_layered else find_uv(Path(sys.executable), environ)
+    entry.log.unlink(missing_ok=True)
+    output = run_installs(
+        entry.future_python, uv, calls, entry.folder, entry.log, progress, environ
+    )
+    if output is not None:
+        cause = why_pip_failed(output, dotted(choice.version), needs)
+        raise _fault(choice, f"{cause} (log: {entry.log})")
 
 
 def _words(choice: Choice) -> str:
