@@ -53,7 +53,7 @@ _DISK_IS_FULL = "No space left on device|Disk quota exceeded"
 _OF_NO_EFFECT = {
     *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
     *("cache-dir", "log", "prefer-binary", "no-warn-script-location", "no-python-version-warning"),
-    *("root-user-action", "break-system-packages", "require-virtualenv"),
+    *("root-user-action", "break-system-packages", "require-virtualenv", "config-file"),
 }
 
 
