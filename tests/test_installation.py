@@ -204,6 +204,15 @@ class TestStamp:
         (stamped / "pyproject.toml").write_text(PYPROJECT + "# changed", "utf-8")
         assert not environment_of(stamped, "nest").is_installed
 
+    def test_other_lock_files_are_not_installed(self, stamped: Path) -> None:
+        (stamped / "requirements").mkdir()
+        (stamped / "requirements" / "core.txt").write_text("numpy==2.0.0\n", "utf-8")
+        assert not environment_of(stamped, "nest").is_installed
+
+    def test_the_newest_packages_are_looked_for_each_time(self, stamped: Path) -> None:
+        environment = Environment(stamped, ["nest"], Progress(StringIO()), newest=True)
+        assert not environment.is_installed
+
     @pytest.mark.parametrize("text", ["", "[]", "{}", '{"extras": 3}', "null"])
     def test_a_broken_stamp_counts_for_nothing(self, stamped: Path, text: str) -> None:
         (stamped / ".venv" / "neuros.json").write_text(text, "utf-8")
