@@ -16,6 +16,7 @@ from packages import make_wheel
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from neuros.errors import EnvironmentFault
 from neuros.installation.command import extras_of
 from neuros.installation.machine import NEWEST, OLDEST, clean_environment, dotted
 from neuros.installation.packages import (
@@ -285,6 +286,16 @@ class TestFallback:
             stream.getvalue()
         )
         assert self.is_installed(python)
+
+    def test_without_a_network_nothing_is_tried_after_uv(
+        self, python: Path, environ: dict[str, str]
+    ) -> None:
+        online = {k: v for k, v in environ.items() if k not in ("PIP_NO_INDEX", "PIP_FIND_LINKS")}
+        online |= {"PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1"}
+        stream = StringIO()
+        with pytest.raises(EnvironmentFault, match=r"^the package index .* cannot be reached"):
+            install(python, ROOT, ["plot"], Progress(stream), online)
+        assert "pip installs" not in stream.getvalue()
 
 
 @pytest.mark.parametrize(
