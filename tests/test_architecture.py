@@ -73,7 +73,7 @@ MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", 
 MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
 GENERATORS = {f"rosidl_generator_{name}" for name in ("c", "py", "type_description")}
 GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "introspection_c")}
-GENERATORS |= {"rosidl_adapter"}
+GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 # What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},

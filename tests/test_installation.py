@@ -21,8 +21,14 @@ import pytest
 from neuros.cli.main import parser
 from neuros.errors import EnvironmentFault
 from neuros.installation import command
-from neuros.installation.command import build_arguments, build_containers, build_documentation
-from neuros.installation.environment import Environment, extras_of, shared_memory_as_found
+from neuros.installation.command import (
+    Environment,
+    build_arguments,
+    build_containers,
+    build_documentation,
+    extras_of,
+    shared_memory_as_found,
+)
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
 from neuros.installation.progress import Progress
@@ -197,6 +203,15 @@ class TestStamp:
     def test_other_dependencies_are_not_installed(self, stamped: Path) -> None:
         (stamped / "pyproject.toml").write_text(PYPROJECT + "# changed", "utf-8")
         assert not environment_of(stamped, "nest").is_installed
+
+    def test_other_lock_files_are_not_installed(self, stamped: Path) -> None:
+        (stamped / "requirements").mkdir()
+        (stamped / "requirements" / "core.txt").write_text("numpy==2.0.0\n", "utf-8")
+        assert not environment_of(stamped, "nest").is_installed
+
+    def test_the_newest_packages_are_looked_for_each_time(self, stamped: Path) -> None:
+        environment = Environment(stamped, ["nest"], Progress(StringIO()), newest=True)
+        assert not environment.is_installed
 
     @pytest.mark.parametrize("text", ["", "[]", "{}", '{"extras": 3}', "null"])
     def test_a_broken_stamp_counts_for_nothing(self, stamped: Path, text: str) -> None:

@@ -1,29 +1,60 @@
-"""pip: its command, its progress, and explanations of its errors."""
+"""Installs packages with uv, or with pip where there is no uv; explains their errors."""
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import re
 import shutil
+import ssl
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import clean_environment, other_python, system_install
+from neuros.installation.machine import other_python, system_install
 from neuros.installation.progress import Progress
 
 LOG = "neuros-install.log"
-"""What pip wrote, in ``.venv``."""
+"""What pip and uv wrote, in ``.venv``."""
 
-_NOTHING: Mapping[str, str] = MappingProxyType({})
+LOCKS = "requirements"
+"""The folder of the lock files, which ``.ci/lock`` writes."""
+
+UV = "uv>=0.9,<1"
+_OLDEST_UV = (0, 9)
+_UV_TIMEOUT_S = 20.0
 
 PIP_INSTALL = (
     *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
     *("--progress-bar", "off", "--prefer-binary"),
 )
+# As pip: every index counts, and modules are compiled, so that no start has to.
+_UV_INSTALL = ("pip", "install", "--index-strategy", "unsafe-best-match", "--compile-bytecode")
+
+# Settings of pip, and the variables by which uv takes them.
+_IN_UV = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "no-index": "UV_NO_INDEX",
+    "no-cache-dir": "UV_NO_CACHE",
+    "trusted-host": "UV_INSECURE_HOST",
+    "timeout": "UV_HTTP_TIMEOUT",
+    "default-timeout": "UV_HTTP_TIMEOUT",
+    "retries": "UV_HTTP_RETRIES",
+    "constraint": "UV_CONSTRAINT",
+    "cert": "SSL_CERT_FILE",
+    "client-cert": "SSL_CLIENT_CERT",
+    "proxy": "HTTPS_PROXY",
+}
+_DISK_IS_FULL = "No space left on device|Disk quota exceeded"
+_OF_NO_EFFECT = {
+    *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
+    *("cache-dir", "log", "prefer-binary", "no-warn-script-location", "no-python-version-warning"),
+    *("root-user-action", "break-system-packages", "require-virtualenv", "config-file"),
+}
 
 
 def pip_settings(options: argparse.Namespace) -> dict[str, str]:
@@ -42,14 +73,17 @@ def install(
     root: Path,
     extras: Sequence[str],
     progress: Progress,
-    settings: Mapping[str, str] = _NOTHING,
+    environ: Mapping[str, str],
+    *,
+    newest: bool = False,
 ) -> None:
     """Install the source tree at ``root``, editable, with its extras, for ``python`` (in a venv).
 
-    ``settings`` are added to the environment of pip.
+    Versions and hashes are those of the lock files; without an index (``PIP_NO_INDEX``), or with
+    ``newest``, versions are the newest that ``pyproject.toml`` allows.
 
     Raises:
-        EnvironmentFault: with a sentence for the user; pip's own output is in a log file.
+        EnvironmentFault: with a sentence for the user; the output of uv and pip is in a log file.
     """
     folder = python.parent.parent
     free_bytes, need_bytes = shutil.disk_usage(folder).free, _needed_bytes(extras)
@@ -59,30 +93,139 @@ def install(
             f"{need_bytes / 1e9:.1f} GB: make room (df -h)"
         )
     log, names = folder / LOG, f"[{','.join(extras)}]"
-    source = settings.get("PIP_FIND_LINKS", "PyPI")
+    log.write_text("", "utf-8")
+    is_without_index = bool(environ.get("PIP_NO_INDEX"))
+    source = environ.get("PIP_FIND_LINKS", "a folder") if is_without_index else "PyPI"
     progress.step(f"installing neuros{names} from {source} (log: {log})")
-    command = [str(python), *PIP_INSTALL, "--editable", f".{names}"]
-    environ = {**clean_environment(os.environ), **settings}
-    output = run_pip(command, root, log, progress, environ)
+    is_locked = not newest and not is_without_index
+    get_uv = [*_locked(root, "uv")] if is_locked else [UV]
+    uv = find_uv(python, environ) or _install_uv(python, get_uv, log, progress, environ)
+    calls = [["--editable", f".{names}"]]
+    if newest:
+        calls[0].append("--upgrade")
+    if is_locked:
+        # No build isolation: it would take a setuptools that no lock file names.
+        calls = [
+            _locked(root, "build"),
+            ["--no-build-isolation", *_locked(root, "core", *extras)],
+            ["--no-build-isolation", "--no-deps", "--editable", "."],
+        ]
+    output = run_installs(python, uv, calls, root, log, progress, environ)
     if output is not None:
-        rows = [row.strip() for row in output.splitlines()]
-        errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
-        for row in (errors or rows)[-4:]:
-            progress.step(f"  {row[:300]}")
-        raise EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {log})")
+        raise _fault(output, log, progress)
 
 
-def run_pip(
+def _locked(root: Path, *names: str) -> list[str]:
+    """The arguments that install exactly what some lock files hold."""
+    files = [arg for name in names for arg in ("--requirement", str(root / LOCKS / f"{name}.txt"))]
+    return ["--require-hashes", "--no-deps", *files]
+
+
+def _fault(output: str, log: Path, progress: Progress) -> EnvironmentFault:
+    rows = [row.strip() for row in output.splitlines()]
+    errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
+    for row in (errors or rows)[-4:]:
+        progress.step(f"  {row[:300]}")
+    return EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {log})")
+
+
+def find_uv(python: Path, environ: Mapping[str, str]) -> Path | None:
+    """The uv beside ``python``, else one on ``PATH`` that is new enough, else ``None``."""
+    beside = python.with_name("uv")
+    if os.access(beside, os.X_OK):
+        return beside
+    on_path = shutil.which("uv", path=environ.get("PATH"))
+    if on_path is None:
+        return None
+    try:
+        answer = subprocess.run(
+            [on_path, "--version"],
+            env=environ,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_UV_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    match = re.match(r"uv (\d+)\.(\d+)", answer.stdout)
+    return Path(on_path) if match and (int(match[1]), int(match[2])) >= _OLDEST_UV else None
+
+
+def _install_uv(
+    python: Path, what: Sequence[str], log: Path, progress: Progress, environ: Mapping[str, str]
+) -> Path | None:
+    """Install uv beside ``python``; ``None``, and a line for the user, where it cannot be had.
+
+    Raises:
+        EnvironmentFault: where nothing else could be installed either.
+    """
+    progress.detail("installing uv")
+    output = run_logged([str(python), *PIP_INSTALL, *what], log.parent, log, progress, environ)
+    if output is None:
+        return find_uv(python, environ)
+    if explain_machine(output):
+        raise _fault(output, log, progress)
+    progress.step("there is no uv for this machine: pip installs, which takes longer")
+    return None
+
+
+def run_installs(
+    python: Path,
+    uv: Path | None,
+    calls: Sequence[Sequence[str]],
+    folder: Path,
+    log: Path,
+    progress: Progress,
+    environ: Mapping[str, str],
+) -> str | None:
+    """Install for ``python``, once for each of ``calls`` (arguments that uv and pip share).
+
+    Where uv fails, pip tries: it gets through some proxies that stop uv, and what pip says is what
+    callers explain.
+
+    Returns:
+        ``None``, or all that the program wrote that failed.
+
+    Raises:
+        OSError: if a program cannot be started, or the log cannot be written.
+    """
+    in_uv = uv_settings(_settings_of_pip(python, environ), environ) if uv else None
+    if uv and in_uv is None:
+        progress.step("uv does not know all settings that pip has here: pip installs")
+    elif uv and in_uv is not None:
+        command = [str(uv), *_UV_INSTALL, "--python", str(python)]
+        output = _run_each(command, calls, folder, log, progress, {**environ, **in_uv})
+        if output is None or re.search(_DISK_IS_FULL, output):
+            return output
+        progress.step(f"uv failed: pip tries (log: {log})")
+    return _run_each([str(python), *PIP_INSTALL], calls, folder, log, progress, environ)
+
+
+def _run_each(
+    command: Sequence[str],
+    calls: Sequence[Sequence[str]],
+    folder: Path,
+    log: Path,
+    progress: Progress,
+    environ: Mapping[str, str],
+) -> str | None:
+    outputs = (run_logged([*command, *c], folder, log, progress, environ) for c in calls)
+    return next((output for output in outputs if output is not None), None)
+
+
+def run_logged(
     command: Sequence[str], folder: Path, log: Path, progress: Progress, environ: Mapping[str, str]
 ) -> str | None:
-    """Run pip in ``folder`` and show what it does; ``None``, or all that it wrote if it failed.
+    """Run pip or uv in ``folder`` and show what it does; ``None``, or its output if it failed.
 
     Raises:
         OSError: if it cannot be started, or the log cannot be written.
     """
     rows: list[str] = []
     with (
-        log.open("w", encoding="utf-8") as file,
+        log.open("a", encoding="utf-8") as file,
         subprocess.Popen(
             command,
             cwd=folder,
@@ -108,17 +251,79 @@ def run_pip(
 def _show(row: str, progress: Progress) -> None:
     if row.startswith("Installing collected packages"):
         progress.step(f"unpacking {row.count(',') + 1} packages")
+    elif prepared := re.match(r"Prepared (\d+) packages", row):
+        progress.step(f"unpacking {prepared[1]} packages")
     elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
         progress.detail(row.partition(" (from ")[0].strip())
 
 
+def _settings_of_pip(python: Path, environ: Mapping[str, str]) -> str:
+    """What ``pip config list`` says: settings of its files and of the environment."""
+    answer = subprocess.run(
+        [str(python), "-m", "pip", "config", "list"],
+        env=environ,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return answer.stdout
+
+
+def uv_settings(listing: str, environ: Mapping[str, str]) -> dict[str, str] | None:
+    """The environment variables that give uv the settings of pip.
+
+    uv reads none of pip's files and variables. Its own variables, where the user has set them,
+    stay.
+
+    Args:
+        listing: what ``pip config list`` says.
+
+    Returns:
+        ``None`` if pip has settings that uv has not.
+    """
+    rows = re.findall(r"^(global|install|:env:)\.([\w-]+)=(.+)$", listing, re.MULTILINE)
+    # A variable comes before a file, and a setting of one command before those of all.
+    rows.sort(key=lambda row: ("global", "install", ":env:").index(row[0]))
+    found: dict[str, str] = {}
+    for _, key, value in rows:
+        if key in _IN_UV:
+            found[_IN_UV[key]] = str(ast.literal_eval(value))
+        elif key not in _OF_NO_EFFECT:
+            return None
+    if links := found.pop("UV_FIND_LINKS", ""):
+        # pip passes over a folder that is not there; for uv it is an error.
+        there = [link for link in links.split() if "://" in link or os.path.exists(link)]
+        found |= {"UV_FIND_LINKS": ",".join(there)} if there else {}
+    for name in ("UV_NO_INDEX", "UV_NO_CACHE"):
+        if found.get(name, "1").lower() in ("0", "no", "off", "false"):
+            del found[name]
+    if proxy := found.get("HTTPS_PROXY"):
+        found |= {"HTTP_PROXY": proxy, "ALL_PROXY": proxy}
+    bundle = environ.get("REQUESTS_CA_BUNDLE") or environ.get("CURL_CA_BUNDLE")
+    if "SSL_CERT_FILE" not in found and bundle:
+        found["SSL_CERT_FILE"] = bundle
+    if not any(name in found or environ.get(name) for name in ("SSL_CERT_FILE", "SSL_CERT_DIR")):
+        # Authorities of this machine, as for pip; uv has its own where there are none.
+        cafile = ssl.get_default_verify_paths().cafile
+        found |= {"UV_SYSTEM_CERTS": "1"} if cafile else {}
+    return {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
+
+
 def explain_failure(text: str) -> str | None:
     """One sentence, cause and remedy, for what pip or the operating system wrote, where known."""
+    if re.search("DO NOT MATCH THE HASHES|Hash mismatch for", text):
+        return (
+            "a package on the index is not the one that the lock file names, and is not installed:"
+            " use another index (export PIP_INDEX_URL=https://pypi.org/simple), or, if you trust"
+            " this one, install.py --newest, which does without lock files"
+        )
     sentence = explain_machine(text)
     if sentence is None and re.search("No matching distribution|Could not find a version", text):
         return (
             f"a package does not exist for this Python: run {other_python()} install.py"
-            " (with --wheelhouse: or it is not in there)"
+            " (with --wheelhouse: or it is not in there; with an index of your own: --newest takes"
+            " the versions that it has)"
         )
     return sentence
 
@@ -126,7 +331,7 @@ def explain_failure(text: str) -> str | None:
 def explain_machine(text: str, again: str = "install.py") -> str | None:
     """One sentence for a failure of this machine or its network; ``again`` is what to run then."""
     for pattern, sentence in (
-        ("No space left on device|Disk quota exceeded", "the disk is full: make room (df -h)"),
+        (_DISK_IS_FULL, "the disk is full: make room (df -h)"),
         (
             "CERTIFICATE_VERIFY_FAILED",
             "the certificate of the package index is not trusted: "

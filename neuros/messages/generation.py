@@ -103,6 +103,8 @@ class Arguments:
 
     def file(self, generator: str, **more: Any) -> str:
         """The path of the file for a generator; ``more`` is what only this one takes."""
+        from rosidl_cli.command.helpers import generate_visibility_control_file
+
         order = self._order
         output = generated(Path(order.output), generator, order.package)
         idl = generated(Path(order.output), INTERFACES, order.package)
@@ -110,7 +112,12 @@ class Arguments:
             (output / Path(interface).parent / "detail").mkdir(parents=True, exist_ok=True)
         templates = Path(order.prefix, "share", generator, "resource")
         for template in templates.glob("*__visibility_control.h.in"):
-            self._configure(template, output / "msg" / template.stem)
+            # All headers of a package include the one in ``msg``.
+            generate_visibility_control_file(
+                package_name=order.package,
+                template_path=template,
+                output_path=output / "msg" / template.stem,
+            )
         content = {
             "package_name": order.package,
             "output_dir": str(output),
@@ -122,13 +129,6 @@ class Arguments:
         file = Path(order.output, f"{generator}.json")
         file.write_text(json.dumps(content), "utf-8")
         return str(file)
-
-    def _configure(self, template: Path, header: Path) -> None:
-        """What CMake does to a header; all of a package include the one in ``msg``."""
-        text, name = template.read_text("utf-8"), self._order.package
-        text = text.replace("@PROJECT_NAME_UPPER@", name.upper()).replace("@PROJECT_NAME@", name)
-        header.parent.mkdir(parents=True, exist_ok=True)
-        header.write_text(text, "utf-8")
 
 
 if __name__ == "__main__":

@@ -4,8 +4,7 @@ A node whose container has a ``requirements.txt`` that this environment satisfie
 Python. Every other container gets a virtual environment of its own, made once and kept in a cache:
 
 - :mod:`~neuros.backends.environments.requirements` reads ``requirements.txt`` and compares;
-- :mod:`~neuros.backends.environments.choice` decides, without changing anything, and finds the
-  Python that ``.python-version`` names;
 - :mod:`~neuros.backends.environments.cache` knows what is whole, and who makes what;
-- :mod:`~neuros.backends.environments.pythons` makes those of a run, or says why that failed.
+- :mod:`~neuros.backends.environments.pythons` chooses, without changing anything, and makes those
+  of a run, or says why that failed.
 """

@@ -11,10 +11,14 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.containers import ContainerFolder, find_container
-from neuros.backends.environments.choice import HERE, Choice, choose, find_python, wanted_version
 from neuros.backends.environments.pythons import (
+    HERE,
+    Choice,
     Pythons,
+    choose,
+    find_python,
     require_one_python,
+    wanted_version,
     why_no_files,
     why_no_venv,
     why_pip_failed,

@@ -1,0 +1,312 @@
+"""Packages are installed with uv or pip, as the lock files say, which fit ``pyproject.toml``."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import venv
+from collections.abc import Iterator
+from functools import cache
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from packages import make_wheel
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+from neuros.errors import EnvironmentFault
+from neuros.installation.command import extras_of
+from neuros.installation.machine import NEWEST, OLDEST, clean_environment, dotted
+from neuros.installation.packages import (
+    LOCKS,
+    UV,
+    explain_failure,
+    find_uv,
+    install,
+    run_installs,
+    uv_settings,
+)
+from neuros.installation.progress import Progress
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHONS = [dotted((3, minor)) for minor in range(OLDEST[1], NEWEST[1] + 1)]
+PACKAGE = re.compile(r"^(?P<pin>\S+==[^\\\n]+?) \\\n(?P<hashes>(?:    --hash=.+\n)+)", re.MULTILINE)
+
+
+def platform_of(python: str) -> dict[str, str]:
+    """What markers say on a machine that NeuROS is for."""
+    return {
+        "python_version": python,
+        "python_full_version": f"{python}.1",
+        "implementation_name": "cpython",
+        "platform_python_implementation": "CPython",
+        "sys_platform": "linux",
+        "platform_system": "Linux",
+        "platform_machine": "x86_64",
+        "os_name": "posix",
+        "extra": "",
+    }
+
+
+@cache
+def packages_of(name: str) -> list[Requirement]:
+    """The pinned packages of a lock file."""
+    text = (ROOT / LOCKS / f"{name}.txt").read_text("utf-8")
+    return [Requirement(match["pin"]) for match in PACKAGE.finditer(text)]
+
+
+def locked(python: str, *names: str) -> Iterator[tuple[str, Version]]:
+    """The packages that some lock files hold for a version of Python."""
+    for package in (package for name in names for package in packages_of(name)):
+        if package.marker is None or package.marker.evaluate(platform_of(python)):
+            (pin,) = package.specifier
+            yield package.name, Version(pin.version)
+
+
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def asked_for() -> Iterator[tuple[str, str]]:
+    """Each requirement of ``pyproject.toml``, with the lock file that it belongs to."""
+    tomllib = pytest.importorskip("tomllib")
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    project = table["project"]
+    groups = {"core": project["dependencies"], **project["optional-dependencies"]}
+    groups |= {"build": table["build-system"]["requires"], "uv": [UV]}
+    for group, needs in groups.items():
+        yield from ((group, need) for need in needs if not need.startswith("neuros["))
+
+
+class TestLockFiles:
+    def test_there_is_one_for_the_core_and_for_each_extra(self) -> None:
+        extras = extras_of((ROOT / "pyproject.toml").read_text("utf-8"))
+        names = {file.stem for file in (ROOT / LOCKS).glob("*.txt")}
+        assert names == {"build", "core", "uv", *extras}
+
+    @pytest.mark.parametrize("python", PYTHONS)
+    def test_they_hold_what_the_project_asks_for(self, python: str) -> None:
+        missing = []
+        for group, text in asked_for():
+            need = Requirement(text)
+            if need.marker is None or need.marker.evaluate(platform_of(python)):
+                there = dict(locked(python, "core", group)).get(canonical(need.name))
+                if there is None or not need.specifier.contains(there):
+                    missing.append(f"{group}: {text}, and {there} is locked: run .ci/lock")
+        assert missing == []
+
+    @pytest.mark.parametrize("python", PYTHONS)
+    def test_they_agree_on_one_version_of_each_package(self, python: str) -> None:
+        versions: dict[str, set[Version]] = {}
+        for file in (ROOT / LOCKS).glob("*.txt"):
+            for name, version in locked(python, file.stem):
+                versions.setdefault(name, set()).add(version)
+        assert {name: each for name, each in versions.items() if len(each) > 1} == {}
+
+    @pytest.mark.parametrize("file", sorted((ROOT / LOCKS).glob("*.txt")), ids=lambda f: f.stem)
+    def test_every_line_is_a_comment_a_pinned_package_or_its_hash(self, file: Path) -> None:
+        rest = PACKAGE.sub("", file.read_text("utf-8"))
+        assert rest == "# .ci/lock wrote this file: do not edit it.\n"
+
+
+class TestSettingsOfPip:
+    """uv gets what pip is told; it reads none of it by itself."""
+
+    def test_indexes_proxies_and_certificates_are_passed_on(self) -> None:
+        listing = (
+            "global.index-url='https://mirror/simple'\n"
+            "global.extra-index-url='https://one/simple\\nhttps://two/simple'\n"
+            ":env:.cert='/my.pem'\n"
+            ":env:.proxy='http://proxy:3128'\n"
+            "install.trusted-host='mirror'\n"
+        )
+        assert uv_settings(listing, {"SSL_CERT_FILE": "/other.pem"}) == {
+            "UV_DEFAULT_INDEX": "https://mirror/simple",
+            "UV_INDEX": "https://one/simple\nhttps://two/simple",
+            "SSL_CERT_FILE": "/my.pem",
+            "HTTPS_PROXY": "http://proxy:3128",
+            "HTTP_PROXY": "http://proxy:3128",
+            "ALL_PROXY": "http://proxy:3128",
+            "UV_INSECURE_HOST": "mirror",
+        }
+
+    def test_a_variable_comes_before_a_file(self) -> None:
+        listing = ":env:.index-url='https://b'\nglobal.index-url='https://a'\n"
+        settings = uv_settings(listing, {"SSL_CERT_FILE": "/my.pem"})
+        assert settings == {"UV_DEFAULT_INDEX": "https://b"}
+
+    def test_what_the_user_tells_uv_itself_stays(self) -> None:
+        environ = {"UV_DEFAULT_INDEX": "https://mine", "SSL_CERT_FILE": "/my.pem"}
+        assert uv_settings("global.index-url='https://a'\n", environ) == {}
+
+    def test_folders_of_wheels_that_are_not_there_are_left_out(self, tmp_path: Path) -> None:
+        listing = f"global.find-links='{tmp_path} {tmp_path}/nowhere https://wheels'\n"
+        settings = uv_settings(listing, {"SSL_CERT_FILE": "/my.pem"})
+        assert settings == {"UV_FIND_LINKS": f"{tmp_path},https://wheels"}
+
+    @pytest.mark.parametrize(("value", "is_set"), [("1", True), ("true", True), ("0", False)])
+    def test_an_index_is_used_unless_it_is_forbidden(self, value: str, is_set: bool) -> None:
+        settings = uv_settings(f":env:.no-index='{value}'\n", {})
+        assert settings is not None
+        assert ("UV_NO_INDEX" in settings) == is_set
+
+    @pytest.mark.parametrize("name", ["REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"])
+    def test_certificates_for_requests_are_for_uv_too(self, name: str) -> None:
+        assert uv_settings("", {name: "/my.pem"}) == {"SSL_CERT_FILE": "/my.pem"}
+
+    def test_a_setting_that_uv_has_not_leaves_it_to_pip(self) -> None:
+        assert uv_settings("global.keyring-provider='import'\n", {}) is None
+
+    def test_settings_of_the_output_do_not_matter(self) -> None:
+        assert uv_settings("global.quiet='1'\n", {"SSL_CERT_FILE": "/my.pem"}) == {}
+
+
+def program(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n", "utf-8")
+    path.chmod(0o755)
+    return path
+
+
+class TestUv:
+    def test_the_one_beside_python_comes_first(self, tmp_path: Path) -> None:
+        beside = program(tmp_path / "bin" / "uv", "")
+        program(tmp_path / "path" / "uv", "echo uv 0.9.1")
+        environ = {"PATH": str(tmp_path / "path")}
+        assert find_uv(tmp_path / "bin" / "python", environ) == beside
+
+    @pytest.mark.parametrize(
+        ("answer", "is_used"),
+        [("uv 0.9.0", True), ("uv 1.0.0 (x)", True), ("uv 0.1.39", False), ("nonsense", False)],
+    )
+    def test_one_on_the_path_has_to_be_new_enough(
+        self, answer: str, is_used: bool, tmp_path: Path
+    ) -> None:
+        on_path = program(tmp_path / "uv", f"echo '{answer}'")
+        found = find_uv(tmp_path / "bin" / "python", {"PATH": str(tmp_path)})
+        assert found == (on_path if is_used else None)
+
+
+@pytest.fixture
+def environ(tmp_path: Path) -> dict[str, str]:
+    """An environment in which pip knows one folder of wheels, and nothing else."""
+    return {
+        **{k: v for k, v in clean_environment(os.environ).items() if not k.startswith("PIP_")},
+        "PIP_CONFIG_FILE": os.devnull,
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": str(tmp_path / "wheels"),
+        "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+        "PATH": "/usr/bin:/bin",
+    }
+
+
+@pytest.fixture(scope="module")
+def with_pip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of a virtual environment that has pip."""
+    folder = tmp_path_factory.mktemp("with_pip")
+    venv.create(folder, with_pip=True)
+    return folder / "bin" / "python"
+
+
+class TestFallback:
+    """What cannot be had with uv, pip installs; here from a folder, without a network."""
+
+    @pytest.fixture
+    def python(self, with_pip: Path, tmp_path: Path) -> Iterator[Path]:
+        make_wheel(tmp_path / "wheels", "neuros_colour", "1.0", "NAME = 'red'")
+        yield with_pip
+        with_pip.with_name("uv").unlink(missing_ok=True)
+        (with_pip.parent.parent / "log").unlink(missing_ok=True)
+        for path in with_pip.parent.parent.glob("lib/*/site-packages/neuros_colour*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def run(self, python: Path, uv: Path | None, environ: dict[str, str]) -> tuple[str | None, str]:
+        stream, folder = StringIO(), python.parent.parent
+        output = run_installs(
+            *(python, uv, [["neuros_colour"]], folder, folder / "log", Progress(stream), environ)
+        )
+        return output, stream.getvalue()
+
+    def is_installed(self, python: Path) -> bool:
+        return bool([*python.parent.parent.glob("lib/*/site-packages/neuros_colour.py")])
+
+    def test_what_fails_with_uv_pip_tries(self, python: Path, environ: dict[str, str]) -> None:
+        uv = program(python.with_name("uv"), "echo the proxy stops uv; exit 2")
+        output, shown = self.run(python, uv, environ)
+        assert output is None
+        assert "uv failed: pip tries (log: " in shown
+        assert self.is_installed(python)
+        assert "the proxy stops uv" in (python.parent.parent / "log").read_text("utf-8")
+
+    def test_a_full_disk_is_one_for_pip_as_well(
+        self, python: Path, environ: dict[str, str]
+    ) -> None:
+        uv = program(python.with_name("uv"), "echo 'No space left on device (os error 28)'; exit 2")
+        output, _ = self.run(python, uv, environ)
+        assert explain_failure(output or "") == "the disk is full: make room (df -h)"
+        assert not self.is_installed(python)
+
+    def test_uv_gets_the_settings_of_pip(self, python: Path, environ: dict[str, str]) -> None:
+        uv = program(python.with_name("uv"), 'echo "$@" "[$UV_NO_INDEX $UV_FIND_LINKS]"')
+        output, shown = self.run(python, uv, environ)
+        assert output is None
+        log = (python.parent.parent / "log").read_text("utf-8")
+        assert f"--python {python} neuros_colour [1 {environ['PIP_FIND_LINKS']}]" in log
+        assert "pip" not in shown
+
+    def test_a_setting_that_uv_does_not_know_is_said(
+        self, python: Path, environ: dict[str, str]
+    ) -> None:
+        uv = program(python.with_name("uv"), "exit 2")
+        output, shown = self.run(python, uv, {**environ, "PIP_PRE": "1"})
+        assert output is None
+        assert "uv does not know all settings that pip has here: pip installs" in shown
+        assert self.is_installed(python)
+
+    def test_where_there_is_no_uv_install_says_so_and_takes_pip(
+        self, python: Path, environ: dict[str, str], tmp_path: Path
+    ) -> None:
+        """From a folder of wheels, and without lock files, which such a folder need not match."""
+        tree, stream = tmp_path / "tree", StringIO()
+        tree.mkdir()
+        (tree / "pyproject.toml").write_text(
+            '[build-system]\nrequires = []\nbuild-backend = "backend"\nbackend-path = ["."]\n'
+        )
+        (tree / "backend.py").write_text(
+            "import shutil, pathlib\n"
+            "def build_editable(target, config_settings=None, metadata_directory=None):\n"
+            f"    wheel = next(pathlib.Path({str(tmp_path / 'wheels')!r}).glob('*.whl'))\n"
+            "    shutil.copy(wheel, target)\n"
+            "    return wheel.name\n"
+        )
+        install(python, tree, ["plot"], Progress(stream), environ)
+        assert "there is no uv for this machine: pip installs, which takes longer" in (
+            stream.getvalue()
+        )
+        assert self.is_installed(python)
+
+    def test_without_a_network_nothing_is_tried_after_uv(
+        self, python: Path, environ: dict[str, str]
+    ) -> None:
+        online = {k: v for k, v in environ.items() if k not in ("PIP_NO_INDEX", "PIP_FIND_LINKS")}
+        online |= {"PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1"}
+        stream = StringIO()
+        with pytest.raises(EnvironmentFault, match=r"^the package index .* cannot be reached"):
+            install(python, ROOT, ["plot"], Progress(stream), online)
+        assert "pip installs" not in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "output",
+    [
+        "ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE. If you ...",
+        "  × Failed to download `jsonschema==4.26.0`\n  ╰─▶ Hash mismatch for `jsonschema==4.26.0`",
+    ],
+)
+def test_a_package_with_another_hash_is_told_in_one_sentence(output: str) -> None:
+    explanation = explain_failure(output)
+    assert explanation is not None
+    assert explanation.startswith("a package on the index is not the one that the lock file names")
+    assert "--newest" in explanation
