@@ -53,9 +53,10 @@ BY_NAME = {
         "benchmarks/test_reproduce_command.py",
         "cli/test_command_line.py::test_what_could_not_be_started",
         "cli/test_validate_command.py",
-        "doctor/test_machine_checks.py::test_a_gpu_tool",
+        "doctor/test_checks.py::test_a_gpu_tool",
         "simulators/test_mujoco_opengl.py::TestDoctor",
         "test_installation.py",
+        "test_packages_installed.py",
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",
     ),
     "slow": (

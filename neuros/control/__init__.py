@@ -356,12 +356,19 @@ class LogRecord(Message):
 
 @dataclass(frozen=True)
 class Ended(Message):
-    """All nodes have ended; ``reports``: the last one of each; ``running_s``: how long all ran."""
+    """All nodes have ended.
+
+    Attributes:
+        reports: the last one of each node.
+        running_s: how long all nodes ran.
+        real_time_factor: simulated seconds per second of that.
+    """
 
     exit_code: int
     reason: str
     reports: Mapping[str, Report]
     running_s: float | None
+    real_time_factor: float | None
 
 
 FROM_NODES: Sequence[type[Message]] = (

@@ -268,7 +268,15 @@ class Observers:
 
     def part(self, outcome: Outcome) -> None:
         """Tell them how the run has ended."""
-        self.tell(Ended(outcome.exit_code, outcome.reason, outcome.reports, outcome.running_s))
+        self.tell(
+            Ended(
+                outcome.exit_code,
+                outcome.reason,
+                outcome.reports,
+                outcome.running_s,
+                outcome.real_time_factor,
+            )
+        )
 
 
 @dataclass

@@ -46,10 +46,12 @@ def read_run_file(folder: Path) -> dict[str, Any]:
         raise UsageError(f"{file} cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
-    found = record.get("format") if isinstance(record, dict) else None
+    if not isinstance(record, dict):
+        raise UsageError(f"{file} is broken: it holds no object")
+    found = record.get("format")
     if found != FORMAT:
         raise UsageError(
             f"{file} has format {found}, and this version of NeuROS reads format {FORMAT}: use the"
             " version that the run was made with, or run the project again"
         )
-    return dict(record)
+    return record

@@ -44,7 +44,7 @@ def test_what_is_no_record_is_refused_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "a/node.json").touch()
     with pytest.raises(UsageError, match="its run goes on, or its launcher was killed"):
         read_run_file(tmp_path)
-    for text, reason in (("{", "is broken"), ("[]", "has format None"), ("{}", "has format None")):
+    for text, reason in (("{", "is broken"), ("[]", "holds no object"), ("{}", "has format None")):
         (tmp_path / "run.json").write_text(text)
         with pytest.raises(UsageError, match=reason):
             read_run_file(tmp_path)

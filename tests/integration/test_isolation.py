@@ -22,7 +22,7 @@ from launching import Running, start
 from outside_asker import PROGRAM
 
 from neuros.backends.domain import choose_domain
-from neuros.doctor.delivery import PROJECT as IMAGES
+from neuros.doctor.checks import PROJECT as IMAGES
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 
 pytestmark = pytest.mark.needs("root")

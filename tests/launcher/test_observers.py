@@ -92,7 +92,7 @@ def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     assert told(lines, 3) == [
         PhaseChanged("running", False),
         PhaseChanged("draining", False),
-        Ended(3, "why", {}, None),
+        Ended(3, "why", {}, None, None),
     ]
     lines.close()
 

@@ -202,12 +202,18 @@ class LiveMetrics:
         for name, latency in self._latencies.items():
             self.connections[name]["latency_ms"] = latency.ms
 
-    def end(self, reports: Mapping[str, Report], running_s: float | None) -> None:
+    def end(
+        self,
+        reports: Mapping[str, Report],
+        running_s: float | None,
+        real_time_factor: float | None,
+    ) -> None:
         """The run is over: counts are final, and rates and shares are those of the whole run.
 
         Args:
             reports: the last one of each node that has made one.
             running_s: how long all nodes ran.
+            real_time_factor: of that time.
         """
         self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
         ends: dict[str, dict[str, int]] = {}
@@ -233,8 +239,7 @@ class LiveMetrics:
                 "rate_hz": count / running_s if count is not None and running_s else None,
                 "lost": final["sent"] - final["received"] if is_known else None,
             }
-        if self.sim_time is not None and running_s:
-            self._ended_factor = self.sim_time / running_s
+        self._ended_factor = real_time_factor
 
     def _end_node(self, name: str, metrics: Metrics, running_s: float | None) -> None:
         spent = time_budget_of(metrics, running_s)
@@ -366,8 +371,8 @@ class LiveRun:
                 self._pages.send("phase", self.phase)
             case LogRecord(severity, text):
                 self._pages.send("log", [f"[{severity}] [neuros] {text}"])
-            case Ended(exit_code, reason, reports, running_s):
-                self._metrics.end(reports, running_s)
+            case Ended(exit_code, reason, reports, running_s, real_time_factor):
+                self._metrics.end(reports, running_s, real_time_factor)
                 self._show()
                 self.phase = {"phase": "ended", "is_paused": False}
                 self.phase |= {"exit_code": exit_code, "reason": reason}

@@ -41,7 +41,7 @@ def test_of_a_run_that_was_cut_off_packets_are_counted(tmp_path: Path) -> None:
     [
         (None, "no folder that a run has left behind"),
         ('{"format": 2', "is broken"),
-        ("[]", "has format None"),
+        ("[]", "is broken: it holds no object"),
         ('{"format": 3}', "has format 3, and this version of NeuROS reads format 2"),
         ('{"format": 2, "connections": 7}', "is broken"),
         ('{"format": 2, "connections": [{"connection": "a"}]}', "is broken"),

@@ -22,7 +22,7 @@ from outside_asker import PROGRAM
 from containers import nothing_left, require_containers, wait_until
 from neuros.backends.docker.images import image_for
 from neuros.backends.domain import choose_domain
-from neuros.doctor.delivery import PROJECT as IMAGES
+from neuros.doctor.checks import PROJECT as IMAGES
 from neuros.transport.dds_profile import RANGE_VARIABLE
 
 ECHO = Path(__file__).parents[1] / "isolation"

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from neuros.control import TO_OBSERVERS
+from neuros.control.link import ControlLink
+from neuros.viewers.dashboard.live_metrics import LiveRun
+from neuros.viewers.dashboard.pages import Pages
 from neuros.viewers.dashboard.server import Dashboard, Sources
 
 TOKEN = "secret"
@@ -17,8 +23,16 @@ class Server:
     """The application, asked without a network."""
 
     def __init__(self) -> None:
-        dashboard = Dashboard({}, ("a",), Sources(lambda: None, dict), 0.0)  # type: ignore[arg-type]
+        here, self._there = socket.socketpair()
+        pages, link = Pages(), ControlLink(here, TO_OBSERVERS, "the supervisor")
+        run = LiveRun(pages, link, ("a",), 0.0)
+        dashboard = Dashboard({}, Sources(lambda: None, dict), pages, run)  # type: ignore[arg-type]
         self._app = dashboard.app(TOKEN, "0123456789abcdef")
+        self._link = link
+
+    def close(self) -> None:
+        self._link.close()
+        self._there.close()
 
     def post(self, path: str, body: Any) -> int:
         """The status of the answer."""
@@ -47,8 +61,10 @@ class Server:
 
 
 @pytest.fixture
-def server() -> Server:
-    return Server()
+def server() -> Iterator[Server]:
+    server = Server()
+    yield server
+    server.close()
 
 
 @pytest.mark.parametrize(

@@ -172,7 +172,7 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     reports = {
         name: Report(node=name, metrics=each, is_final=True) for name, each in metrics.items()
     }
-    figures.end(reports, 4.0)
+    figures.end(reports, 4.0, 0.25)
     assert {node["state"] for node in figures.nodes.values()} == {"ended"}
     assert figures.nodes["a"]["shares"] == pytest.approx(
         {"executing": 0.25, "waiting": 0, "blocked": 0, "idle": 0.75}
@@ -187,5 +187,5 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     assert (shown["rate_hz"], figures.real_time_factor) == (2.0, 0.25)
 
     reports["b"] = replace(reports["b"], is_final=False)
-    figures.end(reports, 4.0)
+    figures.end(reports, 4.0, 0.25)
     assert figures.connections[LINK]["lost"] is None
