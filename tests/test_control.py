@@ -117,7 +117,7 @@ def test_half_a_character_arrives_as_its_escape() -> None:
         ),
         (
             b'{"kind": "ended", "exit_code": 0, "reason": "", "reports": {"a": {}},'
-            b' "running_s": null}',
+            b' "running_s": null, "real_time_factor": null}',
             "field reports['a'].node is missing",
         ),
     ],
