@@ -36,6 +36,7 @@ _ESCAPE = re.compile(
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1a\x1c-\x1f\x7f-\x9f\u2028\u2029]|\x1b(?!\[[0-9;:]*m)")
 _READ_BYTES = 1 << 16
 _LONGEST_LINE_BYTES = 1 << 16
+_MOST_BEHIND_BYTES = 1 << 22
 # A pipe that is ready takes this much without blocking (PIPE_BUF, pipe(7)).
 _CHUNK_BYTES = 4096
 _LOOK_MS = 50
@@ -45,7 +46,8 @@ class LogTail:
     """Shows complete lines of several growing files, each in a colour of its own.
 
     What is new in all files is shown in the order of its records' times; lines without a time stay
-    behind the record that they follow.
+    behind the record that they follow. Of a file that grows faster than it can be shown, a part is
+    left out, and a line says so.
 
     Args:
         files: the name to show, usually the node's, and the file, which need not exist yet.
@@ -164,10 +166,25 @@ class _GrowingFile:
         if not data:
             return []
         *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(data) == _READ_BYTES:
+            lines += self._skip()
         while len(self._rest) > _LONGEST_LINE_BYTES:  # do not wait for its end
             lines.append(self._rest[:_LONGEST_LINE_BYTES])
             self._rest = self._rest[_LONGEST_LINE_BYTES:]
         return lines
+
+    def _skip(self) -> list[bytes]:
+        """Leave out most of what is too much to be shown; returns the line that says so."""
+        assert self._descriptor is not None
+        at, size = os.lseek(self._descriptor, 0, os.SEEK_CUR), os.fstat(self._descriptor).st_size
+        if size - at <= _MOST_BEHIND_BYTES:
+            return []
+        os.lseek(self._descriptor, size - _READ_BYTES, os.SEEK_SET)
+        _, _, shown = os.read(self._descriptor, _READ_BYTES).partition(b"\n")
+        os.lseek(self._descriptor, -len(shown), os.SEEK_CUR)
+        self._rest = b""
+        left_out = (size - at - len(shown)) / 1e6
+        return [f"({left_out:.0f} MB are not shown here: {self._path} has all)".encode()]
 
     def take_rest(self) -> list[bytes]:
         rest, self._rest = self._rest, b""
@@ -224,6 +241,8 @@ def clean(text: str, *, keep_colours: bool) -> str:
     Escape sequences go, except colours if they are to stay; other control characters are shown as
     ``\x07``. Of a line that was overwritten with carriage returns, the last version stays.
     """
+    if text.isprintable():
+        return text
     text = text.rstrip("\r").rpartition("\r")[2]
     text = _ESCAPE.sub(
         lambda match: match[0] if keep_colours and match["sgr"] is not None else "", text

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import selectors
 import socket
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -48,6 +49,9 @@ _WAKING_BYTES = 1024
 class Channels:
     """All programs that have connected to the control channel of a run.
 
+    Attributes:
+        parted: the nodes of each process that has hung up, and when (``time.monotonic()``).
+
     Raises:
         EnvironmentFault: if there can be no such channel.
     """
@@ -58,7 +62,8 @@ class Channels:
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
         self._unsent: dict[ControlLink, bytearray] = {}
-        self._nodes: dict[ControlLink, None] = {}  # in the order in which they said hello
+        self._nodes: dict[ControlLink, tuple[str, ...]] = {}  # as they said hello
+        self.parted: dict[tuple[str, ...], float] = {}
         self._waker: socket.socket | None = None
 
     def wake_on(self, waker: socket.socket) -> None:
@@ -90,6 +95,8 @@ class Channels:
                 for line in lines or ():
                     yield link, self._message_in(line, link)
                 if lines is None:
+                    if link in self._nodes:
+                        self.parted[self._nodes[link]] = time.monotonic()
                     self.hang_up(link)
                 if link not in self._unsent:
                     break
@@ -146,7 +153,7 @@ class Channels:
         except ControlError as error:
             return error
         if isinstance(message, Hello):
-            self._nodes[link] = None
+            self._nodes[link] = tuple(message.nodes)
             link.peer = f"the process of {' and '.join(message.nodes)}"
         elif isinstance(message, Watch):
             link.peer = "an observer"

@@ -19,18 +19,20 @@ from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, Overheard, PauseState
 from neuros.launcher.declarations import Declarations
-from neuros.launcher.outcome import Outcome, Output, Phase, Processes
+from neuros.launcher.outcome import Outcome, Output, Phase, Processes, names_of
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Probing, Verdict, connections_among
 from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
-from neuros.ports import ControlListener, Launcher
+from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 from neuros.stacks import remove_stack_files
 
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
+_PARTED_S = 1.0
+"""A process that has hung up ends within this time, or something has closed its descriptors."""
 
 
 class Supervisor:
@@ -226,6 +228,22 @@ class Supervisor:
                     self._processes.how_it_failed(process, how, is_stopping=is_stopping),
                     exit_code=4 if process.is_abandoned else 1,
                 )
+
+        for process in self._processes:
+            if self._is_cut_off(process):
+                self._processes.kill(process)
+                self._shutdown.fail(
+                    f"{'node' if len(process.names) == 1 else 'nodes'} {names_of(process)} cannot"
+                    " be reached any more: the control connection was closed at that end. Does a"
+                    " plugin close file descriptors that it has not opened?"
+                )
+
+    def _is_cut_off(self, process: RunningNode) -> bool:
+        """Whether a process goes on, though it has hung up and has not told its last."""
+        for names, since_s in self._channels.parted.items():
+            if {*names} & {*process.names} and time.monotonic() - since_s > _PARTED_S:
+                return not self._processes.may_end(process, is_stopping=True)
+        return False
 
     # ------------------------------------------------------------------ time
 

@@ -105,6 +105,15 @@ def test_bytes_that_are_no_text_are_shown_as_numbers(screen: Screen) -> None:
     assert screen.after("snn", b"\xff!\n") == "[snn] \\xff!\n"
 
 
+def test_what_is_too_much_to_be_shown_is_left_out_and_said_so(screen: Screen) -> None:
+    line = b"x" * 99 + b"\n"
+    shown = screen.after("snn", b"first\n" + line * 100_000 + b"last\n").splitlines()
+    assert (shown[0], shown[-1]) == ("[snn] first", "[snn] last")
+    (notice,) = [each for each in shown if "not shown" in each]
+    assert notice == f"[snn] (10 MB are not shown here: {screen.files['snn']} has all)"
+    assert {*shown} == {"[snn] first", f"[snn] {'x' * 99}", notice, "[snn] last"}
+
+
 def test_an_endless_line_is_shown_in_pieces(screen: Screen) -> None:
     screen.log("snn", b"x" * 200_000)
     while screen.tail.poll():
