@@ -42,6 +42,7 @@ class UnixListener:
         try:
             with _short_path(self._path) as name:
                 self._socket.bind(name)
+                os.chmod(name, 0o600)  # whatever the umask; nobody can connect before it listens
         except OSError as error:
             self._socket.close()
             raise EnvironmentFault(

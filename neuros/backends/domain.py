@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import stat
 import tempfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -134,10 +135,15 @@ def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:
 
 
 def _open(path: Path) -> int | None:
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW
+    # A pipe of this name, made by another user, would hold up whoever opens it (O_NONBLOCK).
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         # Linux refuses O_CREAT on another user's file in a shared folder (fs.protected_regular).
-        return os.open(path, flags)
+        descriptor = os.open(path, flags)
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            return descriptor
+        os.close(descriptor)
+        return None
     except FileNotFoundError:
         pass
     except OSError:

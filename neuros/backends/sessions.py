@@ -15,11 +15,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from neuros.backends.console import clean
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
 from neuros.control import Interrupt
-from neuros.control.link import ControlLink
-from neuros.errors import EnvironmentFault
+from neuros.control.link import ControlLink, read_as
+from neuros.errors import ControlError, EnvironmentFault
 
 _VARIABLE = "NEUROS_GUARDED_RUN"
 
@@ -110,8 +111,9 @@ def _found() -> Iterator[Session]:
     for name in filter(str.isdigit, os.listdir("/proc")):
         for variable in environ_of(int(name)):
             if variable.startswith(mark):
-                described = json.loads(variable.removeprefix(mark))
-                with contextlib.suppress(KeyError):  # of another version of NeuROS
+                # Another version of NeuROS, or another user, may have written anything there.
+                with contextlib.suppress(ControlError, ValueError, TypeError, RecursionError):
+                    described = json.loads(variable.removeprefix(mark))
                     yield _session({**described, "user": _user_of(int(name))})
 
 
@@ -124,7 +126,18 @@ def _user_of(pid: int) -> int | None:
 
 
 def _session(described: Mapping[str, Any]) -> Session:
-    """The run that a reaper's environment describes; raises ``KeyError`` if something lacks."""
-    known = {each.name: described[each.name] for each in fields(Session)}
-    known |= {name: tuple(described[name]) for name in ("nodes", "launcher")}
-    return Session(**known)
+    """The run that a reaper's environment describes, as it can be shown in a terminal.
+
+    Raises:
+        ControlError: if something lacks, or is of a wrong type.
+    """
+    names = {each.name for each in fields(Session)}
+    known = {key: _harmless(each) for key, each in described.items() if key in names}
+    return read_as(Session, known)
+
+
+def _harmless(value: Any) -> Any:
+    """A value whose texts do nothing to a terminal."""
+    if isinstance(value, str):
+        return clean(value, keep_colours=False)
+    return [_harmless(each) for each in value] if isinstance(value, list) else value

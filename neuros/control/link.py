@@ -9,7 +9,7 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
-from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from neuros.control import Message
 from neuros.errors import ControlError
@@ -83,6 +83,7 @@ class ControlLink:
 
 _NO_CHARACTER = re.compile("[\ud800-\udfff]")
 _LONGEST_SHOWN = 60
+_Declared = TypeVar("_Declared")
 
 
 def kind_of(message: type[Message]) -> str:
@@ -111,7 +112,7 @@ def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Mes
     try:
         content = json.loads(line)
         kind = content.pop("kind")
-    except (ValueError, AttributeError, TypeError, KeyError):
+    except (ValueError, AttributeError, TypeError, KeyError, RecursionError):
         raise ControlError(f"{peer} sent what is no control message: {_shown(line)}") from None
     message = accepted.get(kind) if isinstance(kind, str) else None
     if message is None:
@@ -121,6 +122,20 @@ def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Mes
         found: Message = read(content)
     except _WrongField as error:
         raise ControlError(f"{peer} sent a wrong control message '{kind}': {error}") from None
+    return found
+
+
+def read_as(declared: type[_Declared], content: Any) -> _Declared:
+    """An object of a dataclass from JSON that somebody else has written.
+
+    Raises:
+        ControlError: if a field is missing, unknown or of a wrong type.
+    """
+    read: _Reader = _reader(declared)  # type: ignore[arg-type]
+    try:
+        found: _Declared = read(content)
+    except _WrongField as error:
+        raise ControlError(str(error)) from None
     return found
 
 

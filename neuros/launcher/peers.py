@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 from neuros.control import Report
+from neuros.control.link import read_as
+from neuros.errors import ControlError
 from neuros.project.model import Connection, NodeFile
 
 Counters = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
@@ -72,8 +74,8 @@ class PeerState:
 def state_from(text: str) -> PeerState | None:
     """The inverse of :meth:`PeerState.to_text`; ``None`` for anything else."""
     try:
-        return PeerState(**json.loads(text))
-    except (TypeError, ValueError):
+        return read_as(PeerState, json.loads(text))
+    except (ControlError, ValueError, RecursionError):
         return None
 
 

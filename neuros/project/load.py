@@ -39,6 +39,10 @@ STANDARD_CONTAINERS = frozenset(
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
 _T = TypeVar("_T")
+_OWN_VARIABLES = frozenset(
+    f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE", "GUARDED_RUN")
+)
+"""Variables by which the processes of a run find each other, and the reaper finds them."""
 
 
 class _Builder:
@@ -63,6 +67,10 @@ class _Builder:
                 if is_for_gazebo(name) and not self._roots.finds(
                     member.value, member.source.folder
                 ):
+                    continue
+                if name in _OWN_VARIABLES:
+                    text = f"'{name}' is set by NeuROS itself: remove it"
+                    self.problems.append(member.key_problem(text))
                     continue
                 environment[name], is_path = self._variable(member)
                 if is_path:

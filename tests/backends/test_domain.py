@@ -123,6 +123,15 @@ def test_a_link_in_place_of_a_lock_file_is_not_followed(tmp_path: Path) -> None:
     assert not (tmp_path / "elsewhere").exists()
 
 
+def test_a_pipe_in_place_of_a_lock_file_holds_up_nobody(tmp_path: Path) -> None:
+    with _first_free(tmp_path) as probe:
+        path, free = probe.path, probe.id
+    assert path is not None
+    os.mkfifo(path)
+    with _first_free(tmp_path) as lock:
+        assert lock.id != free
+
+
 def test_without_any_free_domain_the_user_is_told_what_to_do(tmp_path: Path) -> None:
     held = []
     try:

@@ -55,6 +55,26 @@ def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) ->
     assert older["run"] not in runs
 
 
+@pytest.mark.parametrize(
+    "written", ["{", "[]", "1", '{"run": 1}', "[" * 100_000, '{"nodes": {"a": 1}, "since": "now"}']
+)
+def test_what_describes_no_run_is_passed_over(written: str, session: Session) -> None:
+    (variable,) = reaper_environment(session)
+    reaper = Reaper.start(secrets.token_hex(8), None, {variable: written})
+    found = sessions()
+    reaper.finish()
+    assert session in found
+
+
+def test_names_do_nothing_to_a_terminal(session: Session) -> None:
+    ((variable, text),) = reaper_environment(session).items()
+    forged = {**json.loads(text), "run": secrets.token_hex(8), "project": "\x1b[2Jdemo\x07"}
+    reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
+    names = {each.run: each.project for each in sessions()}
+    reaper.finish()
+    assert names[forged["run"]] == "demo\\x07"
+
+
 def test_a_run_is_its_reapers_users_whatever_that_says(session: Session) -> None:
     ((variable, text),) = reaper_environment(session).items()
     forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}

@@ -55,6 +55,18 @@ def connect(place):
 """
 
 
+def test_nobody_else_reaches_the_socket_whatever_the_umask(tmp_path: Path) -> None:
+    listener = UnixListener(tmp_path)
+    before = os.umask(0)
+    try:
+        listener.open()
+    finally:
+        os.umask(before)
+    (socket_file,) = listener.files
+    listener.close()
+    assert socket_file.stat().st_mode & 0o777 == 0o600
+
+
 @pytest.fixture
 def tcp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A distribution that knows how to connect to ``tcp:`` is installed."""

@@ -230,3 +230,20 @@ def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> No
 def test_a_state_comes_through_as_it_was() -> None:
     state = PeerState("r", "h", 4, RUNNING, 0, "é", "o", 1.5, received(3))
     assert state_from(state.to_text()) == state
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"run": "r"}',
+        '{"run": "r", "machine": "m", "number": "1"}',
+        '{"run": "r", "machine": "m", "counters": []}',
+        '{"run": "r", "machine": "m", "colour": "red"}',
+        "[" * 100_000,
+    ],
+)
+def test_what_is_no_state_is_passed_over(text: str) -> None:
+    assert state_from(text) is None
