@@ -67,7 +67,11 @@ viewcode_follow_imported_members = False
 
 nitpicky = True
 # Types of other projects are not linked, since no network is needed, nor private ones.
-nitpick_ignore_regex = [("py:.*", r"(?!neuros\.).*"), ("py:class", r".*\._\w+")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!neuros\.).*"),
+    ("py:class", r".*\._\w+"),
+    ("py:(class|obj)", r"neuros\.registry\.Part"),  # a type variable
+]
 
 smartquotes = False  # options begin with two hyphens
 

@@ -66,6 +66,7 @@ class NodeProcess:
     Attributes:
         names: of the nodes.
         command: what becomes the node process; it runs the scripts of the nodes before.
+        node_program: the command without these scripts.
         environment: the whole of it.
         log: where both its outputs are to be appended.
         folder: the one to start it in.
@@ -74,6 +75,7 @@ class NodeProcess:
 
     names: tuple[str, ...]
     command: Sequence[str]
+    node_program: Sequence[str]
     environment: Mapping[str, str]
     log: Path
     folder: Path
@@ -82,7 +84,7 @@ class NodeProcess:
     def __str__(self) -> str:
         names = ", ".join(self.names)
         what = f"one process for {names}" if self.log.name == PROCESS_LOG else f"process {names}"
-        return f"{what}{on_cores(self.cores)}: {shlex.join(self.command)} (log: {self.log})"
+        return f"{what}{on_cores(self.cores)}: {shlex.join(self.node_program)} (log: {self.log})"
 
 
 def node_process(
@@ -119,6 +121,7 @@ def _process(
     return NodeProcess(
         tuple(node.node.name for node in nodes),
         start_arguments(command, nodes),
+        node_command(command, nodes),
         start_environment(command, nodes, whole),
         log,
         nodes[0].folders.run,

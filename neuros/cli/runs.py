@@ -317,9 +317,10 @@ def _info(options: argparse.Namespace) -> int:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
         print(tabulate(rows, headers=["topic", "type", "packets"], disable_numparse=True))
         print(f"\n{opened.folder}: {opened.duration_s:.2f} s, project {opened.project or '?'}")
-    if opened.damage is None:
+        damage = opened.check()
+    if damage is None:
         return 0
-    print(f"neuros: {opened.damage}", file=sys.stderr)
+    print(f"neuros: {damage}", file=sys.stderr)
     return EXIT_DAMAGED
 
 

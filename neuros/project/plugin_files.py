@@ -2,7 +2,7 @@
 
 Only what is written as a literal is looked at. A name that is computed, a hook inside of an ``if``,
 a decorator of another library: of those nothing is said, here or in
-:mod:`neuros.project.plugin_checks`.
+:mod:`neuros.project.checks`.
 """
 
 from __future__ import annotations

@@ -19,12 +19,16 @@ import os
 import sqlite3
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from struct import Struct, pack
+from struct import Struct, pack, unpack
 from typing import Any, BinaryIO, NamedTuple
+from zlib import crc32
 
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -308,7 +312,10 @@ class _McapFile:
             self._first_ns = min(self._first_ns, first_ns)
             self._last_ns = max(self._last_ns, last_ns)
         start, size = self._size, self._chunk_size
-        head = _CHUNK_HEAD.pack(first_ns, last_ns, size, 0) + _text("") + pack("<Q", size)
+        checksum = 0
+        for part in self._chunk:
+            checksum = crc32(part, checksum)
+        head = _CHUNK_HEAD.pack(first_ns, last_ns, size, checksum) + _text("") + pack("<Q", size)
         self._add(_RECORD_HEAD.pack(_CHUNK, len(head) + size), head, *self._chunk)
         length = self._size - start
         offsets = b""
@@ -355,8 +362,9 @@ class _McapFile:
                 where = pack("<BQQ", kind, start + len(summary), len(group))
                 offsets += _record(_SUMMARY_OFFSET, where)
                 summary += group
-        footer = _record(_FOOTER, pack("<QQI", start, start + len(summary), 0))
-        return before + summary + offsets + footer + _MAGIC
+        footer = _RECORD_HEAD.pack(_FOOTER, 20) + pack("<QQ", start, start + len(summary))
+        checksum = pack("<I", crc32(summary + offsets + footer))
+        return before + summary + offsets + footer + checksum + _MAGIC
 
     def _write(self, data: bytes) -> None:
         at = self._safe_bytes
@@ -446,15 +454,20 @@ class Stored(NamedTuple):
     data: bytes
 
 
-def stored_messages(folder: Path) -> Iterator[Stored]:
+def stored_messages(
+    folder: Path, complain: Callable[[str], object] = lambda _: None
+) -> Iterator[Stored]:
     """All messages in the files of a bag's folder, as far as they go.
+
+    Args:
+        complain: told in one sentence of each part of a file that is not as it was written.
 
     Raises:
         EnvironmentFault: if they are compressed, which is not how NeuROS records.
     """
     for path in sorted(folder.glob("*.mcap")):
         with open(path, "rb") as file:
-            for topic, log_ns, publish_ns, _, data in _of_mcap(file):
+            for topic, log_ns, publish_ns, _, data in _of_mcap(file, complain):
                 yield Stored(topic, log_ns, publish_ns, bytes(data))
     for path in sorted(folder.glob("*.db3")):
         yield from _of_sqlite(path)
@@ -465,10 +478,14 @@ class StoredTopics:
 
     With the first topic an MCAP file is gone through once, and it is noted where each message is:
     32 bytes for one.
+
+    Args:
+        complain: told in one sentence of each part of a file that is not as it was written.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, complain: Callable[[str], object]) -> None:
         self._folder = folder
+        self._complain = complain
         self._places: dict[Path, Mapping[str, array[int]]] = {}
 
     def messages(self, topic: str) -> list[Stored]:
@@ -477,7 +494,7 @@ class StoredTopics:
         for path in sorted(self._folder.glob("*.mcap")):
             with open(path, "rb") as file:
                 if path not in self._places:
-                    self._places[path] = _places_in(file)
+                    self._places[path] = _places_in(file, self._complain)
                 row = iter(self._places[path].get(topic, ()))
                 for log_ns, publish_ns, start, size in zip(row, row, row, row, strict=True):
                     data = os.pread(file.fileno(), size, start)
@@ -488,24 +505,68 @@ class StoredTopics:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether readers will open a bag: it has its metadata, and its files have their ends."""
-    if not (folder / "metadata.yaml").is_file():
+    """Whether readers will open a bag: metadata, and beginning and end of its files."""
+    try:
+        with opened(folder):
+            return True
+    except EnvironmentFault:
         return False
-    files = [*folder.glob("*.mcap"), *folder.glob("*.db3")]
-    return bool(files) and all(path.suffix != ".mcap" or _has_end(path) for path in files)
 
 
-def _has_end(path: Path) -> bool:
-    with open(path, "rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - len(_MAGIC)))
-        return size > 2 * len(_MAGIC) and file.read() == _MAGIC
+@contextmanager
+def opened(folder: Path) -> Iterator[Reader]:
+    """A bag as ``rosbags`` opens it.
+
+    Raises:
+        EnvironmentFault: if it cannot.
+    """
+    reader = None
+    try:
+        _check_summaries(folder)
+        reader = Reader(folder)
+        reader.open()
+        _check_definitions(reader)
+    # Of a damaged file it may believe anything.
+    except Exception as error:
+        with suppress(Exception):  # it may be half open
+            reader.close()  # type: ignore[union-attr]
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
+    try:
+        yield reader
+    finally:
+        reader.close()
 
 
-def _places_in(file: BinaryIO) -> Mapping[str, array[int]]:
+def _check_definitions(reader: Reader) -> None:
+    """Raise ``ReaderError`` where metadata and files do not agree."""
+    storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
+    there = {each.topic for storage in storages for each in storage.connections}
+    for connection in reader.connections:
+        is_there = connection.topic in there or not connection.msgcount
+        if connection.msgdef.format == MessageDefinitionFormat.NONE or not is_there:
+            what = f"{connection.topic} of type {connection.msgtype}"
+            raise ReaderError(f"its files do not have the topic {what}")
+
+
+def _check_summaries(folder: Path) -> None:
+    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says."""
+    for path in folder.glob("*.mcap"):
+        with open(path, "rb") as file:
+            end = file.seek(0, os.SEEK_END) - len(_MAGIC) - 4
+            if end < 16:
+                raise ReaderError(f"{path.name} has no end")
+            file.seek(end - 16)
+            start, _, checksum = unpack("<QQI", file.read(20))
+            file.seek(min(start, end))
+            if checksum and crc32(file.read(end - min(start, end))) != checksum:
+                raise ReaderError(f"the summary of {path.name} is not what was written")
+
+
+def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
     """By topic, four numbers for each message: both times, offset in the file, and length."""
     places: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-    for topic, log_ns, publish_ns, offset, data in _of_mcap(file):
+    for topic, log_ns, publish_ns, offset, data in _of_mcap(file, complain):
         places[topic].extend((log_ns, publish_ns, offset, len(data)))
     return places
 
@@ -514,8 +575,12 @@ _Found = tuple[str, int, int, int, memoryview]
 """Topic, log time, publish time, where in the file the data begin, and the data."""
 
 
-def _of_mcap(file: BinaryIO) -> Iterator[_Found]:
-    if file.read(len(_MAGIC)) != _MAGIC:
+def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
+    file_size = os.fstat(file.fileno()).st_size
+    start = file.read(len(_MAGIC))
+    if start != _MAGIC:
+        if not _MAGIC.startswith(start):  # else it has been cut off
+            complain(f"{file.name} does not begin as an MCAP file")
         return
     topics: dict[int, str] = {}
     while len(head := file.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
@@ -523,9 +588,28 @@ def _of_mcap(file: BinaryIO) -> Iterator[_Found]:
         offset = file.tell()
         if kind == _DATA_END:
             return
-        content = file.read(size)
+        # A damaged length may be any number: no memory is taken for it.
+        content = file.read(min(size, file_size - offset))
         if kind == _CHUNK:
-            yield from _of_chunk(content, offset, topics)
+            whole = content[: _CHUNK_HEAD.size + 4 + 8 + _size_in(content)]
+            if not _is_as_written(whole) or len(whole) < len(content):
+                complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
+            file.seek(offset + len(whole))
+            yield from _of_chunk(whole, offset, topics)
+
+
+def _size_in(chunk: bytes) -> int:
+    """The length of the records in a chunk without compression, as it says itself."""
+    return int(_CHUNK_HEAD.unpack_from(chunk)[2]) if len(chunk) >= _CHUNK_HEAD.size else 0
+
+
+def _is_as_written(chunk: bytes) -> bool:
+    """Whether the checksum of a chunk is right; a chunk without one, or cut off, counts as that."""
+    at = _CHUNK_HEAD.size + 4 + 8
+    if len(chunk) < at + _size_in(chunk):
+        return True
+    checksum = _CHUNK_HEAD.unpack_from(chunk)[3]
+    return not checksum or crc32(memoryview(chunk)[at:]) == checksum
 
 
 def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_Found]:
@@ -546,8 +630,8 @@ def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_
         if kind == _CHANNEL:
             length = int.from_bytes(content[at + 4 : at + 8], "little")
             number = int.from_bytes(content[at : at + 2], "little")
-            topics[number] = content[at + 8 : at + 8 + length].decode()
-        elif kind == _MESSAGE:
+            topics[number] = content[at + 8 : at + 8 + length].decode(errors="replace")
+        elif kind == _MESSAGE and size >= _MESSAGE_HEAD.size:
             number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
             start = at + _MESSAGE_HEAD.size
             if number in topics:

@@ -8,7 +8,6 @@ all that have the same lengths (plain CDR: OMG DDSI-RTPS 2.5, 10.2).
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import sys
@@ -20,14 +19,14 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Connection, QosDurability, QosReliability
-from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from neuros.errors import EnvironmentFault
-from neuros.recording.bag_files import StoredTopics
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.recording.bag_files import StoredTopics, opened, stored_messages
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
+from neuros.recording.run_file import read_run_file
 
 Column: TypeAlias = npt.NDArray[Any]
 _LOG_TIME, _PUBLISH_TIME = "log_time_ns", "publish_time_ns"
@@ -150,14 +149,10 @@ class Bag:
         recorded: Mapping[str, int] | None = None,
     ) -> None:
         self.folder = folder
-        try:
-            with Reader(folder) as reader:
-                self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
-                self.duration_s = reader.duration / 1e9
-                found = {c.topic: c for c in reader.connections}
-        except ReaderError as error:
-            why = " ".join(str(error).split())
-            raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
+        with opened(folder) as reader:
+            self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
+            self.duration_s = reader.duration / 1e9
+            found = {c.topic: c for c in reader.connections}
         self.store = _store_of(found.values())
         self.topics = {
             name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
@@ -167,7 +162,7 @@ class Bag:
             for name, count in (recorded or {}).items()
             if (lost := count - (self.topics[name].count if name in self.topics else 0)) > 0
         }
-        self._stored = StoredTopics(folder)
+        self._stored = StoredTopics(folder, self.refuse)
         self._packets: dict[str, list[RawPacket]] = {}
 
     @property
@@ -177,6 +172,20 @@ class Bag:
             return None
         topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
         return f"{self.folder} has been damaged since the run; packets that are missing: {topics}"
+
+    def check(self) -> str | None:
+        """What is wrong with the bag, in a sentence; reads all of it."""
+        faults: list[str] = []
+        for _ in stored_messages(self.folder, faults.append):
+            pass
+        return "; ".join([*([self.damage] if self.damage else []), *faults]) or None
+
+    def refuse(self, fault: str) -> None:
+        """Raise a fault of its files, which readers of packets cannot pass over."""
+        raise EnvironmentFault(
+            f"{fault}: what it holds now is not what was recorded (`neuros bag repair` keeps the"
+            " packets that can be read)"
+        )
 
     @property
     def project(self) -> str | None:
@@ -208,6 +217,9 @@ class Bag:
                 RawPacket(log_ns, publish_ns, data)
                 for _, log_ns, publish_ns, data in self._stored.messages(name)
             ]
+            count = self.topics[name].count
+            if len(packets) < count:
+                self.refuse(f"{self.folder}: of {count} packets of {name} {len(packets)} are left")
             packets.sort(key=itemgetter(0))
             self._packets[name] = packets
         return self._packets[name]
@@ -240,9 +252,9 @@ def open_bag(run: str | os.PathLike[str]) -> Bag:
 def _recorded(run: Path) -> dict[str, int]:
     """By topic, the packets that were in the bag when the run ended, as far as is known."""
     try:
-        topics = json.loads((run / "run.json").read_text("utf-8"))["recording"]["topics"]
+        topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (UsageError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 

@@ -10,10 +10,8 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rosbags.rosbag2 import Reader, ReaderError
-
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_files import is_whole, stored_messages
+from neuros.recording.bag_files import is_whole, opened, stored_messages
 from neuros.recording.recorder import Recorder, has_spools
 from neuros.recording.recording_plan import (
     BAG_NAME,
@@ -60,7 +58,8 @@ def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | Non
         with the_only_recorder(run) as is_alone:
             if not is_alone or _is_fed(run, plan):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
-            return _rebuild(run, plan, complain) if needs_repair(run, plan) else None
+            is_to_be_rebuilt = needs_repair(run, plan) or _has_damage(run / BAG_NAME)
+            return _rebuild(run, plan, complain) if is_to_be_rebuilt else None
     except OSError as error:
         raise EnvironmentFault(
             f"the bag of {run} cannot be completed: {error.strerror}; what is there was left as it"
@@ -71,10 +70,19 @@ def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | Non
 def counts_of(run: Path) -> dict[str, int]:
     """Packets in the bag of a run, by topic. Raises ``OSError`` if it cannot be read."""
     try:
-        with Reader(run / BAG_NAME) as reader:
+        with opened(run / BAG_NAME) as reader:
             return {connection.topic: connection.msgcount for connection in reader.connections}
-    except ReaderError as error:
+    except EnvironmentFault as error:
         raise OSError(errno.EIO, str(error)) from error
+
+
+def _has_damage(bag: Path) -> bool:
+    """Whether a part of a file is not as it was written; reads all of it."""
+    faults: list[str] = []
+    for _ in stored_messages(bag, faults.append):
+        if faults:
+            break
+    return bool(faults)
 
 
 def _is_fed(run: Path, plan: RecordingPlan) -> bool:
@@ -93,7 +101,7 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
     present: set[tuple[int, int]] = set()
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        for message in stored_messages(damaged):
+        for message in stored_messages(damaged, complain):
             topic = topics.get(message.topic)
             number = None if topic is None else recorder.copy(topic, message)
             if number is not None:

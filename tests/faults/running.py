@@ -71,7 +71,7 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
         FAULT_MARK=mark,
     )
     with started as running:
-        due_s = _end_is_due(cell, running, folder / "run")
+        due_s = _end_is_due(cell, running, folder / "run", mark)
         is_over = _read_to_end(running, time.monotonic() + _GIVES_UP_AFTER_S)
         took_s = time.monotonic() - due_s
     exit_code = running.process.returncode
@@ -126,7 +126,7 @@ def _write_project(cell: Cell, folder: Path, mark: str, flood_bytes: int) -> Non
     (folder / "project.json").write_text(json.dumps(project, indent=1))
 
 
-def _end_is_due(cell: Cell, running: Running, run_folder: Path) -> float:
+def _end_is_due(cell: Cell, running: Running, run_folder: Path, mark: str) -> float:
     """Wait for the fault; returns when the end is due by the rules, on the monotonic clock."""
     struck = run_folder / "victim" / "struck"
     deadline_s = time.monotonic() + _STRIKES_WITHIN_S
@@ -136,6 +136,8 @@ def _end_is_due(cell: Cell, running: Running, run_folder: Path) -> float:
         if time.monotonic() > deadline_s:
             return time.monotonic()
     struck_s = float(struck.read_text()) if struck.exists() else time.monotonic()
+    if cell.backend == "docker":
+        _strike_from_outside(cell.fault, mark)
     if cell.needs_interrupt:
         _read_to_end(running, struck_s + _LOOKS_FOR_S)
         running.signal(signal.SIGINT)
@@ -148,6 +150,24 @@ def _end_is_due(cell: Cell, running: Running, run_folder: Path) -> float:
             begins_s = _first_hook_s(running, deadline_s)
         return begins_s + DURATION_S + (1.0 if cell.fault == "stop_and_continue" else 0.0)
     return struck_s
+
+
+def _strike_from_outside(fault: str, mark: str) -> None:
+    """The faults that process 1 of a container cannot do to itself."""
+    if fault not in ("kill", "stop_and_continue"):
+        return
+    for process in psutil.process_iter(["environ"]):
+        environ = process.info["environ"] or {}
+        if (environ.get("FAULT_MARK"), Path(environ.get("NEUROS_RUN_DIR", "")).name) == (
+            mark,
+            "victim",
+        ):
+            if fault == "kill":
+                process.kill()
+                return
+            process.suspend()
+            time.sleep(1.0)
+            process.resume()
 
 
 def _first_hook_s(running: Running, deadline_s: float) -> float:

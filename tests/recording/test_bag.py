@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import neuros.bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.bag_reader import columns_of
+from neuros.recording.bag_reader import Bag, columns_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -261,11 +261,13 @@ def test_a_run_that_was_not_recorded_and_one_of_another_version_are_said(tmp_pat
         neuros.bag.open(tmp_path)
 
 
-def test_a_bag_that_is_not_one_is_said(tmp_path: Path) -> None:
+def test_metadata_that_are_none_are_written_anew(tmp_path: Path) -> None:
     record(tmp_path, plan())
     (tmp_path / "bag" / "metadata.yaml").write_text("nonsense: 1")
     with pytest.raises(EnvironmentFault, match="cannot be read"):
-        neuros.bag.open(tmp_path)
+        Bag(tmp_path / "bag", {})
+    with neuros.bag.open(tmp_path) as bag:
+        assert NUMBER.name in bag.topics
 
 
 def lay_out(folder: Path, *files: str) -> None:

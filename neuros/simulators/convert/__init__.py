@@ -4,7 +4,7 @@
 :func:`~neuros.simulators.convert.urdf.read_urdf` are the way in.
 An unsupported element, without a counterpart in MuJoCo, is never dropped in silence: an element
 counts as taken over once it has been read, and all others are listed at the end
-(:mod:`neuros.simulators.convert.report`).
+(:mod:`neuros.simulators.convert.elements`).
 """
 
 import os
