@@ -158,16 +158,16 @@ def _strike_from_outside(fault: str, mark: str) -> None:
         return
     for process in psutil.process_iter(["environ"]):
         environ = process.info["environ"] or {}
-        if (environ.get("FAULT_MARK"), Path(environ.get("NEUROS_RUN_DIR", "")).name) == (
-            mark,
-            "victim",
-        ):
-            if fault == "kill":
-                process.kill()
-                return
+        node = Path(environ.get("NEUROS_RUN_DIR", "")).name
+        if (environ.get("FAULT_MARK"), node) != (mark, "victim"):
+            continue
+        if fault == "kill":
+            process.kill()
+        else:
             process.suspend()
             time.sleep(1.0)
             process.resume()
+        return
 
 
 def _first_hook_s(running: Running, deadline_s: float) -> float:
