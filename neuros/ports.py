@@ -387,8 +387,7 @@ class RunningNode(Protocol):
     """A started process or container, and the nodes that live in it."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The nodes in it."""
+    def names(self) -> tuple[str, ...]: ...
 
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended: "exit code 1", "killed by SIGKILL"."""
@@ -400,8 +399,7 @@ class RunningNode(Protocol):
     def terminate(self) -> None:
         """Ask it to end (SIGTERM)."""
 
-    def kill(self) -> None:
-        """End it now."""
+    def kill(self) -> None: ...
 
 
 class Launcher(Protocol):
@@ -501,8 +499,8 @@ class State(Enum):
     """How good a finding is."""
 
     GOOD = "ok"
-    ABSENT = "-"
-    BAD = "PROBLEM"
+    ABSENT = "-"  # projects run without it
+    BAD = "PROBLEM"  # projects do not run, or not well
 
 
 @dataclass(frozen=True)
@@ -516,17 +514,14 @@ class Finding:
 
     @classmethod
     def good(cls, subject: str, text: str) -> Finding:
-        """It is as it should be."""
         return cls(State.GOOD, subject, text)
 
     @classmethod
     def absent(cls, subject: str, text: str, remedy: str = "") -> Finding:
-        """It is not there, and projects run without it."""
         return cls(State.ABSENT, subject, text, remedy)
 
     @classmethod
     def bad(cls, subject: str, text: str, remedy: str = "") -> Finding:
-        """Projects do not run, or not well, because of it."""
         return cls(State.BAD, subject, text, remedy)
 
     def __str__(self) -> str:
