@@ -49,7 +49,7 @@ def _mask_of(tmp_path: Path, cores: tuple[int, ...]) -> set[int]:
     log = tmp_path / "log"
     log.unlink(missing_ok=True)
     command = ["python3", "-S", "-c", program]
-    host = RunningProcess(NodeProcess(("a",), command, os.environ, log, tmp_path, cores))
+    host = RunningProcess(NodeProcess(("a",), command, command, os.environ, log, tmp_path, cores))
     assert host.wait(10) == "exit code 0"
     return set(json.loads(log.read_text()))
 

@@ -215,7 +215,7 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
         "    return node.make_packet('o')\n",
     )
     running = bench.start()
-    running.wait_for("a has been executing 'think' for 5 s", 10.0)
+    running.wait_for("a has been executing 'think' for 5 s", 20.0)
     if bench.back_end == "process":
         running.wait_for("c waits for `x` from b", 3.0)
         running.wait_for("b waits for `x` from a", 3.0)
