@@ -42,8 +42,16 @@ def main() -> int:
     failed = [outcome for outcome in outcomes if outcome.problems]
     print(f"{len(outcomes)} runs, {len(failed)} not as they must be")
     if options.table:
-        options.table.write_text(table(outcomes))
+        _write(options.table, table(outcomes))
     return 1 if failed else 0
+
+
+def _write(file: Path, text: str) -> None:
+    """Write a table into a file, between the marks of what is generated if it has them."""
+    whole = file.read_text("utf-8") if file.exists() else ""
+    before, begin, rest = whole.partition("<!-- generated: begin -->\n")
+    _, end, after = rest.partition("<!-- generated: end -->")
+    file.write_text(f"{before}{begin}\n{text}\n{end}{after}" if end else text, "utf-8")
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -98,7 +106,12 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="so many runs at a time (1)")
     parser.add_argument("--flood-bytes", type=int, default=1 << 30, metavar="N", help="(2**30)")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the folders of failed runs")
-    parser.add_argument("--table", type=Path, metavar="FILE", help="write a table in Markdown")
+    parser.add_argument(
+        "--table",
+        type=Path,
+        metavar="FILE",
+        help="write a table in Markdown, between its marks if it has them",
+    )
     return parser.parse_args()
 
 
