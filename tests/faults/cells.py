@@ -75,6 +75,12 @@ class Cell:
         return self.kind in (Kind.HANGS, Kind.BLOCKS) and self.is_before_first_hook
 
     @property
+    def ends_by_itself(self) -> bool:
+        """Whether the run ends when its duration is over, and not earlier."""
+        hangs = self.kind in (Kind.HANGS, Kind.BLOCKS) and not self.needs_interrupt
+        return self.is_survived or hangs
+
+    @property
     def exit_codes(self) -> tuple[int, ...]:
         """Those that are right."""
         if self.is_survived:

@@ -75,6 +75,12 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
         is_over = _read_to_end(running, time.monotonic() + _GIVES_UP_AFTER_S)
         took_s = time.monotonic() - due_s
     exit_code = running.process.returncode
+    record = _record(folder / "run")
+    if (
+        cell.ends_by_itself and record
+    ):  # ``wall_s`` counts from the first hook, as the duration does
+        stood_still_s = 1.0 if cell.fault == "stop_and_continue" else 0.0
+        took_s = record["wall_s"] - DURATION_S - stood_still_s
     left = _left(mark, since_s, temporary)
     lines = [line for line in running.output.splitlines() if line.strip()]
     outcome = Outcome(
@@ -88,7 +94,7 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
     )
     if not is_over:
         outcome.problems.append(f"not ended {_GIVES_UP_AFTER_S:g} s after the fault")
-    outcome.problems.extend(_problems(outcome, folder / "run"))
+    outcome.problems.extend(_problems(outcome, record))
     return outcome
 
 
@@ -142,13 +148,6 @@ def _end_is_due(cell: Cell, running: Running, run_folder: Path, mark: str) -> fl
         _read_to_end(running, struck_s + _LOOKS_FOR_S)
         running.signal(signal.SIGINT)
         return time.monotonic()
-    if cell.is_survived or cell.kind in (Kind.HANGS, Kind.BLOCKS):
-        # It ends by itself once the duration is over, counted from the first hook, which may be
-        # later than the fault, and a fault may take some time.
-        begins_s = struck_s
-        if cell.is_before_first_hook:
-            begins_s = _first_hook_s(running, deadline_s)
-        return begins_s + DURATION_S + (1.0 if cell.fault == "stop_and_continue" else 0.0)
     return struck_s
 
 
@@ -168,14 +167,6 @@ def _strike_from_outside(fault: str, mark: str) -> None:
             time.sleep(1.0)
             process.resume()
         return
-
-
-def _first_hook_s(running: Running, deadline_s: float) -> float:
-    """When the launcher has said that all nodes run, or has ended."""
-    while "all nodes have initialised" not in running.output and time.monotonic() < deadline_s:
-        if not running.read(_POLL_S) and running.process.poll() is not None:
-            break
-    return time.monotonic()
 
 
 def _read_to_end(running: Running, deadline_s: float) -> bool:
@@ -221,13 +212,13 @@ def _neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def _problems(outcome: Outcome, run_folder: Path) -> list[str]:
+def _problems(outcome: Outcome, record: dict[str, Any]) -> list[str]:
     cell, found = outcome.cell, []
     if outcome.exit_code not in cell.exit_codes:
         allowed = " or ".join(map(str, cell.exit_codes))
         found.append(f"exit code {outcome.exit_code}, not {allowed}")
-    is_drained = cell.kind in (Kind.HANGS, Kind.BLOCKS) and not cell.needs_interrupt
-    if outcome.took_s > ENDS_WITHIN_S + (DRAINS_WITHIN_S if is_drained else 0.0):
+    drains_s = DRAINS_WITHIN_S if cell.ends_by_itself and not cell.is_survived else 0.0
+    if outcome.took_s > ENDS_WITHIN_S + drains_s:
         found.append(f"ended after {outcome.took_s:.1f} s")
     if outcome.exit_code == 1 and "victim" not in outcome.said:
         found.append("the last line does not name the node")
@@ -237,14 +228,17 @@ def _problems(outcome: Outcome, run_folder: Path) -> list[str]:
     found += [f"left: {each}" for each in outcome.left]
     if outcome.bag not in ("complete", "repaired"):
         found.append(f"bag: {outcome.bag}")
-    return found + _record_problems(outcome, run_folder / "run.json")
+    if not record:
+        found.append("run.json is missing, or broken")
+    elif record["exit_code"] != outcome.exit_code:
+        found.append(f"run.json has exit code {record['exit_code']}")
+    return found
 
 
-def _record_problems(outcome: Outcome, file: Path) -> list[str]:
+def _record(run_folder: Path) -> dict[str, Any]:
+    """The content of ``run.json``, empty if there is none."""
     try:
-        record: dict[str, Any] = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        return [f"run.json: {error}"]
-    if record["exit_code"] != outcome.exit_code:
-        return [f"run.json has exit code {record['exit_code']}"]
-    return []
+        record: dict[str, Any] = json.loads((run_folder / "run.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return record
