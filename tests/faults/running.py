@@ -76,11 +76,9 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
         took_s = time.monotonic() - due_s
     exit_code = running.process.returncode
     record = _record(folder / "run")
-    if (
-        cell.ends_by_itself and record
-    ):  # ``wall_s`` counts from the first hook, as the duration does
-        stood_still_s = 1.0 if cell.fault == "stop_and_continue" else 0.0
-        took_s = record["wall_s"] - DURATION_S - stood_still_s
+    if cell.ends_by_itself and record:
+        # Both count from the first hook.
+        took_s = record["wall_s"] - DURATION_S
     left = _left(mark, since_s, temporary)
     lines = [line for line in running.output.splitlines() if line.strip()]
     outcome = Outcome(
