@@ -15,9 +15,9 @@ from neuros.analysis.packets import Numbers, Packets, read_packets
 from neuros.analysis.run_record import PastRun
 from neuros.errors import NeurosError
 from neuros.project.model import Connection
-from neuros.recording.bag_files import stored_messages
 from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
 from neuros.recording.recording_plan import PLAN_NAME
+from neuros.recording.stored import stored_messages
 
 _LARGE_BYTES = 64 * 1024
 """The buffers of larger messages travel beside them, and nodes digest them apart."""

@@ -1,4 +1,4 @@
-"""Files of a bag: complete on the disk after every checkpoint, and read as far as they go.
+"""Files of a bag, which are complete on the disk after every checkpoint.
 
 ``rosbags`` writes the index of an MCAP file and ``metadata.yaml`` when it closes a bag, gives a
 message one time, and begins to read at the index. Here a checkpoint writes index and metadata, and
@@ -19,16 +19,12 @@ import os
 import sqlite3
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from struct import Struct, pack, unpack
-from typing import Any, BinaryIO, NamedTuple
+from struct import Struct, pack
+from typing import Any
 from zlib import crc32
 
-from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -37,14 +33,14 @@ from neuros.errors import EnvironmentFault
 from neuros.recording.recording_plan import Topic
 
 _CHUNK_BYTES = 1 << 20
-_MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
+MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX = 0x07, 0x08, 0x0B, 0x0C, 0x0D
-_SUMMARY_OFFSET, _DATA_END = 0x0E, 0x0F
-_RECORD_HEAD = Struct("<BQ")  # kind, length
-_MESSAGE_HEAD = Struct("<HIQQ")  # channel, number within the channel, log time, publish time
+_SUMMARY_OFFSET, DATA_END = 0x0E, 0x0F
+RECORD_HEAD = Struct("<BQ")  # kind, length
+MESSAGE_HEAD = Struct("<HIQQ")  # channel, number within the channel, log time, publish time
 _MESSAGE_RECORD = Struct("<BQHIQQ")  # both
-_CHUNK_HEAD = Struct("<QQQI")  # first and last log time, size, checksum
+CHUNK_HEAD = Struct("<QQQI")  # first and last log time, size, checksum
 _LAST_NS = (1 << 63) - 1
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # as rmw has it for "no deadline"
 
@@ -237,7 +233,7 @@ class _McapFile:
         self._summary = b""
         self._size = 0  # with all that is pending
         self._pending: list[bytes] = []
-        self._add(_MAGIC, _record(_HEADER, _text("ros2"), _text(f"neuros-{__version__}")))
+        self._add(MAGIC, _record(_HEADER, _text("ros2"), _text(f"neuros-{__version__}")))
         self._chunk: list[bytes] = []
         self._chunk_size = 0
         self._schemas: dict[str, bytes] = {}
@@ -259,7 +255,7 @@ class _McapFile:
             self._schemas[topic.type] = _record(_SCHEMA, head, *texts)
             self._add_to_chunk(self._schemas[topic.type])
         self._channels[number] = _record(
-            _CHANNEL,
+            CHANNEL,
             pack("<HH", number, [*self._schemas].index(topic.type) + 1),
             _text(topic.name),
             _text("cdr"),
@@ -271,9 +267,9 @@ class _McapFile:
     def put(self, topic: int, log_ns: int, publish_ns: int, data: bytes) -> None:
         self._places[topic].extend((log_ns, self._chunk_size))
         number = self._counts[topic] = self._counts[topic] + 1
-        size = _MESSAGE_HEAD.size + len(data)
+        size = MESSAGE_HEAD.size + len(data)
         number &= 0xFFFFFFFF
-        head = _MESSAGE_RECORD.pack(_MESSAGE, size, topic, number, log_ns, publish_ns)
+        head = _MESSAGE_RECORD.pack(MESSAGE, size, topic, number, log_ns, publish_ns)
         self._add_to_chunk(head, data)
         if self._chunk_size > _CHUNK_BYTES:
             self._close_chunk()
@@ -315,8 +311,8 @@ class _McapFile:
         checksum = 0
         for part in self._chunk:
             checksum = crc32(part, checksum)
-        head = _CHUNK_HEAD.pack(first_ns, last_ns, size, checksum) + _text("") + pack("<Q", size)
-        self._add(_RECORD_HEAD.pack(_CHUNK, len(head) + size), head, *self._chunk)
+        head = CHUNK_HEAD.pack(first_ns, last_ns, size, checksum) + _text("") + pack("<Q", size)
+        self._add(RECORD_HEAD.pack(CHUNK, len(head) + size), head, *self._chunk)
         length = self._size - start
         offsets = b""
         for channel, places in self._places.items():
@@ -342,7 +338,7 @@ class _McapFile:
         name = _text("rosbag2")
         pairs = _text(_text("serialized_metadata") + _text(metadata))
         metadata_record = _record(_METADATA, name, pairs)
-        before = metadata_record + _record(_DATA_END, pack("<I", 0))
+        before = metadata_record + _record(DATA_END, pack("<I", 0))
         place = pack("<QQ", self._size, len(metadata_record))
         counts = b"".join(pack("<HQ", *each) for each in self._counts.items())
         number = sum(self._counts.values())
@@ -352,7 +348,7 @@ class _McapFile:
         summary, offsets = b"", b""
         for kind, records in (
             (_SCHEMA, self._schemas.values()),
-            (_CHANNEL, self._channels.values()),
+            (CHANNEL, self._channels.values()),
             (_CHUNK_INDEX, self._chunk_indexes),
             (_METADATA_INDEX, [_record(_METADATA_INDEX, place, name)]),
             (_STATISTICS, [_record(_STATISTICS, statistics, _text(counts))]),
@@ -362,9 +358,9 @@ class _McapFile:
                 where = pack("<BQQ", kind, start + len(summary), len(group))
                 offsets += _record(_SUMMARY_OFFSET, where)
                 summary += group
-        footer = _RECORD_HEAD.pack(_FOOTER, 20) + pack("<QQ", start, start + len(summary))
+        footer = RECORD_HEAD.pack(_FOOTER, 20) + pack("<QQ", start, start + len(summary))
         checksum = pack("<I", crc32(summary + offsets + footer))
-        return before + summary + offsets + footer + checksum + _MAGIC
+        return before + summary + offsets + footer + checksum + MAGIC
 
     def _write(self, data: bytes) -> None:
         at = self._safe_bytes
@@ -377,7 +373,7 @@ class _McapFile:
 
 def _record(kind: int, *parts: bytes) -> bytes:
     content = b"".join(parts)
-    return _RECORD_HEAD.pack(kind, len(content)) + content
+    return RECORD_HEAD.pack(kind, len(content)) + content
 
 
 def _text(content: str | bytes) -> bytes:
@@ -443,211 +439,3 @@ class _SqliteFile:
             self._connection.execute(statement, values)
         except sqlite3.Error as error:  # the disk is full, say
             raise OSError(errno.EIO, str(error)) from error
-
-
-class Stored(NamedTuple):
-    """A message of a bag; times in nanoseconds."""
-
-    topic: str
-    log_ns: int
-    publish_ns: int
-    data: bytes
-
-
-def stored_messages(
-    folder: Path, complain: Callable[[str], object] = lambda _: None
-) -> Iterator[Stored]:
-    """All messages in the files of a bag's folder, as far as they go.
-
-    Args:
-        complain: told in one sentence of each part of a file that is not as it was written.
-
-    Raises:
-        EnvironmentFault: if they are compressed, which is not how NeuROS records.
-    """
-    for path in sorted(folder.glob("*.mcap")):
-        with open(path, "rb") as file:
-            for topic, log_ns, publish_ns, _, data in _of_mcap(file, complain):
-                yield Stored(topic, log_ns, publish_ns, bytes(data))
-    for path in sorted(folder.glob("*.db3")):
-        yield from _of_sqlite(path)
-
-
-class StoredTopics:
-    """The messages of a bag's folder, topic by topic.
-
-    With the first topic an MCAP file is gone through once, and it is noted where each message is:
-    32 bytes for one.
-
-    Args:
-        complain: told in one sentence of each part of a file that is not as it was written.
-    """
-
-    def __init__(self, folder: Path, complain: Callable[[str], object]) -> None:
-        self._folder = folder
-        self._complain = complain
-        self._places: dict[Path, Mapping[str, array[int]]] = {}
-
-    def messages(self, topic: str) -> list[Stored]:
-        """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
-        found: list[Stored] = []
-        for path in sorted(self._folder.glob("*.mcap")):
-            with open(path, "rb") as file:
-                if path not in self._places:
-                    self._places[path] = _places_in(file, self._complain)
-                row = iter(self._places[path].get(topic, ()))
-                for log_ns, publish_ns, start, size in zip(row, row, row, row, strict=True):
-                    data = os.pread(file.fileno(), size, start)
-                    found.append(Stored(topic, log_ns, publish_ns, data))
-        for path in sorted(self._folder.glob("*.db3")):
-            found += _of_sqlite(path, topic)
-        return found
-
-
-def is_whole(folder: Path) -> bool:
-    """Whether readers will open a bag: metadata, and beginning and end of its files."""
-    try:
-        with opened(folder):
-            return True
-    except EnvironmentFault:
-        return False
-
-
-@contextmanager
-def opened(folder: Path) -> Iterator[Reader]:
-    """A bag as ``rosbags`` opens it.
-
-    Raises:
-        EnvironmentFault: if it cannot.
-    """
-    reader = None
-    try:
-        _check_summaries(folder)
-        reader = Reader(folder)
-        reader.open()
-        _check_definitions(reader)
-    # Of a damaged file it may believe anything.
-    except Exception as error:
-        with suppress(Exception):  # it may be half open
-            reader.close()  # type: ignore[union-attr]
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
-    try:
-        yield reader
-    finally:
-        reader.close()
-
-
-def _check_definitions(reader: Reader) -> None:
-    """Raise ``ReaderError`` where metadata and files do not agree."""
-    storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
-    there = {each.topic for storage in storages for each in storage.connections}
-    for connection in reader.connections:
-        is_there = connection.topic in there or not connection.msgcount
-        if connection.msgdef.format == MessageDefinitionFormat.NONE or not is_there:
-            what = f"{connection.topic} of type {connection.msgtype}"
-            raise ReaderError(f"its files do not have the topic {what}")
-
-
-def _check_summaries(folder: Path) -> None:
-    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says."""
-    for path in folder.glob("*.mcap"):
-        with open(path, "rb") as file:
-            end = file.seek(0, os.SEEK_END) - len(_MAGIC) - 4
-            if end < 16:
-                raise ReaderError(f"{path.name} has no end")
-            file.seek(end - 16)
-            start, _, checksum = unpack("<QQI", file.read(20))
-            file.seek(min(start, end))
-            if checksum and crc32(file.read(end - min(start, end))) != checksum:
-                raise ReaderError(f"the summary of {path.name} is not what was written")
-
-
-def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
-    """By topic, four numbers for each message: both times, offset in the file, and length."""
-    places: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-    for topic, log_ns, publish_ns, offset, data in _of_mcap(file, complain):
-        places[topic].extend((log_ns, publish_ns, offset, len(data)))
-    return places
-
-
-_Found = tuple[str, int, int, int, memoryview]
-"""Topic, log time, publish time, where in the file the data begin, and the data."""
-
-
-def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
-    file_size = os.fstat(file.fileno()).st_size
-    start = file.read(len(_MAGIC))
-    if start != _MAGIC:
-        if not _MAGIC.startswith(start):  # else it has been cut off
-            complain(f"{file.name} does not begin as an MCAP file")
-        return
-    topics: dict[int, str] = {}
-    while len(head := file.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
-        kind, size = _RECORD_HEAD.unpack(head)
-        offset = file.tell()
-        if kind == _DATA_END:
-            return
-        # A damaged length may be any number: no memory is taken for it.
-        content = file.read(min(size, file_size - offset))
-        if kind == _CHUNK:
-            whole = content[: _CHUNK_HEAD.size + 4 + 8 + _size_in(content)]
-            if not _is_as_written(whole) or len(whole) < len(content):
-                complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
-            file.seek(offset + len(whole))
-            yield from _of_chunk(whole, offset, topics)
-
-
-def _size_in(chunk: bytes) -> int:
-    """The length of the records in a chunk without compression, as it says itself."""
-    return int(_CHUNK_HEAD.unpack_from(chunk)[2]) if len(chunk) >= _CHUNK_HEAD.size else 0
-
-
-def _is_as_written(chunk: bytes) -> bool:
-    """Whether the checksum of a chunk is right; a chunk without one, or cut off, counts as that."""
-    at = _CHUNK_HEAD.size + 4 + 8
-    if len(chunk) < at + _size_in(chunk):
-        return True
-    checksum = _CHUNK_HEAD.unpack_from(chunk)[3]
-    return not checksum or crc32(memoryview(chunk)[at:]) == checksum
-
-
-def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_Found]:
-    """The messages of a chunk without compression; ``topics`` grows by its channels."""
-    at = _CHUNK_HEAD.size
-    if len(content) < at + 4:
-        return
-    if int.from_bytes(content[at : at + 4], "little"):
-        raise EnvironmentFault("its chunks are compressed, which this reader does not read")
-    at += 4 + 8
-    view = memoryview(content)
-    while at + _RECORD_HEAD.size <= len(content):
-        kind, size = _RECORD_HEAD.unpack_from(content, at)
-        at += _RECORD_HEAD.size
-        end = at + size
-        if end > len(content):
-            return
-        if kind == _CHANNEL:
-            length = int.from_bytes(content[at + 4 : at + 8], "little")
-            number = int.from_bytes(content[at : at + 2], "little")
-            topics[number] = content[at + 8 : at + 8 + length].decode(errors="replace")
-        elif kind == _MESSAGE and size >= _MESSAGE_HEAD.size:
-            number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
-            start = at + _MESSAGE_HEAD.size
-            if number in topics:
-                yield topics[number], log_ns, publish_ns, offset + start, view[start:end]
-        at = end
-
-
-def _of_sqlite(path: Path, only: str | None = None) -> Iterator[Stored]:
-    query = (
-        "SELECT topics.name, timestamp, data FROM messages"
-        " JOIN topics ON topics.id = topic_id WHERE ?1 IS NULL OR topics.name = ?1"
-        " ORDER BY messages.id"
-    )
-    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
-        try:
-            for topic, log_ns, data in connection.execute(query, (only,)):
-                yield Stored(topic, log_ns, log_ns, data)
-        except sqlite3.DatabaseError:
-            return

@@ -23,10 +23,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.bag_files import StoredTopics, opened, stored_messages
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
+from neuros.recording.stored import StoredTopics, opened, stored_messages
 
 Column: TypeAlias = npt.NDArray[Any]
 _LOG_TIME, _PUBLISH_TIME = "log_time_ns", "publish_time_ns"

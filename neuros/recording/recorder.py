@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_files import BagWriter, Stored
+from neuros.recording.bag_files import BagWriter
 from neuros.recording.recording_plan import BAG_NAME, LISTENER, RecordingPlan, Topic
 from neuros.recording.spool import (
     NO_TIME,
@@ -19,6 +19,7 @@ from neuros.recording.spool import (
     forget_listened,
     listened_topics,
 )
+from neuros.recording.stored import Stored
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
 # running. Readers of bags sort, so a packet that comes later is only less convenient.

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_files import is_whole, opened, stored_messages
 from neuros.recording.recorder import Recorder, has_spools
 from neuros.recording.recording_plan import (
     BAG_NAME,
@@ -21,6 +20,7 @@ from neuros.recording.recording_plan import (
     load_plan,
 )
 from neuros.recording.spool import SpoolReader, listened_topics
+from neuros.recording.stored import is_whole, opened, stored_messages
 
 DAMAGED_NAME = "bag.damaged"
 

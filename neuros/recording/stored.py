@@ -1,0 +1,242 @@
+"""Messages that are stored in the files of a bag, read as far as they go, and checked.
+
+A file of a run that was killed, or that something has happened to since, is read from its
+beginning. Checksums of chunks and of the summary tell what is not as it was written.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from array import array
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from struct import unpack
+from typing import BinaryIO, NamedTuple
+from zlib import crc32
+
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.reader import DirectoryReader
+
+from neuros.errors import EnvironmentFault
+from neuros.recording.bag_files import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+)
+
+
+class Stored(NamedTuple):
+    """A message of a bag; times in nanoseconds."""
+
+    topic: str
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+def stored_messages(
+    folder: Path, complain: Callable[[str], object] = lambda _: None
+) -> Iterator[Stored]:
+    """All messages in the files of a bag's folder, as far as they go.
+
+    Args:
+        complain: told in one sentence of each part of a file that is not as it was written.
+
+    Raises:
+        EnvironmentFault: if they are compressed, which is not how NeuROS records.
+    """
+    for path in sorted(folder.glob("*.mcap")):
+        with open(path, "rb") as file:
+            for topic, log_ns, publish_ns, _, data in _of_mcap(file, complain):
+                yield Stored(topic, log_ns, publish_ns, bytes(data))
+    for path in sorted(folder.glob("*.db3")):
+        yield from _of_sqlite(path)
+
+
+class StoredTopics:
+    """The messages of a bag's folder, topic by topic.
+
+    With the first topic an MCAP file is gone through once, and it is noted where each message is:
+    32 bytes for one.
+
+    Args:
+        complain: told in one sentence of each part of a file that is not as it was written.
+    """
+
+    def __init__(self, folder: Path, complain: Callable[[str], object]) -> None:
+        self._folder = folder
+        self._complain = complain
+        self._places: dict[Path, Mapping[str, array[int]]] = {}
+
+    def messages(self, topic: str) -> list[Stored]:
+        """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
+        found: list[Stored] = []
+        for path in sorted(self._folder.glob("*.mcap")):
+            with open(path, "rb") as file:
+                if path not in self._places:
+                    self._places[path] = _places_in(file, self._complain)
+                row = iter(self._places[path].get(topic, ()))
+                for log_ns, publish_ns, start, size in zip(row, row, row, row, strict=True):
+                    data = os.pread(file.fileno(), size, start)
+                    found.append(Stored(topic, log_ns, publish_ns, data))
+        for path in sorted(self._folder.glob("*.db3")):
+            found += _of_sqlite(path, topic)
+        return found
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether readers will open a bag: metadata, and beginning and end of its files."""
+    try:
+        with opened(folder):
+            return True
+    except EnvironmentFault:
+        return False
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[Reader]:
+    """A bag as ``rosbags`` opens it.
+
+    Raises:
+        EnvironmentFault: if it cannot.
+    """
+    reader = None
+    try:
+        _check_summaries(folder)
+        reader = Reader(folder)
+        reader.open()
+        _check_definitions(reader)
+    # Of a damaged file it may believe anything.
+    except Exception as error:
+        with suppress(Exception):  # it may be half open
+            reader.close()  # type: ignore[union-attr]
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _check_definitions(reader: Reader) -> None:
+    """Raise ``ReaderError`` where metadata and files do not agree."""
+    storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
+    there = {each.topic for storage in storages for each in storage.connections}
+    for connection in reader.connections:
+        is_there = connection.topic in there or not connection.msgcount
+        if connection.msgdef.format == MessageDefinitionFormat.NONE or not is_there:
+            what = f"{connection.topic} of type {connection.msgtype}"
+            raise ReaderError(f"its files do not have the topic {what}")
+
+
+def _check_summaries(folder: Path) -> None:
+    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says."""
+    for path in folder.glob("*.mcap"):
+        with open(path, "rb") as file:
+            end = file.seek(0, os.SEEK_END) - len(MAGIC) - 4
+            if end < 16:
+                raise ReaderError(f"{path.name} has no end")
+            file.seek(end - 16)
+            start, _, checksum = unpack("<QQI", file.read(20))
+            file.seek(min(start, end))
+            if checksum and crc32(file.read(end - min(start, end))) != checksum:
+                raise ReaderError(f"the summary of {path.name} is not what was written")
+
+
+def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
+    """By topic, four numbers for each message: both times, offset in the file, and length."""
+    places: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
+    for topic, log_ns, publish_ns, offset, data in _of_mcap(file, complain):
+        places[topic].extend((log_ns, publish_ns, offset, len(data)))
+    return places
+
+
+_Found = tuple[str, int, int, int, memoryview]
+"""Topic, log time, publish time, where in the file the data begin, and the data."""
+
+
+def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
+    file_size = os.fstat(file.fileno()).st_size
+    start = file.read(len(MAGIC))
+    if start != MAGIC:
+        if not MAGIC.startswith(start):  # else it has been cut off
+            complain(f"{file.name} does not begin as an MCAP file")
+        return
+    topics: dict[int, str] = {}
+    while len(head := file.read(RECORD_HEAD.size)) == RECORD_HEAD.size:
+        kind, size = RECORD_HEAD.unpack(head)
+        offset = file.tell()
+        if kind == DATA_END:
+            return
+        # A damaged length may be any number: no memory is taken for it.
+        content = file.read(min(size, file_size - offset))
+        if kind == CHUNK:
+            whole = content[: CHUNK_HEAD.size + 4 + 8 + _size_in(content)]
+            if not _is_as_written(whole) or len(whole) < len(content):
+                complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
+            file.seek(offset + len(whole))
+            yield from _of_chunk(whole, offset, topics)
+
+
+def _size_in(chunk: bytes) -> int:
+    """The length of the records in a chunk without compression, as it says itself."""
+    return int(CHUNK_HEAD.unpack_from(chunk)[2]) if len(chunk) >= CHUNK_HEAD.size else 0
+
+
+def _is_as_written(chunk: bytes) -> bool:
+    """Whether the checksum of a chunk is right; a chunk without one, or cut off, counts as that."""
+    at = CHUNK_HEAD.size + 4 + 8
+    if len(chunk) < at + _size_in(chunk):
+        return True
+    checksum = CHUNK_HEAD.unpack_from(chunk)[3]
+    return not checksum or crc32(memoryview(chunk)[at:]) == checksum
+
+
+def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_Found]:
+    """The messages of a chunk without compression; ``topics`` grows by its channels."""
+    at = CHUNK_HEAD.size
+    if len(content) < at + 4:
+        return
+    if int.from_bytes(content[at : at + 4], "little"):
+        raise EnvironmentFault("its chunks are compressed, which this reader does not read")
+    at += 4 + 8
+    view = memoryview(content)
+    while at + RECORD_HEAD.size <= len(content):
+        kind, size = RECORD_HEAD.unpack_from(content, at)
+        at += RECORD_HEAD.size
+        end = at + size
+        if end > len(content):
+            return
+        if kind == CHANNEL:
+            length = int.from_bytes(content[at + 4 : at + 8], "little")
+            number = int.from_bytes(content[at : at + 2], "little")
+            topics[number] = content[at + 8 : at + 8 + length].decode(errors="replace")
+        elif kind == MESSAGE and size >= MESSAGE_HEAD.size:
+            number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content, at)
+            start = at + MESSAGE_HEAD.size
+            if number in topics:
+                yield topics[number], log_ns, publish_ns, offset + start, view[start:end]
+        at = end
+
+
+def _of_sqlite(path: Path, only: str | None = None) -> Iterator[Stored]:
+    query = (
+        "SELECT topics.name, timestamp, data FROM messages"
+        " JOIN topics ON topics.id = topic_id WHERE ?1 IS NULL OR topics.name = ?1"
+        " ORDER BY messages.id"
+    )
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
+        try:
+            for topic, log_ns, data in connection.execute(query, (only,)):
+                yield Stored(topic, log_ns, log_ns, data)
+        except sqlite3.DatabaseError:
+            return
