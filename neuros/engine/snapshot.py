@@ -1,4 +1,4 @@
-"""What a running node does: its metrics as plain data, and why it does not move.
+"""Metrics of a running node as plain data, and the explanation of a node that does not move.
 
 :func:`snapshot` and :func:`explain` may be called from any thread while the engine runs. They only
 read and take no lock, so figures of one snapshot can be an event apart; once the node has stopped

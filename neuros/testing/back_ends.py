@@ -1,4 +1,4 @@
-"""What every back end guarantees, as a suite of checks.
+"""Suite of checks of what each back end guarantees.
 
 A distribution with a back end runs it by a test module of a few lines::
 
