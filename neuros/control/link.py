@@ -117,12 +117,10 @@ def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Mes
     message = accepted.get(kind) if isinstance(kind, str) else None
     if message is None:
         raise ControlError(f"{peer} sent a control message of the unknown kind {_shown(kind)}")
-    read: _Reader = _reader(message)  # type: ignore[arg-type]
     try:
-        found: Message = read(content)
-    except _WrongField as error:
+        return read_as(message, content)
+    except ControlError as error:
         raise ControlError(f"{peer} sent a wrong control message '{kind}': {error}") from None
-    return found
 
 
 def read_as(declared: type[_Declared], content: Any) -> _Declared:

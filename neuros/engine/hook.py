@@ -137,12 +137,6 @@ class Hook:
                 return hook_input
         return None
 
-    def is_blocked(self) -> bool:
-        """Whether it has all inputs, and only its receivers hold it up."""
-        return (
-            self.is_enabled and self.is_due and self.missing_input() is None and not self.can_send()
-        )
-
     def blocking_windows(self) -> list[SendWindow]:
         """The send windows that hold it up."""
         freed = self._freed_windows() if self.loops else ()

@@ -11,7 +11,7 @@ import sqlite3
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from struct import unpack
 from typing import BinaryIO, NamedTuple
@@ -109,22 +109,18 @@ def opened(folder: Path) -> Iterator[Reader]:
     Raises:
         EnvironmentFault: if it cannot.
     """
-    reader = None
-    try:
-        _check_summaries(folder)
-        reader = Reader(folder)
-        reader.open()
-        _check_definitions(reader)
-    # Of a damaged file it may believe anything.
-    except Exception as error:
-        with suppress(Exception):  # it may be half open
-            reader.close()  # type: ignore[union-attr]
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            _check_summaries(folder)
+            reader = Reader(folder)
+            reader.open()
+            stack.callback(reader.close)
+            _check_definitions(reader)
+        # Of a damaged file it may believe anything.
+        except Exception as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
         yield reader
-    finally:
-        reader.close()
 
 
 def _check_definitions(reader: Reader) -> None:
