@@ -16,6 +16,7 @@ import os
 import re
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ LONG_S = 5.0
 FILE_NAME = ".stack"
 HELD_S = 4.0
 """A global lock that is held for this long has the stack written; nodes report more often."""
+
+_RENEW_S = 1.9
+"""A timer of faulthandler is a thread: one per report is most of what an idle node does."""
 
 _THREAD = re.compile(r"(?:Current thread|Thread) 0x0*(?P<ident>[0-9a-f]+)\b.*:")
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
@@ -59,10 +63,14 @@ class StackFile:
             folder / FILE_NAME, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
         )
         os.write(self._descriptor, self._head)
+        self._renewed_s = float("-inf")
 
     def renew(self) -> None:
         """The process reports: only if it cannot do so again for a while the stack is written."""
-        faulthandler.dump_traceback_later(HELD_S, repeat=True, file=self._descriptor)
+        now_s = time.monotonic()
+        if now_s - self._renewed_s > _RENEW_S:
+            self._renewed_s = now_s
+            faulthandler.dump_traceback_later(HELD_S, repeat=True, file=self._descriptor)
         if os.fstat(self._descriptor).st_size != len(self._head):
             os.ftruncate(self._descriptor, len(self._head))
 

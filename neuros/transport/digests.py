@@ -8,7 +8,6 @@ speed (a camera's 921,600 bytes in 0.03 ms, where BLAKE2b takes 1.6 ms and CRC-3
 
 from __future__ import annotations
 
-import statistics
 import time
 from array import array
 from collections.abc import Callable, Sequence
@@ -94,7 +93,7 @@ class TriedDigest:
         elif self._seen > _WARMING_UP:
             self._took_ns.append(self._clock() - begun_ns)
             if len(self._took_ns) == _TRIED:
-                in_all_ns = statistics.median(self._took_ns) * _TRIED
+                in_all_ns = sorted(self._took_ns)[_TRIED // 2] * _TRIED  # the median
                 self._is_dear = in_all_ns > _DEAR * (self._worked() - self._worked_before_ns)
                 self._took_ns = None
         return None if self._is_dear else found
