@@ -19,7 +19,7 @@ from neuros.api.request import LaunchOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.projects import add_project, load_with_messages
-from neuros.errors import NeurosError
+from neuros.errors import NeurosError, UsageError
 from neuros.options import add_options, parsed_as, values_of
 
 if TYPE_CHECKING:
@@ -79,9 +79,22 @@ def _launch(parsed: argparse.Namespace) -> int:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
-        views = Views(options, plan)
+        views = Views(options, plan)  # the dashboard listens where the browser is
+        if options.isolate:
+            _isolate(options, plan)
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
+
+
+def _isolate(options: LaunchOptions, plan: Plan) -> None:
+    """Put the run into a network of its own."""
+    from neuros.backends.isolation import enter_own_network
+
+    if options.node_graph or options.visualisations:
+        flag = "-g" if options.node_graph else "-z"
+        raise UsageError(f"--isolate with {flag}: windows cannot see into the run; use --dashboard")
+    if not plan.back_end.has_own_network:
+        enter_own_network()
 
 
 def _dry_run(plan: Plan) -> int:
