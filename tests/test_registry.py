@@ -15,6 +15,7 @@ from neuros.ports import BackEnd
 from neuros.registry import OWN
 from neuros.simulators.registered import SIMULATORS
 from neuros.transport.registered import TRANSPORTS
+from neuros.viewers.registered import VIEWERS
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / "neuros").rglob("*.py"))
@@ -30,8 +31,8 @@ def test_our_back_ends_can_be_loaded_and_say_what_help_needs(name: str) -> None:
     assert back_end.place
 
 
-def test_our_transports_and_simulators_can_be_loaded() -> None:
-    for registry in (TRANSPORTS, SIMULATORS):
+def test_our_transports_simulators_and_viewers_can_be_loaded() -> None:
+    for registry in (TRANSPORTS, SIMULATORS, VIEWERS):
         assert [registry.load(name).name for name in registry] == [*registry]
 
 

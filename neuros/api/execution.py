@@ -8,7 +8,6 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -31,22 +30,13 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
+from neuros.ports import Shown
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
 _PATIENCE_S = 1.0
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The run that is shown: its id, its folder, the environment of its nodes, and its logs."""
-
-    run_id: str
-    folder: Path
-    environment: Mapping[str, str]
-    logs: Mapping[str, Path]
 
 
 class Views(Protocol):
@@ -151,8 +141,7 @@ class Execution:
             duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             if self._views is not None:
-                shown = Shown(self._run_id, self.folder, self._beside(), self._logs)
-                self._views.start(shown, reaper, self._console.log)
+                self._views.start(self._shown(), reaper, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -202,6 +191,18 @@ class Execution:
         if self._recording_plan is None:
             return None
         return Recording(self._recording_plan, self._run_id, self.folder, self._beside(), reaper)
+
+    def _shown(self) -> Shown:
+        plan = self._plan
+        return Shown(
+            self._run_id,
+            self.folder,
+            self._beside(),
+            self._logs,
+            plan.project,
+            plan.names,
+            plan.back_end.is_one_process,
+        )
 
     def _beside(self) -> dict[str, str]:
         """What programs beside the nodes get, which know the same messages."""

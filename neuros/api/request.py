@@ -29,6 +29,12 @@ def _back_ends() -> Iterable[str]:
     return [AUTO, *BACK_ENDS]
 
 
+def _viewers() -> Iterable[str]:
+    from neuros.viewers.registered import VIEWERS
+
+    return VIEWERS
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions:
     """Changes to a project, for every command that reads one."""
@@ -236,6 +242,16 @@ class Request(ProjectOptions):
 class LaunchOptions(Request):
     """Options of the command line alone, besides those of every run."""
 
+    viewer: Sequence[str] = option(
+        "--viewer",
+        is_repeatable=True,
+        suggestions=_viewers,
+        metavar="NAME",
+        is_recorded=False,
+        page="dashboard.md#viewers",
+        help="show the run with this viewer: dashboard, rqt_graph, rviz2 or rerun; other"
+        " distributions may add viewers",
+    )
     dashboard: bool = option(
         "--dashboard",
         default=False,

@@ -1,35 +1,25 @@
-"""Sidecar processes: the recorder, the dashboard and the Rerun viewer of a run.
+"""Sidecar processes: the recorder of a run, and programs of viewers.
 
 Each is started before the nodes or beside them, and ended after them.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import secrets
-import socket
 import subprocess
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote, urlsplit
 
 from neuros.backends.node_command import process_environment, with_libraries
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault
 
-HOST = "127.0.0.1"
 END = b"end\n"
 """What the recorder is told when nothing more will come."""
 
 _NICENESS = 10
-_RERUN_MEMORY = "512MB"
-_END_S = 3.0
-_START_S, _LOOK_S = 30.0, 0.1
+_LOOK_S = 0.1
 
 
 def start_sidecar(
@@ -143,162 +133,3 @@ class RecorderProcess:
             return Recorded(**json.loads(answer))
         except (ValueError, TypeError):
             return None
-
-
-class DashboardProcess:
-    """Serves the dashboard of a run.
-
-    It listens as soon as this is made, so the address may be opened at once; requests wait until
-    the process is started, which loads what it needs when the first one comes. It ends when the
-    supervisor hangs up, or, if no page was open, with its standard input.
-
-    Args:
-        port: on 127.0.0.1; 0: any free one.
-
-    Raises:
-        UsageError: if the port is taken.
-    """
-
-    def __init__(self, port: int) -> None:
-        self._token = secrets.token_urlsafe(24)
-        self._process: subprocess.Popen[bytes] | None = None
-        self._listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._listening.bind((HOST, port))
-        except (OSError, OverflowError) as error:
-            self._listening.close()
-            raise UsageError(
-                f"--dashboard-port {port}: cannot be listened on ({error}); name another one, or"
-                " leave it out for any free one"
-            ) from error
-        self._listening.listen(64)
-        self._port = self._listening.getsockname()[1]
-
-    @property
-    def url(self) -> str:
-        """The address to open, with the token that lets the reader in."""
-        return f"http://{HOST}:{self._port}/?token={self._token}"
-
-    def start(
-        self,
-        command: Sequence[str],
-        run: Path,
-        environment: Mapping[str, str],
-        told: Mapping[str, Any],
-    ) -> int:
-        """Start the process, once there is a control socket; returns its id.
-
-        Args:
-            told: what it is told on its standard input, besides the token and where to listen:
-                a command line can be read by other users.
-
-        Raises:
-            EnvironmentFault: if it cannot be started.
-        """
-        descriptor = self._listening.fileno()
-        self._process = process = start_sidecar(
-            "dashboard", command, run, run / "dashboard.log", environment, [descriptor]
-        )
-        self._listening.close()
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            text = json.dumps({**told, "token": self._token, "descriptor": descriptor})
-            process.stdin.write(text.encode() + b"\n")
-            process.stdin.flush()
-        return process.pid
-
-    def finish(self) -> None:
-        """Let it tell its pages that the run is over, and end."""
-        self._listening.close()
-        process = self._process
-        if process is None:
-            return
-        if process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                process.stdin.close()
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-
-
-class RerunProcesses:
-    """Serves a Rerun web viewer for a run.
-
-    Attributes:
-        feed_url: where marks are sent to.
-        url: the address to open in a browser.
-    """
-
-    def __init__(self) -> None:
-        self._feed_port, self._web_port = _free_ports(2)
-        self.feed_url = f"rerun+http://{HOST}:{self._feed_port}/proxy"
-        self.url = f"http://{HOST}:{self._web_port}/?url={quote(self.feed_url, safe=':/')}"
-        self._processes: list[subprocess.Popen[bytes]] = []
-
-    def start(
-        self,
-        feeder: Sequence[str],
-        run: Path,
-        environment: Mapping[str, str],
-        told: Mapping[str, Any],
-    ) -> list[int]:
-        """Start both, once there is a control socket; returns their ids.
-
-        Args:
-            feeder: the command of what feeds it, which is ``told`` the rest on its input.
-
-        Raises:
-            EnvironmentFault: if one of them cannot be started.
-        """
-        server = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST]
-        server += ["--port", str(self._feed_port), "--web-viewer-port", str(self._web_port)]
-        server += ["--server-memory-limit", _RERUN_MEMORY, "--hide-welcome-screen"]
-        server += ["--newest-first"]  # who opens it late wants to see what is now
-        log = run / "rerun.log"
-        for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
-            self._processes.append(start_sidecar(what, command, run, log, environment))
-        pipe = self._processes[-1].stdin
-        assert pipe is not None
-        with contextlib.suppress(BrokenPipeError), pipe:
-            text = json.dumps({**told, "feed_url": self.feed_url, "url": self.url})
-            pipe.write(text.encode() + b"\n")
-        return [process.pid for process in self._processes]
-
-    def finish(self) -> None:
-        """End them with the run: the feeder by itself, then the server."""
-        for process in reversed(self._processes):
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_END_S if process is self._processes[-1] else 0)
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
-
-
-def await_server(url: str) -> None:
-    """Until the server of a page answers. Raises ``OSError`` if it does not."""
-    where = urlsplit(url)
-    give_up_s = time.monotonic() + _START_S
-    while True:
-        try:
-            socket.create_connection((HOST, where.port or 0), 1.0).close()
-        except ConnectionRefusedError:
-            if time.monotonic() > give_up_s:
-                raise
-            time.sleep(_LOOK_S)
-        else:
-            return
-
-
-def _free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for each in sockets:
-            each.bind((HOST, 0))
-        return [each.getsockname()[1] for each in sockets]

@@ -1,4 +1,4 @@
-"""``neuros launch``: a run with its console, its signals, and its exit code.
+"""``neuros launch`` and ``neuros sweep``: runs with console, signals, and exit code.
 
 What runs projects is imported late: ``--help`` and completion read this module, too.
 """
@@ -10,20 +10,35 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from neuros.api.request import LaunchOptions
+from neuros.api.request import LaunchOptions, SweepOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.projects import add_project, load_with_messages
 from neuros.errors import NeurosError, UsageError
-from neuros.options import add_options, parsed_as, values_of
+from neuros.options import add_options, options_of, parsed_as, values_of
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
+    from neuros.ports import BackEnd
+    from neuros.viewers.registered import Views
+
+EXIT_FAILED = 1
+SUBJECTS = {"--node-graph": "graph", "--visualisations": "packets"}
+
+_SWEEP_EPILOG = """\
+exit codes:
+  0    all runs ended normally
+  1    a run did not; the others were made
+  2    wrong usage
+  3    the project is invalid with some of the values: nothing was run
+  130  ended by Ctrl+C: the runs that had ended are kept, and not run again
+"""
 
 
 def add_launch(launch: argparse.ArgumentParser) -> None:
@@ -69,7 +84,6 @@ def _launch(parsed: argparse.Namespace) -> int:
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
         from neuros.cli.environments import make_shown_environments
-        from neuros.cli.views import Views
 
         options = parsed_as(LaunchOptions, parsed)
         options = replace(options, backend_options=_back_end_options(parsed))
@@ -79,21 +93,36 @@ def _launch(parsed: argparse.Namespace) -> int:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
-        views = Views(options, plan)  # the dashboard listens where the browser is
+        views = _views(options, plan.back_end)  # the dashboard listens where the browser is
         if options.isolate:
-            _isolate(options, plan)
+            _isolate(options, plan.back_end)
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
 
 
-def _isolate(options: LaunchOptions, plan: Plan) -> None:
+def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
+    """What the run is to be looked at with; ``None``: nothing."""
+    flags = {"--node-graph": options.node_graph, "--visualisations": options.visualisations}
+    subjects = {flag: SUBJECTS[flag] for flag, is_given in flags.items() if is_given}
+    names = list(options.viewer)
+    if options.dashboard or options.dashboard_port is not None:
+        names.append("dashboard")
+    if not (names or subjects):
+        return None
+    from neuros.viewers.registered import Views
+
+    return Views(back_end, names, subjects, options.dashboard_port)
+
+
+def _isolate(options: LaunchOptions, back_end: BackEnd) -> None:
     """Put the run into a network of its own."""
     from neuros.backends.isolation import enter_own_network
 
-    if options.node_graph or options.visualisations:
-        flag = "-g" if options.node_graph else "-z"
-        raise UsageError(f"--isolate with {flag}: windows cannot see into the run; use --dashboard")
-    if not plan.back_end.has_own_network:
+    if options.node_graph or options.visualisations or {*options.viewer} - {"dashboard"}:
+        raise UsageError(
+            "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
+        )
+    if not back_end.has_own_network:
         enter_own_network()
 
 
@@ -145,3 +174,41 @@ def _signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
             signal.signal(number, handler)
         reader.close()
         writer.close()
+
+
+def add_sweep(command: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    command.description = (
+        "Run a project with every combination of values and seeds, and write one"
+        " table (sweep.csv). What has finished before in the same folder is not run again."
+    )
+    command.epilog = _SWEEP_EPILOG
+    command.add_argument(
+        "project", metavar="PROJECT", help="a file, or a folder with a project.json"
+    )
+    add_options(command, options_of(SweepOptions))
+    command.set_defaults(command=_sweep)
+
+
+def _sweep(parsed: argparse.Namespace) -> int:
+    from neuros.api.sweep import CSV_NAME, sweep
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = _warn
+        options = values_of(options_of(SweepOptions), parsed)
+        made = sweep(parsed.project, **options, on_row=_say_row)
+    print(f"\n{made}\n\n{made.folder / CSV_NAME}")
+    return 0 if all(row["exit_code"] == 0 for row in made.rows) else EXIT_FAILED
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """What may be a mistake in the project, without the line of Python that found it."""
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def _say_row(number: int, count: int, row: Mapping[str, Any]) -> None:
+    """One line when a run has ended."""
+    values = list(row)[: list(row).index("exit_code")]
+    what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
+    print(f"[{number}/{count}] {what}: {row['reason']}", flush=True)

@@ -52,7 +52,7 @@ COMMANDS = {
     "build": Command("setup", "build message packages"),
     "ps": Command("runs", "show the runs of this user"),
     "stop": Command("runs", "stop a run, as Ctrl+C does"),
-    "sweep": Command("sweep", "run a project with many values and seeds, and make one table"),
+    "sweep": Command("launch", "run a project with many values and seeds, and make one table"),
     "verify": Command("runs", "compare the packets of two runs"),
     "report": Command("runs", "say what limited a run, and draw figures of it"),
     "compare": Command("runs", "show the figures of runs side by side"),

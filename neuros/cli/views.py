@@ -1,4 +1,4 @@
-"""Viewers of a run: ``--dashboard``, ``--node-graph``, ``--visualisations``, their programs."""
+"""Programs of the viewers of a run: what serves the dashboard, and what feeds Rerun."""
 
 from __future__ import annotations
 
@@ -8,155 +8,14 @@ import os
 import select
 import socket
 import sys
-import time
-from collections.abc import Callable, Mapping
-from importlib.util import find_spec
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-
-from neuros.errors import EnvironmentFault
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neuros.api.execution import Shown
-    from neuros.api.plan import Plan
-    from neuros.api.request import LaunchOptions
-    from neuros.backends.reaper import Reaper
-    from neuros.backends.sidecars import DashboardProcess, RerunProcesses
-    from neuros.backends.tools import Tool
     from neuros.viewers.dashboard.server import Sources
 
-RVIZ_FILE = "project.rviz"
 _LAST_LOG_BYTES = 1 << 16
-
-
-class Closable(Protocol):
-    """Something that shows a run, and is closed with it."""
-
-    def finish(self) -> None: ...
-
-
-class Views:
-    """What the command line asks to be shown of a run.
-
-    Raises:
-        UsageError: if the port of the dashboard is taken.
-        EnvironmentFault: if visualisations cannot be shown in any way.
-    """
-
-    def __init__(self, options: LaunchOptions, plan: Plan) -> None:
-        self._plan = plan
-        self._tools: list[Tool] = []
-        self._rerun: RerunProcesses | None = None
-        self._notices: list[str] = []
-        self._running: list[Closable] = []
-        self._opens_graph = False
-        if options.node_graph:
-            reason = self._take_tool("rqt_graph")
-            if reason is not None:
-                self._opens_graph = True
-                self._notices.append(f"--node-graph: in the dashboard, since {reason}")
-        if options.visualisations:
-            reason = self._take_tool("rviz2")
-            if reason is not None:
-                self._take_rerun(reason)
-        self._dashboard: DashboardProcess | None = None
-        if options.dashboard or options.dashboard_port is not None or self._opens_graph:
-            from neuros.backends.sidecars import DashboardProcess
-
-            self._dashboard = DashboardProcess(options.dashboard_port or 0)
-
-    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
-        """Open windows and pages, once there is a control socket. Raises ``EnvironmentFault``."""
-        for notice in self._notices:
-            log("INFO", notice)
-        for tool in self._tools:
-            arguments = [] if tool.program == "rqt_graph" else ["-d", self._write_rviz(run.folder)]
-            running = tool.start(arguments, run.folder, run.environment)
-            self._running.append(running)
-            running.announce(reaper)
-            log("INFO", f"{tool.program}: a window on this display")
-        if self._dashboard is not None:
-            self._running.append(self._dashboard)
-            reaper.watch(self._start_dashboard(self._dashboard, run))
-            log("INFO", f"dashboard: {self._dashboard.url}")
-            if self._opens_graph:
-                _open(f"{self._dashboard.url}#graph-section")
-        if self._rerun is not None:
-            self._start_rerun(self._rerun, run, reaper)
-            log("INFO", f"visualisations: {self._rerun.url}")
-
-    def finish(self) -> None:
-        """Close what was opened."""
-        for running in self._running:
-            running.finish()
-
-    def _take_tool(self, program: str) -> str | None:
-        """Have a tool started later, or say in a few words why it cannot be."""
-        from neuros.backends.tools import find_tool
-
-        if self._plan.back_end.is_one_process:
-            return "nodes of one process talk past ROS, where its tools see nothing"
-        found = find_tool(program)
-        if isinstance(found, str):
-            return found
-        self._tools.append(found)
-        return None
-
-    def _take_rerun(self, reason: str) -> None:
-        from neuros.backends.sidecars import RerunProcesses
-
-        if find_spec("rerun") is None:
-            raise EnvironmentFault(
-                f"--visualisations: {reason}, and Rerun is not installed: ./install.py --extras"
-                " rerun, or pip install 'neuros[rerun]'"
-            )
-        self._rerun = RerunProcesses()
-        self._notices.append(f"--visualisations: in Rerun, since {reason}")
-
-    def _start_dashboard(self, dashboard: DashboardProcess, run: Shown) -> int:
-        """Start the process that serves it; returns its id."""
-        from neuros.viewers.project_view import project_view
-
-        return dashboard.start(
-            [sys.executable, "-m", "neuros.cli", "dashboard", str(run.folder)],
-            run.folder,
-            run.environment,
-            {
-                "run": run.run_id,
-                "plan": project_view(self._plan.project, self._plan.names),
-                "names": self._plan.names,
-                "logs": {name: str(path) for name, path in run.logs.items()},
-                "is_one_process": self._plan.back_end.is_one_process,
-                "start_s": time.monotonic(),
-            },
-        )
-
-    def _start_rerun(self, rerun: RerunProcesses, run: Shown, reaper: Reaper) -> None:
-        from neuros.viewers.project_view import project_view
-
-        sources = project_view(self._plan.project, self._plan.names)["sources"]
-        command = [sys.executable, "-m", "neuros.cli", "view", str(run.folder)]
-        told = {"project": self._plan.project.name, "sources": sources}
-        self._running.append(rerun)
-        for pid in rerun.start(command, run.folder, run.environment, told):
-            reaper.watch(pid)
-
-    def _write_rviz(self, folder: Path) -> str:
-        from neuros.viewers.rviz import rviz_configuration
-
-        path = folder / RVIZ_FILE
-        path.write_text(rviz_configuration(self._plan.project), "utf-8")
-        return str(path)
-
-
-def _open(url: str) -> None:
-    """Open a page where there is a display; its address is printed in any case."""
-    import webbrowser
-
-    from neuros.backends.tools import has_display
-
-    if has_display():
-        webbrowser.open(url)
 
 
 def add_view(view: argparse.ArgumentParser) -> None:
@@ -167,11 +26,12 @@ def add_view(view: argparse.ArgumentParser) -> None:
 
 def _run_view(_: argparse.Namespace) -> int:
     from neuros.backends.control_sockets import connect_by
-    from neuros.backends.sidecars import await_server
     from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
     from neuros.viewers.rerun_feed import RerunFeed
     from neuros.viewers.visual_types import VisualTypes, look_on
+    from neuros.viewers.web import await_server
+    from neuros.viewers.windows import open_page
 
     told = json.loads(sys.stdin.readline())
     sources = {
@@ -179,7 +39,7 @@ def _run_view(_: argparse.Namespace) -> int:
         for each in told["sources"]
     }
     await_server(told["url"])
-    _open(told["url"])
+    open_page(told["url"])
     feed = RerunFeed(
         told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
     )

@@ -1,4 +1,4 @@
-"""A back end from another distribution: found by its name, and as good as ours."""
+"""A back end and a viewer from another distribution: found by name, and as good as ours."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ DISTRIBUTION = Path(__file__).parents[1] / "distributions" / "neuros_nice"
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
 
 
-def install(site: Path, name: str, back_ends: Mapping[str, str]) -> None:
+def install(site: Path, name: str, parts: Mapping[str, Mapping[str, str]]) -> None:
     """Put the metadata of a distribution where Python finds them, as pip does."""
     info = site / f"{name.replace('-', '_')}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    rows = [f"{key} = {value}\n" for key, value in back_ends.items()]
-    (info / "entry_points.txt").write_text("".join(["[neuros.backends]\n", *rows]))
+    rows: list[str] = []
+    for group, values in parts.items():
+        rows += [f"[{group}]\n", *(f"{key} = {value}\n" for key, value in values.items())]
+    (info / "entry_points.txt").write_text("".join(rows))
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +37,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     """The folder in which Python finds the distribution, for programs that are started."""
     site = tmp_path_factory.mktemp("site")
     project = tomllib.loads((DISTRIBUTION / "pyproject.toml").read_text())["project"]
-    install(site, project["name"], project["entry-points"]["neuros.backends"])
+    install(site, project["name"], project["entry-points"])
     paths = [str(site), str(DISTRIBUTION), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
     return site
@@ -100,7 +102,7 @@ def test_a_name_that_is_none_is_refused_with_all_that_there_are() -> None:
 def test_what_is_broken_is_named_with_its_distribution(
     installed: Path, value: str, why: str
 ) -> None:
-    install(installed, "bad", {"x": value})
+    install(installed, "bad", {"neuros.backends": {"x": value}})
     refused = neuros("launch", str(CLOCK), "--backend", "x")
     assert refused.returncode == 4
     assert f"back end 'x' of the distribution bad ({value}) {why}" in refused.stderr
@@ -108,7 +110,7 @@ def test_what_is_broken_is_named_with_its_distribution(
 
 
 def test_auto_passes_over_what_is_broken_and_says_so(installed: Path, tmp_path: Path) -> None:
-    install(installed, "bad", {"x": "no:X"})
+    install(installed, "bad", {"neuros.backends": {"x": "no:X"}})
     folder = tmp_path / "run"
     described = finish(launcher(CLOCK, folder, "--backend", "auto", "--dry-run"), folder)
     assert described.exit_code == 0, described.output
@@ -116,7 +118,7 @@ def test_auto_passes_over_what_is_broken_and_says_so(installed: Path, tmp_path: 
 
 
 def test_a_name_that_two_distributions_have_is_refused(installed: Path) -> None:
-    install(installed, "twin", {"process": "twin:X"})
+    install(installed, "twin", {"neuros.backends": {"process": "twin:X"}})
     refused = neuros("launch", str(CLOCK), "--backend", "auto")
     assert refused.returncode == 4
     assert "both neuros and twin have a back end 'process'" in refused.stderr
@@ -137,3 +139,21 @@ def test_auto_takes_it_in_no_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     said = neuros("launch", str(CLOCK), "--backend", "auto", "--dry-run").stdout
     assert said.startswith("back end process;")
     assert "each node runs in a process, not in a container: no Docker engine answers" in said
+
+
+def test_its_viewer_gets_the_run_and_is_told_of_its_end(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    options = ("--backend", "in-process", "--viewer", "notes", "--duration", "0.2")
+    shown = finish(launcher(CLOCK, folder, *options), folder)
+    assert shown.exit_code == 0, shown.output
+    assert f"notes: {folder / 'note.txt'}" in shown.output
+    assert (folder / "note.txt").read_text() == "clock: clock, display\nended\n"
+
+
+def test_a_viewer_that_is_none_is_refused_with_all_that_there_are() -> None:
+    refused = neuros("launch", str(CLOCK), "--viewer", "rviz")
+    assert refused.returncode == 2
+    assert refused.stderr == (
+        "neuros: viewer 'rviz': choose one of dashboard, rqt_graph, rviz2, rerun, notes (did you"
+        " mean 'rviz2'?)\n"
+    )

@@ -11,7 +11,7 @@ import pytest
 import requests
 from launching import REPOSITORY, launch, start
 
-from neuros.backends.sidecars import await_server
+from neuros.viewers.web import await_server
 
 WATCHED = REPOSITORY / "tests" / "viewers" / "dashboard" / "watched"
 # A stand-in for a tool with a window: it tells how it was started, and stays.

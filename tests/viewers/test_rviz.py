@@ -8,7 +8,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from neuros.project.model import Connection, Node, Port, Project
-from neuros.viewers.rviz import rviz_configuration
+from neuros.viewers.windows import rviz_configuration
 
 SCAN, POSE, TEXT = (
     "sensor_msgs/msg/LaserScan",

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.tools import Tool, find_tool, has_display
+from neuros.errors import EnvironmentFault
+from neuros.viewers.windows import Tool, find_tool, has_display
 
 NO_ENGINE = {"DOCKER_HOST": "unix:///nowhere.sock"}
 
@@ -25,12 +26,12 @@ def test_a_tool_on_the_path_runs_where_there_is_a_display(folder: Path) -> None:
 
 
 def test_without_a_display_no_tool_runs(folder: Path) -> None:
-    assert find_tool("rqt_graph", {"PATH": str(folder)}) == "rqt_graph needs a display"
+    with pytest.raises(EnvironmentFault, match="rqt_graph needs a display"):
+        find_tool("rqt_graph", {"PATH": str(folder)})
     assert has_display({"WAYLAND_DISPLAY": "wayland-0"})
 
 
 def test_what_is_nowhere_is_told_with_both_places(folder: Path) -> None:
-    found = find_tool("rviz2", {"PATH": str(folder), "DISPLAY": ":1", **NO_ENGINE})
-    assert found == (
-        "rviz2 is not on PATH, and there is no Docker engine for the image neuros_tools"
-    )
+    why = "rviz2 is not on PATH, and there is no Docker engine for the image neuros_tools"
+    with pytest.raises(EnvironmentFault, match=why):
+        find_tool("rviz2", {"PATH": str(folder), "DISPLAY": ":1", **NO_ENGINE})
