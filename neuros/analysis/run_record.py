@@ -99,7 +99,7 @@ def run_table(record: Mapping[str, Any]) -> str:
 
     from neuros.recording.system_load import load_table
 
-    counts = _COUNTS
+    counts: tuple[str, ...] = _COUNTS
     if any(c.get("foreign") for c in record["connections"]):
         counts = (*counts, "foreign")
     connections = [[c["connection"], *(c[key] for key in counts)] for c in record["connections"]]

@@ -83,6 +83,7 @@ def _launch(parsed: argparse.Namespace) -> int:
     with _signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
+        from neuros.backends.isolation import enter_own_network
         from neuros.cli.environments import make_shown_environments
 
         options = parsed_as(LaunchOptions, parsed)
@@ -94,8 +95,8 @@ def _launch(parsed: argparse.Namespace) -> int:
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
         views = _views(options, plan.back_end)  # the dashboard listens where the browser is
-        if options.isolate:
-            _isolate(options, plan.back_end)
+        if options.isolate and not plan.back_end.has_own_network:
+            enter_own_network()
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
 
@@ -105,6 +106,10 @@ def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
     flags = {"--node-graph": options.node_graph, "--visualisations": options.visualisations}
     subjects = {flag: SUBJECTS[flag] for flag, is_given in flags.items() if is_given}
     names = list(options.viewer)
+    if options.isolate and (subjects or {*names} - {"dashboard"}):
+        raise UsageError(
+            "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
+        )
     if options.dashboard or options.dashboard_port is not None:
         names.append("dashboard")
     if not (names or subjects):
@@ -112,18 +117,6 @@ def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
     from neuros.viewers.registered import Views
 
     return Views(back_end, names, subjects, options.dashboard_port)
-
-
-def _isolate(options: LaunchOptions, back_end: BackEnd) -> None:
-    """Put the run into a network of its own."""
-    from neuros.backends.isolation import enter_own_network
-
-    if options.node_graph or options.visualisations or {*options.viewer} - {"dashboard"}:
-        raise UsageError(
-            "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
-        )
-    if not back_end.has_own_network:
-        enter_own_network()
 
 
 def _dry_run(plan: Plan) -> int:

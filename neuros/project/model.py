@@ -182,7 +182,7 @@ class NodeFile:
     index: int = 0
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
-    keys: Mapping[int, str] = field(default_factory=lambda: _NOTHING, hash=False, repr=False)
+    keys: Mapping[int, str] = field(default_factory=dict, hash=False, repr=False)
 
 
 @dataclass(frozen=True)

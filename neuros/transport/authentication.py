@@ -8,7 +8,7 @@ for each connection between two nodes that it starts, and only they are told (``
 - On ``/data`` the tag is 14 bits in the option bytes of the encapsulation header, which ROS and its
   tools do not read (their last two bits count padding, DDSI-RTPS 2.5, 10.5). The number is the one
   that DDS gives each message of a writer, from 1; one that has been there is not taken again.
-- On ``/ack`` it is 8 bytes behind the position, on ``/reg`` the last word of the text.
+- On ``/ack`` it stands beside the position, 64 bits, on ``/reg`` it is the last word of the text.
 
 A tag that is read off the topic is of no use: its number has passed. That keeps out whoever uses
 ROS. It does not keep out who writes a program that guesses tags, or packets of DDS itself: that
@@ -23,14 +23,15 @@ import struct
 from array import array
 
 from neuros.transport.large_packets import PARCEL_MARK
-from neuros.transport.messages import encode_position
 
 _BLOCK = 512
 _HEADER_BYTES = 4
 _OPTIONS = 0xFFFC
 _IS_FREE = (b"\0\0", PARCEL_MARK)
-_POSITION = struct.Struct("<4sQQ")
-_TAG = struct.Struct("<Q")
+_LITTLE_ENDIAN = b"\0\1\0\0"
+# The header; no dimensions, no offset, two items, and a gap before them; position and tag.
+_POSITION = struct.Struct("<4s3I4x2Q")
+_BIG_ENDIAN_POSITION = struct.Struct(">4s3I4x2Q")
 
 
 class Tags:
@@ -85,32 +86,43 @@ class DataTags:
         return header.to_bytes(_HEADER_BYTES, "big") + data[_HEADER_BYTES:]
 
 
-class PositionTags:
-    """Tags of the acknowledgements of one connection."""
+class Positions:
+    """Acknowledgements of one connection: a position and its tag.
 
-    def __init__(self, key: str) -> None:
-        self._tags = Tags(key, "ack", "Q")
+    They travel as a ``std_msgs/msg/UInt64MultiArray``, made without a message object in between.
+
+    Args:
+        key: of the connection; ``None``: the other end has none, and any tag will do.
+    """
+
+    def __init__(self, key: str | None) -> None:
+        self._tags = None if key is None else Tags(key, "ack", "Q")
 
     def encode(self, position: int) -> bytes:
         """A position as ``/ack`` carries it."""
-        return encode_position(position) + _TAG.pack(self._tags[position])
+        tag = 0 if self._tags is None else self._tags[position]
+        return _POSITION.pack(_LITTLE_ENDIAN, 0, 0, 2, position, tag)
 
     def decode(self, data: bytes) -> int | None:
-        """The position; ``None``: the acknowledgement is foreign."""
+        """The position, from a sender of either byte order; ``None``: it is foreign."""
         if len(data) != _POSITION.size:
             return None
-        _, position, tag = _POSITION.unpack(data)
-        return position if tag == self._tags[position] else None
+        position: int
+        *_, position, tag = (_POSITION if data[1] else _BIG_ENDIAN_POSITION).unpack(data)
+        return position if self._tags is None or tag == self._tags[position] else None
 
 
 def signed(text: str, key: str) -> str:
     """A text of ``/reg`` with its tag."""
-    tag = hashlib.blake2b(text.encode(), key=bytes.fromhex(key), digest_size=8)
+    tag = hashlib.blake2b(_encoded(text), key=bytes.fromhex(key), digest_size=8)
     return f"{text} {tag.hexdigest()}"
 
 
 def verified(text: str, key: str) -> str | None:
     """The text without its tag; ``None``: it is foreign."""
     found = text.rpartition(" ")[0]
-    is_genuine = hmac.compare_digest(signed(found, key).encode(), text.encode(errors="replace"))
-    return found if is_genuine else None
+    return found if hmac.compare_digest(_encoded(signed(found, key)), _encoded(text)) else None
+
+
+def _encoded(text: str) -> bytes:
+    return text.encode(errors="surrogatepass")

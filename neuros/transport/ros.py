@@ -23,20 +23,23 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from std_msgs.msg import String, UInt64
+from std_msgs.msg import String, UInt64MultiArray
 
 from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.authentication import DataTags, PositionTags, signed, verified
+from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import Decoder, Encoder, message_codec
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel
-from neuros.transport.messages import decode_position, encode_position, message_class
+from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
+_NAME_S = 0.5
+"""The ROS graph lists an endpoint a moment before it knows its node."""
 
 
 @dataclass
@@ -76,8 +79,7 @@ class ReceivingLink:
         self._digest = digest
         self._deliver = deliver
         self._note = digests.append
-        self.publish_position: Callable[[bytes], None] = _nowhere
-        self.encode_position = encode_position
+        self.publish_position: Callable[[int], None] = _nowhere
 
     def receive(self, data: bytes) -> None:
         """Deliver the packet that was published, unless it was lost on its way."""
@@ -90,7 +92,7 @@ class ReceivingLink:
         """Publish the position that every taker has reached."""
         if self._settle is not None:
             self._settle(position)
-        self.publish_position(self.encode_position(position))
+        self.publish_position(position)
 
 
 def _tagging(tags: DataTags, publish: Callable[[bytes], None]) -> Callable[[bytes], None]:
@@ -98,7 +100,7 @@ def _tagging(tags: DataTags, publish: Callable[[bytes], None]) -> Callable[[byte
     return lambda data: publish(add(data))
 
 
-def _nowhere(data: bytes) -> None:
+def _nowhere(position: int) -> None:
     """Acknowledges on a connection without acknowledgements."""
 
 
@@ -134,6 +136,8 @@ class RosTransport:
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self.foreign = {str(connection): 0 for connection in file.connections}
+        self._unnamed: list[tuple[Connection, str]] = []
+        self._naming: Timer | None = None
         self._registrations: list[Registration] = []
         self._large = LargeCodecs(file, ros_node.get_logger().warning)
         self._is_open = False
@@ -208,6 +212,7 @@ class RosTransport:
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
+        self._name_foreign()
         self._external.close()
         self._large.close()
 
@@ -227,7 +232,7 @@ class RosTransport:
         )
         subscriptions = []
         if connection.is_reliable:
-            decode = decode_position if key is None else PositionTags(key).decode
+            decode = Positions(key).decode
 
             def take_position(data: bytes) -> None:
                 position = decode(data)
@@ -237,7 +242,7 @@ class RosTransport:
                     inbox.on_acknowledgement(connection, position)
 
             subscriptions.append(
-                self._subscribe(UInt64, f"{connection.topic}/ack", _HEARD, take_position)
+                self._subscribe(UInt64MultiArray, f"{connection.topic}/ack", _HEARD, take_position)
             )
         self._registrations.append(
             Registration(
@@ -265,12 +270,11 @@ class RosTransport:
         key = self._keys.get(connection.index)
         publishers = []
         if connection.is_reliable:
-            if key is not None:
-                link.encode_position = PositionTags(key).encode
             acknowledge = self._ros_node.create_publisher(
-                UInt64, f"{connection.topic}/ack", _LATCHED
+                UInt64MultiArray, f"{connection.topic}/ack", _LATCHED
             )
-            link.publish_position = acknowledge.handle.publish_raw
+            encode, publish = Positions(key).encode, acknowledge.handle.publish_raw
+            link.publish_position = lambda position: publish(encode(position))
             publishers.append(acknowledge)
         receive: Callable[..., None] = link.receive
         if key is not None:
@@ -310,7 +314,8 @@ class RosTransport:
         @functools.wraps(deliver)  # rclpy asks for its signature
         def receive(*message: Any) -> None:
             if self._is_open:
-                deliver(*message)
+                # The events executor hands over a message and its info as one tuple.
+                deliver(*(message[0] if type(message[0]) is tuple else message))
 
         return self._ros_node.create_subscription(
             kind, topic, self._loop.guarded(receive), qos, raw=True
@@ -333,18 +338,28 @@ class RosTransport:
 
     def _refuse(self, connection: Connection, part: str) -> None:
         """Count a message that is not from the other end; the first one is named in the log."""
-        name, topic = str(connection), f"{connection.topic}/{part}"
-        self.foreign[name] += 1
-        if self.foreign[name] > 1:
-            return
-        ends = {connection.source_node, connection.destination_node}
-        listed = self._ros_node.get_publishers_info_by_topic(topic)
-        others = sorted({each.node_name for each in listed} - ends)
-        self._ros_node.get_logger().warning(
-            f"{name}: a message on {topic} is not from its node and is not taken; others that"
-            f" publish there: {', '.join(others) or 'none that can be seen'}. The run counts them"
-            " as foreign; --isolate keeps others out"
-        )
+        self.foreign[str(connection)] += 1
+        if self.foreign[str(connection)] == 1:
+            self._unnamed.append((connection, part))
+            if self._naming is None:
+                self._naming = self._loop.every(self._ros_node, _NAME_S, self._name_foreign)
+
+    def _name_foreign(self) -> None:
+        """Say on which topics foreign messages have come, and who publishes there."""
+        if self._naming is not None:
+            self._ros_node.destroy_timer(self._naming)
+            self._naming = None
+        for connection, part in self._unnamed:
+            topic = f"{connection.topic}/{part}"
+            listed = self._ros_node.get_publishers_info_by_topic(topic)
+            names = {each.node_name for each in listed}
+            others = sorted(names - {connection.source_node, connection.destination_node})
+            self._ros_node.get_logger().warning(
+                f"{connection}: a message on {topic} is not from its node and is not taken; others"
+                f" that publish there: {', '.join(others) or 'none that can be seen'}. The run"
+                " counts them as foreign; --isolate keeps others out"
+            )
+        self._unnamed.clear()
 
     def _look_for_others(self) -> None:
         pending = [each for each in self._registrations if not each.advance()]

@@ -12,7 +12,8 @@ from launching import start
 from rclpy.duration import Duration
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from ros_program import RosProgram
-from std_msgs.msg import Int32, String, UInt64
+from std_msgs.msg import Int32, String
+from std_msgs.msg import UInt64MultiArray as Positions
 from test_transports import RosNetwork
 
 from neuros.backends.domain import choose_domain
@@ -85,8 +86,10 @@ def test_a_run_goes_on_and_names_who_else_publishes(
         intruder.publish(f"{topic}/reg", LATCHED, String(data="ready"), String(data="confirmed"))
         intruder.publish(f"{topic}/data", VOLATILE, *(Int32(data=-1) for _ in range(DATA)))
         if limit is not None:
-            intruder.publish(f"{topic}/ack", LATCHED, *(UInt64(data=9**n) for n in range(ACKS)))
-        running.wait_for(f"a message on {topic}/")
+            intruder.publish(
+                f"{topic}/ack", LATCHED, *(Positions(data=[9**n, n]) for n in range(ACKS))
+            )
+        running.wait_for(f"a message on {topic}/", 30.0)
         running.wait_for("others that publish there: intruder")
         (folder / "sink" / "enough").touch()
         run = running.finish()
@@ -161,7 +164,9 @@ def test_foreign_acknowledgements_push_out_none_that_waits(
     bench.send(7, connection)
     bench.wait(lambda: bool(bench.inboxes["b"].packets))
     bench.acknowledge(connection, 1)
-    intruder.publish(f"{connection.topic}/ack", LATCHED, *(UInt64(data=n) for n in range(2, 90)))
+    intruder.publish(
+        f"{connection.topic}/ack", LATCHED, *(Positions(data=[n, n]) for n in range(2, 90))
+    )
     a = bench.network.transport("a")
     bench.wait(lambda: a.foreign[str(connection)] == 88)
     assert bench.inboxes["a"].acknowledged == {connection: [1]}

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
-from std_msgs.msg import Int32, UInt64
+import struct
 
-from neuros.transport.authentication import DataTags, PositionTags, signed, verified
+import pytest
+
+from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import message_codec
 from neuros.transport.large_packets import PARCEL_MARK, is_parcel
-from neuros.transport.messages import decode, decode_position
+from neuros.transport.messages import decode, message_class
+
+Int32 = message_class("std_msgs/msg/Int32")
+Numbers = message_class("std_msgs/msg/UInt64MultiArray")
 
 KEY, OTHER = "00" * 16, "01" * 16
 PLAIN = b"\0\1\0\0" + bytes(8)
@@ -70,20 +74,31 @@ def test_the_bits_that_count_padding_stay_zero() -> None:
 
 
 def test_acknowledgements_need_a_tag_of_their_position() -> None:
-    tags = PositionTags(KEY)
+    tags = Positions(KEY)
     fifth = tags.encode(5)
-    assert PositionTags(KEY).decode(fifth) == 5
-    assert PositionTags(KEY).decode(fifth) == 5, "it may come again: it is cumulative"
-    assert PositionTags(OTHER).decode(fifth) is None
-    assert tags.decode(fifth[:4] + (6).to_bytes(8, "little") + fifth[12:]) is None
-    for malformed in (b"", fifth[:12], fifth + bytes(4)):
+    assert Positions(KEY).decode(fifth) == 5
+    assert Positions(KEY).decode(fifth) == 5, "it may come again: it is cumulative"
+    assert Positions(OTHER).decode(fifth) is None
+    assert tags.decode(fifth.replace(b"\5", b"\6", 1)) is None
+    for malformed in (b"", b"\0", fifth[:12], fifth + bytes(4)):
         assert tags.decode(malformed) is None
 
 
+def test_another_launcher_has_no_keys() -> None:
+    assert Positions(None).decode(Positions(None).encode(5)) == 5
+    assert Positions(KEY).decode(Positions(None).encode(5)) is None
+    assert Positions(None).decode(b"\0") is None
+
+
 def test_ros_reads_a_tagged_acknowledgement() -> None:
-    data = PositionTags(KEY).encode(7)
-    assert decode((UInt64, data)).data == 7
-    assert decode_position(data[:12]) == 7
+    position, tag = decode((Numbers, Positions(KEY).encode(7))).data
+    assert position == 7
+    assert tag
+
+
+def test_an_acknowledgement_of_the_other_byte_order_is_read() -> None:
+    *start, position, tag = struct.unpack("<4s3I4x2Q", Positions(KEY).encode(7))
+    assert Positions(KEY).decode(struct.pack(">4s3I4x2Q", bytes(4), *start[1:], position, tag)) == 7
 
 
 def test_registrations_are_signed() -> None:
