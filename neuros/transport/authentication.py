@@ -20,18 +20,16 @@ from __future__ import annotations
 import hashlib
 import hmac
 import struct
-from array import array
 
 from neuros.transport.large_packets import PARCEL_MARK
 
 _BLOCK = 512
-_HEADER_BYTES = 4
-_OPTIONS = 0xFFFC
+_LITTLE_ENDIAN = b"\0\1"
+_PLAIN = b"\0\1\0\0"
 _IS_FREE = (b"\0\0", PARCEL_MARK)
-_LITTLE_ENDIAN = b"\0\1\0\0"
 # The header; no dimensions, no offset, two items, and a gap before them; position and tag.
-_POSITION = struct.Struct("<4s3I4x2Q")
-_BIG_ENDIAN_POSITION = struct.Struct(">4s3I4x2Q")
+_POSITION = struct.Struct("<4s3I4xQ8s")
+_BIG_ENDIAN_POSITION = struct.Struct(">4s3I4xQ8s")
 
 
 class Tags:
@@ -40,50 +38,59 @@ class Tags:
     Args:
         key: of the connection, hexadecimal.
         topic: which of its topics.
-        typecode: of the tags, as ``array`` calls it.
+        mask: the bits of a tag that are used; it is as long as this.
     """
 
-    def __init__(self, key: str, topic: str, typecode: str) -> None:
+    def __init__(self, key: str, topic: str, mask: bytes) -> None:
         self._seed = bytes.fromhex(key) + topic.encode()
-        self._typecode = typecode
+        self._size = len(mask)
+        self._mask = int.from_bytes(mask * _BLOCK, "big")
         self._block = -1
-        self._tags: array[int] = array(typecode)
+        self._tags = b""
 
-    def __getitem__(self, number: int) -> int:
+    def __getitem__(self, number: int) -> bytes:
         block, place = divmod(number, _BLOCK)
         if block != self._block:
-            seed = self._seed + block.to_bytes(8, "little")
-            self._tags = array(self._typecode)
-            self._tags.frombytes(hashlib.shake_128(seed).digest(_BLOCK * self._tags.itemsize))
+            seed, size = self._seed + block.to_bytes(8, "little"), _BLOCK * self._size
+            stream = int.from_bytes(hashlib.shake_128(seed).digest(size), "big")
+            self._tags = (stream & self._mask).to_bytes(size, "big")
             self._block = block
-        return self._tags[place]
+        at = place * self._size
+        return self._tags[at : at + self._size]
 
 
 class DataTags:
     """Tags of the packets of one connection, put in by its sender, taken out by its receiver."""
 
     def __init__(self, key: str) -> None:
-        self._tags = Tags(key, "data", "H")
+        self._tags = Tags(key, "data", b"\xff\xfc")
         self._last = 0
 
     def add(self, data: bytes) -> bytes:
         """The next serialised packet with its tag."""
         self._last += 1
-        return self._changed(data, self._last)
+        tag = self._tags[self._last]
+        if data[:4] == _PLAIN:
+            return _LITTLE_ENDIAN + tag + data[4:]
+        return data[:2] + _exclusive_or(data[2:4], tag) + data[4:]
 
     def remove(self, data: bytes, number: int) -> bytes | None:
         """The serialised packet with this number without its tag; ``None``: it is foreign."""
         if number <= self._last:
             return None
-        packet = self._changed(data, number)
-        if packet[2:_HEADER_BYTES] not in _IS_FREE:
+        tag = self._tags[number]
+        if data[:4] == _LITTLE_ENDIAN + tag:
+            self._last = number
+            return _PLAIN + data[4:]
+        options = _exclusive_or(data[2:4], tag)
+        if options not in _IS_FREE:
             return None
         self._last = number
-        return packet
+        return data[:2] + options + data[4:]
 
-    def _changed(self, data: bytes, number: int) -> bytes:
-        header = int.from_bytes(data[:_HEADER_BYTES], "big") ^ (self._tags[number] & _OPTIONS)
-        return header.to_bytes(_HEADER_BYTES, "big") + data[_HEADER_BYTES:]
+
+def _exclusive_or(one: bytes, other: bytes) -> bytes:
+    return bytes(a ^ b for a, b in zip(one, other, strict=False))
 
 
 class Positions:
@@ -96,12 +103,12 @@ class Positions:
     """
 
     def __init__(self, key: str | None) -> None:
-        self._tags = None if key is None else Tags(key, "ack", "Q")
+        self._tags = None if key is None else Tags(key, "ack", b"\xff" * 8)
 
     def encode(self, position: int) -> bytes:
         """A position as ``/ack`` carries it."""
-        tag = 0 if self._tags is None else self._tags[position]
-        return _POSITION.pack(_LITTLE_ENDIAN, 0, 0, 2, position, tag)
+        tag = b"" if self._tags is None else self._tags[position]
+        return _POSITION.pack(_PLAIN, 0, 0, 2, position, tag)
 
     def decode(self, data: bytes) -> int | None:
         """The position, from a sender of either byte order; ``None``: it is foreign."""

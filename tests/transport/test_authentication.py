@@ -97,8 +97,10 @@ def test_ros_reads_a_tagged_acknowledgement() -> None:
 
 
 def test_an_acknowledgement_of_the_other_byte_order_is_read() -> None:
-    *start, position, tag = struct.unpack("<4s3I4x2Q", Positions(KEY).encode(7))
-    assert Positions(KEY).decode(struct.pack(">4s3I4x2Q", bytes(4), *start[1:], position, tag)) == 7
+    *start, position, tag = struct.unpack("<4s3I4xQ8s", Positions(KEY).encode(7))
+    assert (
+        Positions(KEY).decode(struct.pack(">4s3I4xQ8s", bytes(4), *start[1:], position, tag)) == 7
+    )
 
 
 def test_registrations_are_signed() -> None:
