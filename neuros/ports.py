@@ -62,10 +62,7 @@ class Transport(Protocol):
         """The function to call in place of a hook, if the transport looks at what that returns."""
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Packet], bytes | None]:
-        """The function that sends a packet on all these connections of one output.
-
-        It returns the serialised packet if that had to be made, so that it is made once.
-        """
+        """The function that sends a packet on connections of one output; may return its bytes."""
 
     def send_external(self, port: Port, packet: Packet) -> None:
         """Publish on the external topic of an output."""
@@ -75,10 +72,11 @@ class Transport(Protocol):
 
     @property
     def digests(self) -> Mapping[Connection, array[int]]:
-        """By connection, a digest of every packet sent or received on it, in that order.
+        """Digests of all packets sent or received on connections that keep them; read once."""
 
-        Reading takes them away. Connections of which none are kept are left out.
-        """
+    @property
+    def foreign(self) -> Mapping[str, int]:
+        """By connection, messages on its topics from others than its two nodes."""
 
     def note_execution(self) -> None:
         """A hook has ended: what has reached the node meanwhile comes before the next one."""
@@ -446,6 +444,7 @@ class NodeProgram:
         pythons: the Python of nodes that do not run on this one, by name of the node.
         reaper: is told of all that is started; ``None`` where nothing is.
         environ: the environment of the launcher.
+        is_isolated: whether the nodes are to have a network of their own.
         program: the command without its options; paths of ``node.json`` files follow these.
     """
 
@@ -454,6 +453,7 @@ class NodeProgram:
     pythons: Mapping[str, Path] = field(default_factory=dict)
     reaper: Reaper | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
+    is_isolated: bool = False
     program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "node")
 
     def command(self, python: Sequence[str] = ()) -> tuple[str, ...]:
@@ -550,8 +550,8 @@ class BackEnd(ABC):
         transport: the name of the transport that its nodes use.
         is_one_process: whether all nodes share a process. They take turns then, and hand packets
             over in memory, where ROS tools and other launchers do not see them.
-        has_own_pythons: whether nodes run on Pythons that it brings (those of images), and not on
-            those of this machine.
+        has_own_pythons: whether nodes run on Pythons that it brings (those of images).
+        has_own_network: whether it gives an isolated run its network; else the launcher enters one.
     """
 
     name: str
@@ -560,7 +560,7 @@ class BackEnd(ABC):
     options: Sequence[Option] = ()
     transport = "ros"
     is_one_process = False
-    has_own_pythons = False
+    has_own_pythons = has_own_network = False
 
     @abstractmethod
     def prepare(

@@ -7,6 +7,7 @@ run that was cut off or of an older version, too, and says what is missing.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -60,6 +61,7 @@ def run_record(
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r.sim_time for r in ended.reports.values() if r.sim_time is not None]
     sim_s, running_s = max(sim_times, default=None), ended.running_s
+    foreign = sum((Counter(r.foreign) for r in ended.reports.values()), Counter[str]())
     all_metrics = {**ended.elsewhere, **{n: r.metrics or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -76,7 +78,7 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, all_metrics, running_s, run_folder, _cut_off(ended))
+            _connection(c, all_metrics, running_s, run_folder, _cut_off(ended), foreign[str(c)])
             for c in sorted({c for file in files for c in file.connections}, key=lambda c: c.index)
         ],
         "nodes": {
@@ -97,12 +99,15 @@ def run_table(record: Mapping[str, Any]) -> str:
 
     from neuros.recording.system_load import load_table
 
-    connections = [[c["connection"], *(c[key] for key in _COUNTS)] for c in record["connections"]]
+    counts: tuple[str, ...] = _COUNTS
+    if any(c.get("foreign") for c in record["connections"]):
+        counts = (*counts, "foreign")
+    connections = [[c["connection"], *(c[key] for key in counts)] for c in record["connections"]]
     nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
     parts = [
         tabulate(rows, header, missingval="?", disable_numparse=True, colalign=("left", *right))
         for header, rows, right in (
-            (("connection", *_COUNTS), connections, ["right"] * len(_COUNTS)),
+            (("connection", *counts), connections, ["right"] * len(counts)),
             (("node", *_STATES, "remark"), nodes, ["right"] * len(_STATES)),
         )
         if rows
@@ -134,6 +139,7 @@ def _connection(
     running_s: float | None,
     run_folder: Path,
     cut_off: Collection[str],
+    foreign: int,
 ) -> dict[str, Any]:
     from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
 
@@ -153,6 +159,7 @@ def _connection(
         "rate_hz": sent / running_s if sent is not None and running_s else None,
         "lost": sent - received if is_known and None not in (sent, received) else None,
         **{field: incoming.get(field) for field in fields},
+        "foreign": foreign,
     }
     packets = read_packets(run_folder, connection)
     return figures | packet_figures(packets, may_lose=may_have_lost(figures))

@@ -25,7 +25,7 @@ from neuros.backends.progress import Progress
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import Session, reaper_environment, this_process
 from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
@@ -78,6 +78,8 @@ class Execution:
         self._run_id = os.urandom(8).hex()
         check_observation(monitors_load=plan.request.monitor_system_load)
         self._recording_plan = recording_of(plan, os.environ)
+        if plan.request.isolate and plan.back_end.has_own_network:
+            _check_reach(self._recording_plan)
         self._domain = run_domain(plan, self._recording_plan)
         try:
             self.folder = make_run_folder(plan.request.output, plan.project.name)
@@ -237,7 +239,7 @@ class Execution:
             outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
             record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             with contextlib.suppress(OSError):
-                spare.mkdir()
+                spare.mkdir(0o700)
                 write_run_file(record, spare)
 
     def _observation(self) -> Observation:
@@ -304,6 +306,15 @@ class Execution:
             "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # the only one that the wheels bring
             "ROS_LOG_DIR": str(self.folder),
         }
+
+
+def _check_reach(recording: RecordingPlan | None) -> None:
+    """The recorder is not in the network of isolated containers."""
+    if recording and recording.listen:
+        raise UsageError(
+            f"--isolate: the recorder cannot hear {', '.join(recording.listen)} in the network of"
+            " the containers: --exclude these topics, or use --backend process"
+        )
 
 
 def _without_notebook(environ: Mapping[str, str]) -> dict[str, str]:

@@ -178,6 +178,7 @@ class Plan:
                 self.pythons.paths,
                 reaper,
                 as_asked(os.environ),
+                self.request.isolate,
             )
         )
 
@@ -209,6 +210,8 @@ def make_plan(
             f"--network with -n: the nodes of the {back_end.name} back end reach none elsewhere;"
             " use --backend process"
         )
+    if request.isolate:
+        _check_isolation(plan)
     problems = [*_nest_problems(plan), *_time_problems(plan)]
     if problems:
         raise ProjectError(problems)
@@ -282,6 +285,26 @@ def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -
                 f"-n leaves out one end of {connection}, which the {back_end.name} back end"
                 " cannot reach; use --backend docker or process"
             )
+
+
+def _check_isolation(plan: Plan) -> None:
+    """A run in a network of its own reaches nothing outside."""
+    if plan.network.is_wide or plan.is_partial:
+        option = "--network" if plan.network.is_wide else "-n"
+        raise UsageError(f"--isolate with {option}: nodes elsewhere cannot reach the run")
+    nodes = plan.project.nodes
+    sent = {port.external_topic for node in nodes for port in node.outputs}
+    heard = [
+        f"{node.name}.{port.name} ({port.external_topic})"
+        for node in nodes
+        for port in node.inputs
+        if port.external_topic not in sent | {None}
+    ]
+    if heard:
+        raise UsageError(
+            f"--isolate: other programs cannot reach the external inputs {', '.join(heard)}; leave"
+            " --isolate out, or connect them"
+        )
 
 
 def _nest_problems(plan: Plan) -> Sequence[Problem]:

@@ -182,6 +182,11 @@ class Project:
         """A run that has yet to begin."""
         project, messages = self._load_for_run(options)
         plan = make_plan(project, messages, options)
+        if options.isolate and not plan.back_end.has_own_network:
+            raise UsageError(
+                "isolate: a Python program cannot leave its network for a run: use"
+                " backend='docker', or `neuros launch --isolate`"
+            )
         make_environments(plan.pythons, messages, sys.stderr)
         return LiveRun(plan, is_shown=options.show)
 

@@ -104,6 +104,14 @@ class Request(ProjectOptions):
         help="name the other machines, by address or name, where multicast does not reach them;"
         " implies --network",
     )
+    isolate: bool = option(
+        "--isolate",
+        default=False,
+        page="security.md#a-network-of-the-runs-own",
+        help="give the run a network of its own, so that no other program of this machine can read"
+        " or send its packets; not with nodes elsewhere or external inputs. Python programs can ask"
+        " for it with --backend docker only",
+    )
     backend: str | None = option(
         "--backend",
         default="auto",

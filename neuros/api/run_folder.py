@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,7 @@ def run_folder_path(
 
 
 def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) -> Path:
-    """Create the folder of a run.
+    """Create the folder of a run, which only its user can read.
 
     Raises:
         UsageError: if it exists and is not empty, or cannot be created.
@@ -46,7 +48,7 @@ def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) ->
     try:
         if output is not None and _is_taken(folder):
             raise UsageError(f"-o {os.fspath(output)}: is not an empty folder; name a new one")
-        folder.mkdir(parents=True, exist_ok=output is not None)
+        folder.mkdir(0o700, parents=True, exist_ok=output is not None)
     except OSError as error:
         raise UsageError(
             f"the run folder {folder} cannot be made ({error.strerror}): name one with -o"
@@ -69,7 +71,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     Raises:
         UsageError: if the folder cannot be written to, or another run has just begun there.
     """
-    files = plan.node_files(folders_of(plan, run_folder))
+    files = _with_keys(plan.node_files(folders_of(plan, run_folder)))
     try:
         # Two runs that were given the same empty folder: only one of them gets it.
         with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
@@ -78,6 +80,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
             seen = plan.deployment.as_seen(file)
+            path.touch(0o600)  # wherever the folder is: it holds keys
             path.write_text(_text(node_file_to_json(seen)), "utf-8")
     except FileExistsError as error:
         raise UsageError(
@@ -88,6 +91,22 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
     return files
+
+
+def _with_keys(files: Sequence[NodeFile]) -> list[NodeFile]:
+    """The files with a key for each connection between two of their nodes."""
+    here = {file.node.name for file in files}
+    within = {
+        c.index
+        for file in files
+        for c in file.connections
+        if {c.source_node, c.destination_node} <= here
+    }
+    keys = {index: secrets.token_hex(16) for index in within}
+    return [
+        replace(f, keys={c.index: keys[c.index] for c in f.connections if c.index in keys})
+        for f in files
+    ]
 
 
 def _text(content: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from neuros.api.request import LaunchOptions, SweepOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.projects import add_project, load_with_messages
-from neuros.errors import NeurosError
+from neuros.errors import NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
 
 if TYPE_CHECKING:
@@ -83,6 +83,7 @@ def _launch(parsed: argparse.Namespace) -> int:
     with _signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
+        from neuros.backends.isolation import enter_own_network
         from neuros.cli.environments import make_shown_environments
 
         options = parsed_as(LaunchOptions, parsed)
@@ -93,7 +94,9 @@ def _launch(parsed: argparse.Namespace) -> int:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
-        views = _views(options, plan.back_end)
+        views = _views(options, plan.back_end)  # the dashboard listens where the browser is
+        if options.isolate and not plan.back_end.has_own_network:
+            enter_own_network()
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
 
@@ -103,6 +106,10 @@ def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
     flags = {"--node-graph": options.node_graph, "--visualisations": options.visualisations}
     subjects = {flag: SUBJECTS[flag] for flag, is_given in flags.items() if is_given}
     names = list(options.viewer)
+    if options.isolate and (subjects or {*names} - {"dashboard"}):
+        raise UsageError(
+            "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
+        )
     if options.dashboard or options.dashboard_port is not None:
         names.append("dashboard")
     if not (names or subjects):

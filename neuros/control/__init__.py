@@ -131,6 +131,7 @@ class Report(Message):
         metrics: ``None`` before the plugin is loaded.
         stack: where the plugin stands, if its hook runs for long.
         fault: what cannot be recorded.
+        foreign: by connection, messages from others than its two nodes.
         is_driving: whether some hook starts with no packet for it.
         is_final: whether this is the last report.
     """
@@ -144,6 +145,7 @@ class Report(Message):
     metrics: Metrics | None = None
     stack: Stack | None = None
     fault: str | None = None
+    foreign: Mapping[str, int] = field(default_factory=dict)
     is_driving: bool = False
     is_final: bool = False
 

@@ -68,6 +68,7 @@ class NodeReports:
             "metrics": metrics,
             "stack": self._stack(metrics),
             "fault": None if self._packet_log is None else self._packet_log.failure,
+            "foreign": {name: n for name, n in self._transport.foreign.items() if n},
             "is_driving": engine is not None and engine.is_driving,
         }
 

@@ -172,6 +172,8 @@ class NodeFile:
         messages: where Python finds the message packages of workspaces, a folder for each: it is
             called ``python``, and lies in that of the built package.
         names: the project's.
+        keys: by index of a connection, a secret of its two nodes, hexadecimal. None where one of
+            them is another launcher's.
     """
 
     node: Node
@@ -180,6 +182,7 @@ class NodeFile:
     index: int = 0
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
+    keys: Mapping[int, str] = field(default_factory=dict, hash=False, repr=False)
 
 
 @dataclass(frozen=True)

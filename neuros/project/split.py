@@ -54,6 +54,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "folders": {name: str(folder) for name, folder in vars(node_file.folders).items()},
         "messages": [str(path) for path in node_file.messages],
         "index": node_file.index,
+        "keys": {str(index): key for index, key in node_file.keys.items()},
         "file": str(node.file),
         "pointer": node.pointer,
         "environment_paths": list(node.environment_paths),
@@ -90,6 +91,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
         index=content["index"],
         messages=tuple(map(Path, content.get("messages", ()))),
         names=names,
+        keys={int(index): key for index, key in content.get("keys", {}).items()},
     )
 
 

@@ -42,7 +42,8 @@ from neuros.transport.packet_segment import (
 LARGE_BYTES = 64 * 1024
 """Buffers of together this size or more leave the message: below, DDS is as fast."""
 
-_MARK = b"NR"
+PARCEL_MARK = b"NR"
+"""Option bytes of a parcel."""
 _OPTIONS = slice(2, 4)
 # Behind the message, and read from its end: lengths of the buffers, the name of the segment, and
 # generation, size of a slot, slot, length of the message, number of buffers, length of the name.
@@ -235,7 +236,7 @@ class LargeCodecs:
 
 def is_parcel(data: bytes) -> bool:
     """Whether these bytes are a parcel, and not a whole message."""
-    return data[_OPTIONS] == _MARK
+    return data[_OPTIONS] == PARCEL_MARK
 
 
 def message_of(parcel: bytes) -> bytes:
@@ -289,7 +290,7 @@ def _parcel(message: bytes, place: Place) -> bytes:
         len(place.lengths),
         len(name),
     )
-    return b"".join((message[:2], _MARK, message[4:], padding, lengths, name, note))
+    return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
 
 
 def _contents(data: bytes) -> tuple[bytes, Place]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import struct
 import warnings
 from functools import cache
 from typing import Any
@@ -12,12 +11,6 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 
 from neuros.errors import EnvironmentFault
-
-# CDR: two bytes for the encoding (1: little-endian), two unused ones, and the number
-# (OMG DDSI-RTPS 2.5, 10.2).
-_POSITION = struct.Struct("<4sQ")
-_BIG_ENDIAN_POSITION = struct.Struct(">4sQ")
-_LITTLE_ENDIAN = b"\0\1\0\0"
 
 
 @cache
@@ -52,15 +45,3 @@ def decode(parcel: tuple[type, bytes]) -> Any:
     """The packet in a parcel; it shares nothing with the one that was sent."""
     kind, data = parcel
     return deserialize_message(data, kind)
-
-
-def encode_position(position: int) -> bytes:
-    """A ``std_msgs/msg/UInt64`` as DDS carries it, without a message object in between."""
-    return _POSITION.pack(_LITTLE_ENDIAN, position)
-
-
-def decode_position(data: bytes) -> int:
-    """The number in a ``std_msgs/msg/UInt64``, from a sender of either byte order."""
-    kind = _POSITION if data[1] else _BIG_ENDIAN_POSITION
-    position: int = kind.unpack(data)[1]
-    return position

@@ -71,6 +71,7 @@ class _NullTransport:
     """A transport that carries nothing (:class:`neuros.ports.Transport`)."""
 
     digests: Mapping[Connection, array[int]] = {}
+    foreign: Mapping[str, int] = {}
 
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...

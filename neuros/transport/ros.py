@@ -1,34 +1,45 @@
 """The ROS 2 transport: packets of a node over topics, and the registration of its connections.
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
-``/ack`` (the position of the last packet that every taker has started on), and ``/reg``.
+``/ack`` (the position of the last packet that every taker has started on), and ``/reg``. Only what
+its own two nodes publish there is taken: see :mod:`neuros.transport.authentication`.
 """
 
 from __future__ import annotations
 
+import functools
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from rclpy.node import Node as RosNode
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from std_msgs.msg import String, UInt64
+from std_msgs.msg import String, UInt64MultiArray
 
 from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import Decoder, Encoder, message_codec
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel
-from neuros.transport.messages import decode_position, encode_position, message_class
+from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
+_NAME_S = 0.5
+"""The ROS graph lists an endpoint a moment before it knows its node."""
 
 
 @dataclass
@@ -36,7 +47,7 @@ class SendingLink:
     """One connection at its sender.
 
     Attributes:
-        publish: publishes what the codec makes.
+        publish: publishes what the codec makes, with the tag of the packet.
         count_readers: returns the number of all subscriptions to the data topic.
         digests: of the packets sent.
     """
@@ -68,7 +79,7 @@ class ReceivingLink:
         self._digest = digest
         self._deliver = deliver
         self._note = digests.append
-        self.publish_position: Callable[[bytes], None] = _nowhere
+        self.publish_position: Callable[[int], None] = _nowhere
 
     def receive(self, data: bytes) -> None:
         """Deliver the packet that was published, unless it was lost on its way."""
@@ -81,10 +92,15 @@ class ReceivingLink:
         """Publish the position that every taker has reached."""
         if self._settle is not None:
             self._settle(position)
-        self.publish_position(encode_position(position))
+        self.publish_position(position)
 
 
-def _nowhere(data: bytes) -> None:
+def _tagging(tags: DataTags, publish: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    add = tags.add
+    return lambda data: publish(add(data))
+
+
+def _nowhere(position: int) -> None:
     """Acknowledges on a connection without acknowledgements."""
 
 
@@ -96,11 +112,11 @@ _LATCHED = QoSProfile(
 """QoS of ``/reg`` and ``/ack``: the last message also reaches who comes later."""
 
 _HEARD = QoSProfile(
-    depth=10,
+    history=QoSHistoryPolicy.KEEP_ALL,
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""QoS of the reader of ``/reg``: both ends speak there, so it keeps more than the last word."""
+"""QoS of the readers of ``/reg`` and ``/ack``: foreign messages there push out no other."""
 
 _READY = "ready"
 _CONFIRMED = "confirmed"
@@ -112,12 +128,16 @@ class RosTransport:
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
         self._node = file.node
         self._connections = file.connections
+        self._keys = file.keys
         self._ros_node = ros_node
         self._loop = loop
         self._sending: dict[Connection, SendingLink] = {}
         self._receiving: dict[Connection, ReceivingLink] = {}
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
+        self.foreign = {str(connection): 0 for connection in file.connections}
+        self._unnamed: list[tuple[Connection, str]] = []
+        self._naming: Timer | None = None
         self._registrations: list[Registration] = []
         self._large = LargeCodecs(file, ros_node.get_logger().warning)
         self._is_open = False
@@ -192,6 +212,7 @@ class RosTransport:
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
+        self._name_foreign()
         self._external.close()
         self._large.close()
 
@@ -200,8 +221,10 @@ class RosTransport:
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
+        key = self._keys.get(connection.index)
+        publish = data.handle.publish_raw
         self._sending[connection] = SendingLink(
-            data.handle.publish_raw,
+            publish if key is None else _tagging(DataTags(key), publish),
             message_codec(kind),
             digest_for(kind),
             data.get_subscription_count,
@@ -209,14 +232,17 @@ class RosTransport:
         )
         subscriptions = []
         if connection.is_reliable:
+            decode = Positions(key).decode
+
+            def take_position(data: bytes) -> None:
+                position = decode(data)
+                if position is None:
+                    self._refuse(connection, "ack")
+                else:
+                    inbox.on_acknowledgement(connection, position)
+
             subscriptions.append(
-                self._subscribe(
-                    UInt64,
-                    f"{connection.topic}/ack",
-                    _LATCHED,
-                    lambda data: inbox.on_acknowledgement(connection, decode_position(data)),
-                    is_raw=True,
-                )
+                self._subscribe(UInt64MultiArray, f"{connection.topic}/ack", _HEARD, take_position)
             )
         self._registrations.append(
             Registration(
@@ -225,6 +251,8 @@ class RosTransport:
                 publishers=[data],
                 subscriptions=subscriptions,
                 is_sender=True,
+                key=key,
+                on_foreign=lambda: self._refuse(connection, "reg"),
                 on_registered=lambda note: self._loop.post(
                     partial(self._meet_receiver, connection, note, inbox)
                 ),
@@ -239,19 +267,20 @@ class RosTransport:
             partial(inbox.on_packet, connection),
             self.digests[connection],
         )
+        key = self._keys.get(connection.index)
         publishers = []
         if connection.is_reliable:
             acknowledge = self._ros_node.create_publisher(
-                UInt64, f"{connection.topic}/ack", _LATCHED
+                UInt64MultiArray, f"{connection.topic}/ack", _LATCHED
             )
-            link.publish_position = acknowledge.handle.publish_raw
+            encode, publish = Positions(key).encode, acknowledge.handle.publish_raw
+            link.publish_position = lambda position: publish(encode(position))
             publishers.append(acknowledge)
+        receive: Callable[..., None] = link.receive
+        if key is not None:
+            receive = self._checking(connection, DataTags(key), link.receive)
         data = self._subscribe(
-            kind,
-            f"{connection.topic}/data",
-            data_qos(connection),
-            link.receive,
-            is_raw=True,
+            kind, f"{connection.topic}/data", data_qos(connection, is_reader=True), receive
         )
         self._registrations.append(
             Registration(
@@ -260,6 +289,8 @@ class RosTransport:
                 publishers=publishers,
                 subscriptions=[data],
                 is_sender=False,
+                key=key,
+                on_foreign=lambda: self._refuse(connection, "reg"),
                 note=self._large.note(connection),
                 on_registered=lambda _: None,
             )
@@ -276,17 +307,59 @@ class RosTransport:
         kind: type,
         topic: str,
         qos: QoSProfile,
-        deliver: Callable[[Any], None],
-        *,
-        is_raw: bool = False,
+        deliver: Callable[..., None],
     ) -> Subscription:
-        def receive(message: Any) -> None:
+        """Subscribe to serialised messages until the transport closes."""
+
+        @functools.wraps(deliver)  # rclpy asks for its signature
+        def receive(*message: Any) -> None:
             if self._is_open:
-                deliver(message)
+                # The events executor hands over a message and its info as one tuple.
+                deliver(*(message[0] if type(message[0]) is tuple else message))
 
         return self._ros_node.create_subscription(
-            kind, topic, self._loop.guarded(receive), qos, raw=is_raw
+            kind, topic, self._loop.guarded(receive), qos, raw=True
         )
+
+    def _checking(
+        self, connection: Connection, tags: DataTags, take: Callable[[bytes], None]
+    ) -> Callable[[bytes, Mapping[str, int]], None]:
+        """``take`` for the packets of the registered writer alone."""
+        remove = tags.remove
+
+        def receive(data: bytes, info: Mapping[str, int]) -> None:
+            packet = remove(data, info["publication_sequence_number"])
+            if packet is None:
+                self._refuse(connection, "data")
+            else:
+                take(packet)
+
+        return receive
+
+    def _refuse(self, connection: Connection, part: str) -> None:
+        """Count a message that is not from the other end; the first one is named in the log."""
+        self.foreign[str(connection)] += 1
+        if self.foreign[str(connection)] == 1:
+            self._unnamed.append((connection, part))
+            if self._naming is None:
+                self._naming = self._loop.every(self._ros_node, _NAME_S, self._name_foreign)
+
+    def _name_foreign(self) -> None:
+        """Say on which topics foreign messages have come, and who publishes there."""
+        if self._naming is not None:
+            self._ros_node.destroy_timer(self._naming)
+            self._naming = None
+        for connection, part in self._unnamed:
+            topic = f"{connection.topic}/{part}"
+            listed = self._ros_node.get_publishers_info_by_topic(topic)
+            names = {each.node_name for each in listed}
+            others = sorted(names - {connection.source_node, connection.destination_node})
+            self._ros_node.get_logger().warning(
+                f"{connection}: a message on {topic} is not from its node and is not taken; others"
+                f" that publish there: {', '.join(others) or 'none that can be seen'}. The run"
+                " counts them as foreign; --isolate keeps others out"
+            )
+        self._unnamed.clear()
 
     def _look_for_others(self) -> None:
         pending = [each for each in self._registrations if not each.advance()]
@@ -309,7 +382,9 @@ class Registration:
     compatible endpoints that the graph lists are matched.
 
     Args:
+        key: of the connection; ``None``: the other end is another launcher's, and has none.
         note: what a receiver lets its sender know of itself, one line.
+        on_foreign: called for each message that is not from the other end.
         on_registered: called once, in the loop's thread, when this end is sure of the other;
             a sender gets the receiver's note, a receiver an empty one.
     """
@@ -322,7 +397,9 @@ class Registration:
         publishers: list[Publisher],
         subscriptions: list[Subscription],
         is_sender: bool,
+        key: str | None,
         note: str = "",
+        on_foreign: Callable[[], None],
         on_registered: Callable[[str], None],
     ) -> None:
         self.connection = connection
@@ -332,6 +409,8 @@ class Registration:
         self._subscriptions = subscriptions
         self._is_sender = is_sender
         self._peer = connection.destination_node if is_sender else connection.source_node
+        self._key = key
+        self._on_foreign = on_foreign
         self._on_registered = on_registered
         self._announcement = f"{_READY} {note}"
         self._peer_is_ready = False
@@ -345,9 +424,9 @@ class Registration:
         if self.is_done or not self._has_found_peer():
             return self.is_done
         if not self._is_sender:
-            self._reg_publisher.publish(String(data=self._announcement))
+            self._publish(self._announcement)
         elif self._peer_is_ready:
-            self._reg_publisher.publish(String(data=_CONFIRMED))
+            self._publish(_CONFIRMED)
             self._finish()
         return self.is_done
 
@@ -356,13 +435,21 @@ class Registration:
         self._ros_node.destroy_publisher(self._reg_publisher)
         self._ros_node.destroy_subscription(self._reg_subscription)
 
+    def _publish(self, text: str) -> None:
+        said = text if self._key is None else signed(text, self._key)
+        self._reg_publisher.publish(String(data=said))
+
     def _receive(self, message: String) -> None:
-        state, _, note = message.data.partition(" ")
+        text = message.data if self._key is None else verified(message.data, self._key)
+        if text is None:
+            self._on_foreign()
+            return
+        state, _, note = text.partition(" ")
         if self._is_sender and state == _READY:
             self._peer_is_ready = True
             self._peer_note = note
             if self.is_done:  # the receiver may have subscribed after the confirmation
-                self._reg_publisher.publish(String(data=_CONFIRMED))
+                self._publish(_CONFIRMED)
             else:
                 self.advance()
         elif not self._is_sender and state == _CONFIRMED and not self.is_done:

@@ -179,13 +179,17 @@ def qos_profile(qos: Qos) -> QoSProfile:
     )
 
 
-def data_qos(connection: Connection) -> QoSProfile:
-    """Deep enough for DDS itself to drop nothing that flow control lets through."""
-    reliable = QoSReliabilityPolicy.RELIABLE
-    best_effort = QoSReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(
-        depth=connection.window, reliability=reliable if connection.is_reliable else best_effort
-    )
+def data_qos(connection: Connection, *, is_reader: bool = False) -> QoSProfile:
+    """Deep enough for DDS itself to drop nothing that flow control lets through.
+
+    A reader has one history for all writers: it keeps all, so that foreign packets drop none.
+    """
+    if not connection.is_reliable:
+        return QoSProfile(depth=connection.window, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+    profile = QoSProfile(depth=connection.window, reliability=QoSReliabilityPolicy.RELIABLE)
+    if is_reader:
+        profile.history = QoSHistoryPolicy.KEEP_ALL
+    return profile
 
 
 # ---------------------------------------------------------------------- ROS graph checks

@@ -19,6 +19,7 @@ comes at once, while the node waits for others: a round trip takes no longer for
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import deque
 from collections.abc import Callable
@@ -143,13 +144,17 @@ class RosLoop:
         if self._timers:
             self._check_timers()
 
-    def guarded(self, receive: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Wrap a function that ROS calls with a message again and again, as :meth:`guard` does."""
+    def guarded(self, receive: Callable[..., None]) -> Callable[..., None]:
+        """Wrap a function that ROS calls with a message again and again, as :meth:`guard` does.
+
+        It may take what ROS knows of the message, too: ``receive(message, info)``.
+        """
         on_failure, timers = self._on_failure, self._timers
 
-        def guarded(message: Any) -> None:
+        @functools.wraps(receive)  # rclpy asks for its signature
+        def guarded(*message: Any) -> None:
             try:
-                receive(message)
+                receive(*message)
             except BaseException as error:
                 on_failure(error)
             if timers:

@@ -198,7 +198,7 @@ class PeerVoice:
     """Speaks for nodes of this process, and listens to nodes elsewhere, in a thread of its own.
 
     The nodes of a launcher publish its state (:class:`neuros.launcher.peers.PeerState`), each on a
-    topic of its own, ``/neuros/<node>/side`` in the project's namespace: a latched
+    topic of its own, ``/neuros/<node>/peer_state`` in the project's namespace: a latched
     ``std_msgs/msg/String``, so that the last state also reaches who comes later. That a node goes
     on living is told by DDS itself (liveliness, OMG DDS 1.4, 2.2.3.11), from threads that need no
     Python: a plugin that holds its global lock for seconds does not pass for dead.
@@ -221,7 +221,7 @@ class PeerVoice:
     ) -> None:
         self._heard = heard
         self._ros_node = RosNode(
-            f"_{names[0]}_side",  # a hidden one: tools do not list it unless they are asked to
+            f"_{names[0]}_peer_state",  # a hidden one: tools list it only if asked to
             context=context,
             namespace=namespace,
             enable_rosout=False,
@@ -243,7 +243,7 @@ class PeerVoice:
             )
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._ros_node)
-        self._thread = threading.Thread(target=self._listen, name="neuros-side", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="neuros-peers", daemon=True)
         self._thread.start()
 
     def say(self, text: str) -> None:
@@ -272,7 +272,7 @@ class PeerVoice:
 
 
 def _topic(namespace: str, name: str) -> str:
-    return f"{namespace}{INTERNAL}{name}/side"
+    return f"{namespace}{INTERNAL}{name}/peer_state"
 
 
 def _qos(lease_s: float) -> QoSProfile:

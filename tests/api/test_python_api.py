@@ -268,6 +268,12 @@ def test_errors_are_exceptions_of_neuros(tmp_path: Path) -> None:
         made.run(seed=1)
 
 
+def test_a_python_program_does_not_leave_its_network_for_a_run(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(dice(tmp_path))
+    with pytest.raises(UsageError, match="use backend='docker', or `neuros launch --isolate`"):
+        project.run(isolate=True, backend="process")
+
+
 def test_a_run_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = project(tmp_path)
 

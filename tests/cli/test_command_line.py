@@ -99,6 +99,9 @@ def test_help_documents_the_exit_codes(
         ([".", "--peers", "10.0.0.7,2.3"], "--peers 10.0.0.7,2.3: '2.3' is neither an IPv4"),
         ([".", "--peers", "a b,"], "--peers a b,: 'a b', '' is neither an IPv4"),
         ([".", "--peers", "224.0.0.1"], "--peers 224.0.0.1: '224.0.0.1' is neither an IPv4"),
+        ([".", "--isolate", "--network"], "--isolate with --network: nodes elsewhere cannot"),
+        ([".", "--isolate", "-n", "a"], "--isolate with -n: nodes elsewhere cannot reach the run"),
+        ([".", "--isolate", "-z"], "--isolate with -g, -z or --viewer: they cannot see into"),
         ([".", "-o", "plugin.py"], "-o plugin.py: is not an empty folder"),
         ([".", "-o", "."], "-o .: is not an empty folder"),
     ],
@@ -111,6 +114,20 @@ def test_wrong_usage_is_one_sentence(
     assert output.err.startswith(f"neuros: {reason}")
     assert output.err.count("\n") == 1
     assert not Path("runs").exists()
+
+
+def test_an_isolated_run_has_no_inputs_from_outside(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads(project.read_text())
+    content["nodes"][1]["inputs"].append({"name": "y", "type": PORT, "external_topic": "/odom"})
+    project.write_text(json.dumps(content))
+    assert main(["launch", ".", "--isolate"]) == 2
+    error = capsys.readouterr().err
+    assert "--isolate: other programs cannot reach the external inputs b.y (/odom)" in error
+    content["nodes"][0]["outputs"].append({"name": "p", "type": PORT, "external_topic": "/odom"})
+    project.write_text(json.dumps(content))
+    assert main(["launch", ".", "--isolate", "--dry-run", "--backend", "process"]) == 0
 
 
 def test_no_command_at_all_gives_the_help(capsys: pytest.CaptureFixture[str]) -> None:

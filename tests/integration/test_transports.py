@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -77,6 +78,13 @@ class TestRosTransport(TransportChecks):
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
         return RosNetwork([[file] for file in files], in_memory=False)
+
+
+class TestRosTransportBetweenLaunchers(TransportChecks):
+    """Nodes of other launchers, which have no keys in common."""
+
+    def network(self, files: Sequence[NodeFile]) -> RosNetwork:
+        return RosNetwork([[replace(file, keys={})] for file in files], in_memory=False)
 
 
 class TestMemoryTransportOnRos(TransportChecks):

@@ -29,6 +29,7 @@ class Docker(BackEnd):
     place = "a container"
     rank = 100
     has_own_pythons = True
+    has_own_network = True
 
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]

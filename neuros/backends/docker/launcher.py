@@ -22,7 +22,14 @@ from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_socket
 from neuros.backends.docker.images import Image, images_for
 from neuros.backends.docker.leftovers import RUN_LABEL
-from neuros.backends.docker.settings import container_settings, shared_memory, user_for
+from neuros.backends.docker.settings import (
+    NETWORK_MODE,
+    NO_NETWORK,
+    container_name,
+    container_settings,
+    shared_memory,
+    user_for,
+)
 from neuros.backends.node_command import (
     last_line,
     log_file,
@@ -114,10 +121,16 @@ class DockerLauncher:
         events.start()
         in_run_folder = _in_run_folder(nodes)
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
-            work = [
-                threads.submit(self._start_one, node, environment, events, in_run_folder)
-                for node in nodes
-            ]
+            networks = self._networks(nodes, environment)
+            work = []
+            for node, network in zip(nodes, networks, strict=True):
+                work.append(
+                    threads.submit(
+                        self._start_one, node, environment, events, in_run_folder, network
+                    )
+                )
+                if network == NO_NETWORK and work[0].exception():  # the others need it
+                    break
         faults = [fault for each in work if (fault := each.exception())]
         started = [each.result() for each in work if not each.exception()]
         if not faults:
@@ -134,17 +147,26 @@ class DockerLauncher:
         """One line per container."""
         return [self._description(node) for node in nodes]
 
+    def _networks(self, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> Sequence[str]:
+        """The network of each container: this machine's, or one of the run's own."""
+        if not self._program.is_isolated:
+            return [NETWORK_MODE] * len(nodes)
+        first, *others = nodes
+        shared = f"container:{container_name(first, environment.get(RUN_ID, ''))}"
+        return [NO_NETWORK, *(shared for _ in others)]
+
     def _start_one(
         self,
         file: NodeFile,
         environment: Mapping[str, str],
         events: ContainerEvents,
         in_run_folder: Sequence[Path],
+        network: str,
     ) -> RunningContainer:
         name, mem_bytes = file.node.name, file.node.resources.mem_bytes
         with engine_faults(f"the container of node '{name}' cannot be started"):
             container = self._engine.containers.create(
-                **self._settings(file, environment, in_run_folder)
+                **self._settings(file, environment, in_run_folder, network)
             )
             container.start()
         return RunningContainer(
@@ -157,7 +179,11 @@ class DockerLauncher:
         )
 
     def _settings(
-        self, file: NodeFile, environment: Mapping[str, str], in_run_folder: Sequence[Path]
+        self,
+        file: NodeFile,
+        environment: Mapping[str, str],
+        in_run_folder: Sequence[Path],
+        network: str,
     ) -> dict[str, Any]:
         return container_settings(
             file,
@@ -167,6 +193,7 @@ class DockerLauncher:
             environment,
             others=[path for path in in_run_folder if path != node_folder(file)],
             launcher_pid=os.getpid(),
+            network=network,
         )
 
     def _description(self, file: NodeFile) -> str:

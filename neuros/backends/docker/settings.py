@@ -37,6 +37,7 @@ from neuros.project.model import NodeFile
 # Discovery stays on this machine, so that nodes have to share its network. Large packets go through
 # shared memory where both ends see the same: the containers of one run do, and see nobody else's.
 NETWORK_MODE = "host"
+NO_NETWORK = "none"
 IPC_MODE = "private"
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -112,6 +113,7 @@ def container_settings(
     *,
     others: Sequence[Path] = (),
     launcher_pid: int = 0,
+    network: str = NETWORK_MODE,
 ) -> dict[str, Any]:
     """The arguments of ``docker.containers.create`` for a node.
 
@@ -120,6 +122,7 @@ def container_settings(
         environment: what the run adds to that of each node.
         others: what is in the run folder and not the node's own; it can only read that.
         launcher_pid: said in a label.
+        network: that of this machine, none, or that of another container.
     """
     node, resources = file.node, file.node.resources
     run_id, cores = environment.get(RUN_ID, ""), program.cores.get(node.name)
@@ -139,7 +142,7 @@ def container_settings(
         "read_only": True,
         "tmpfs": {"/tmp": _TMP},
         "init": True,
-        "network_mode": NETWORK_MODE,
+        "network_mode": network,
         "ipc_mode": IPC_MODE,
         "pids_limit": resources.pids or MOST_PIDS,
         "auto_remove": True,

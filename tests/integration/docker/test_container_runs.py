@@ -134,6 +134,22 @@ def last_line(finished: Finished) -> str:
 # ------------------------------------------------------------------ what a node may
 
 
+def test_isolated_containers_have_a_network_of_their_own(bench: ContainerBench) -> None:
+    arguments = ("--backend", "docker", "--isolate")
+    with start(EXAMPLES / "1_tick/clock", *arguments, cwd=bench.folder) as running:
+        running.wait_for("[display]: ", 30.0)
+        run = bench.session(running).run
+        found = bench.engine.containers.list(filters={"label": f"neuros.run={run}"})
+        interfaces = {c.exec_run(["ls", "/sys/class/net"]).output.decode() for c in found}
+        modes = sorted(each.attrs["HostConfig"]["NetworkMode"] for each in found)
+        running.signal(signal.SIGINT)
+        assert running.finish().exit_code == 130
+    assert len(found) == 2
+    assert interfaces == {"lo\n"}
+    assert modes[0].startswith("container:")
+    assert modes[1] == "none"
+
+
 def test_a_container_is_locked_down(bench: ContainerBench, monkeypatch: pytest.MonkeyPatch) -> None:
     (bench.folder / "file").write_text("hello")
     bench.project(
