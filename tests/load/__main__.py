@@ -43,11 +43,11 @@ def main() -> int:
 
 def _row(load: Load) -> str:
     first_ms, last_ms, p99_ms = load.latency_ms
-    first_mb, last_mb = load.memory_mb
+    memory = [f"{mb:.0f} MB" if mb else "-" for mb in load.memory_mb]  # none of a short run
     row = (
         f"| {load.shape} | {load.backend} | {load.lossless:,} | {load.seconds:.0f} s"
         f" | {first_ms:.2f} ms | {last_ms:.2f} ms | {p99_ms:.1f} ms"
-        f" | {first_mb:.0f} MB | {last_mb:.0f} MB |"
+        f" | {' | '.join(memory)} |"
     )
     return f"{row[:-1]}**{'; '.join(load.problems)}** |" if load.problems else row
 
