@@ -28,7 +28,7 @@ _GROWTH_SHARE, _GROWTH_BYTES = 0.1, 24 << 20  # three of the largest packets tha
 _SLOWER, _SLOWER_MS = 2.0, 2.0
 _FEWEST_SAMPLES = 20
 _FEWEST_TENTH = 3  # a shorter run is all beginning
-_BUSY = "while True: pass"
+_BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"  # ends with it
 
 
 @dataclass
