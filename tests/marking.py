@@ -42,6 +42,7 @@ BY_NAME = {
         "conformance/test_conformance.py::test_random_projects",
         "conformance/test_conformance.py::test_what_once",
         "integration/",
+        "upgrades/test_upgrades.py",
     ),
     "process": (
         "recording/test_provenance.py",

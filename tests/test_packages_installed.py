@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
+import sys
+import threading
 import venv
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from io import StringIO
 from pathlib import Path
 
@@ -210,6 +214,15 @@ def with_pip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bin" / "python"
 
 
+def empty(python: Path) -> None:
+    """Remove from its virtual environment what a test has installed."""
+    folder = python.parent.parent
+    python.with_name("uv").unlink(missing_ok=True)
+    (folder / "log").unlink(missing_ok=True)
+    for path in folder.glob("lib/*/site-packages/neuros*"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 class TestFallback:
     """What cannot be had with uv, pip installs; here from a folder, without a network."""
 
@@ -217,10 +230,7 @@ class TestFallback:
     def python(self, with_pip: Path, tmp_path: Path) -> Iterator[Path]:
         make_wheel(tmp_path / "wheels", "neuros_colour", "1.0", "NAME = 'red'")
         yield with_pip
-        with_pip.with_name("uv").unlink(missing_ok=True)
-        (with_pip.parent.parent / "log").unlink(missing_ok=True)
-        for path in with_pip.parent.parent.glob("lib/*/site-packages/neuros_colour*"):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        empty(with_pip)
 
     def run(self, python: Path, uv: Path | None, environ: dict[str, str]) -> tuple[str | None, str]:
         stream, folder = StringIO(), python.parent.parent
@@ -296,6 +306,90 @@ class TestFallback:
         with pytest.raises(EnvironmentFault, match=r"^the package index .* cannot be reached"):
             install(python, ROOT, ["plot"], Progress(stream), online)
         assert "pip installs" not in stream.getvalue()
+
+
+class TestHashes:
+    """A file is installed only if a lock file names its hash, by uv and by pip."""
+
+    @pytest.fixture(params=["uv", "pip"])
+    def python(self, request: pytest.FixtureRequest, with_pip: Path) -> Iterator[Path]:
+        if request.param == "uv":
+            with_pip.with_name("uv").symlink_to(Path(sys.executable).with_name("uv"))
+        yield with_pip
+        empty(with_pip)
+
+    @pytest.fixture
+    def index(self, tmp_path: Path) -> Iterator[dict[str, str]]:
+        """An index with one package on this machine, as an environment of pip."""
+        wheel = make_wheel(tmp_path / "simple/neuros-colour", "neuros_colour", "1.0")
+        page = f'<a href="{wheel.name}">{wheel.name}</a>'
+        wheel.with_name("index.html").write_text(page, "utf-8")
+        handler = partial(QuietHandler, directory=str(tmp_path))
+        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+            thread = threading.Thread(target=server.serve_forever)
+            thread.start()
+            yield {
+                **{k: v for k, v in clean_environment(os.environ).items() if k[:4] != "PIP_"},
+                "PIP_CONFIG_FILE": os.devnull,
+                "PIP_INDEX_URL": f"http://127.0.0.1:{server.server_port}/simple",
+                "PATH": "/usr/bin:/bin",
+                "UV_NO_CACHE": "1",
+            }
+            server.shutdown()
+            thread.join()
+
+    def install(self, python: Path, hashes: str, index: dict[str, str], tmp_path: Path) -> None:
+        tree = tmp_path / "tree"
+        (tree / "requirements").mkdir(parents=True)
+        for name in ("build", "core", "uv"):
+            text = f"neuros-colour==1.0{hashes}\n" if name == "core" else ""
+            (tree / "requirements" / f"{name}.txt").write_text(text, "utf-8")
+        (tree / "pyproject.toml").write_text(
+            '[build-system]\nrequires = []\nbuild-backend = "backend"\nbackend-path = ["."]\n'
+        )
+        wheel = make_wheel(tree, "neuros", "2.0")
+        (tree / "backend.py").write_text(
+            "import shutil, pathlib\n"
+            "def build_editable(target, config_settings=None, metadata_directory=None):\n"
+            f"    return pathlib.Path(shutil.copy({str(wheel)!r}, target)).name\n"
+        )
+        install(python, tree, [], Progress(StringIO()), index)
+
+    def is_installed(self, python: Path) -> bool:
+        return bool([*python.parents[1].glob("lib/*/site-packages/neuros_colour.py")])
+
+    def sha256(self, tmp_path: Path) -> str:
+        wheel = next(tmp_path.rglob("neuros_colour*.whl"))
+        return hashlib.sha256(wheel.read_bytes()).hexdigest()
+
+    def test_a_file_that_the_lock_file_names_is_installed(
+        self, python: Path, index: dict[str, str], tmp_path: Path
+    ) -> None:
+        self.install(python, f" --hash=sha256:{self.sha256(tmp_path)}", index, tmp_path)
+        assert self.is_installed(python)
+
+    def test_a_file_that_has_changed_since_is_refused(
+        self, python: Path, index: dict[str, str], tmp_path: Path
+    ) -> None:
+        before = self.sha256(tmp_path)
+        make_wheel(tmp_path / "simple/neuros-colour", "neuros_colour", "1.0", "CHANGED = True")
+        with pytest.raises(EnvironmentFault, match=r"is not the one that the lock file names"):
+            self.install(python, f" --hash=sha256:{before}", index, tmp_path)
+        assert not self.is_installed(python)
+
+    def test_a_package_without_a_hash_is_refused(
+        self, python: Path, index: dict[str, str], tmp_path: Path
+    ) -> None:
+        with pytest.raises(EnvironmentFault):
+            self.install(python, "", index, tmp_path)
+        assert not self.is_installed(python)
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder and says nothing."""
+
+    def log_message(self, *_: object) -> None:
+        pass
 
 
 @pytest.mark.parametrize(

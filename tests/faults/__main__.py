@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from tests.tables import write_table
+
 from .cells import BACKENDS, FAULTS, PLACES, Cell, all_cells
 from .running import Outcome, run
 
@@ -42,16 +44,8 @@ def main() -> int:
     failed = [outcome for outcome in outcomes if outcome.problems]
     print(f"{len(outcomes)} runs, {len(failed)} not as they must be")
     if options.table:
-        _write(options.table, table(outcomes))
+        write_table(options.table, table(outcomes))
     return 1 if failed else 0
-
-
-def _write(file: Path, text: str) -> None:
-    """Write a table into a file, between the marks of what is generated if it has them."""
-    whole = file.read_text("utf-8") if file.exists() else ""
-    before, begin, rest = whole.partition("<!-- generated: begin -->\n")
-    _, end, after = rest.partition("<!-- generated: end -->")
-    file.write_text(f"{before}{begin}\n{text}\n{end}{after}" if end else text, "utf-8")
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

@@ -1,5 +1,7 @@
 """Two machines joined by a cable: network namespaces and a veth pair, as far as DDS can tell.
 
+In place of the veth pair there may be a :class:`~cable.Cable`, which delays and reorders, too.
+
 Each has addresses of its own (192.0.2.1 and 192.0.2.2, which are reserved for such ends: RFC 5737),
 a host name, shared memory, and an engine of its own where a test asks for one.
 """
@@ -10,10 +12,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+from cable import Cable
 from docker import DockerClient
 from engines import OwnEngine, own_engine
 from launching import Running, start
 from machines import Machine, require_machines, run
+from needs import cannot_run
 
 ADDRESSES = {"left": "192.0.2.1", "right": "192.0.2.2"}
 CABLE = "cable"
@@ -22,12 +26,15 @@ CABLE = "cable"
 class TwoMachines:
     """``left`` and ``right``, and the cable between them."""
 
-    def __init__(self, machines: Mapping[str, Machine]) -> None:
+    def __init__(self, machines: Mapping[str, Machine], cable: Cable | None = None) -> None:
         self._machines = machines
         self._engines: Mapping[str, OwnEngine] = {}
         left, right = (machine.pid for machine in machines.values())
         link = f"ip link add {CABLE} netns {left} type veth peer name {CABLE} netns {right}"
-        run(*link.split())
+        if cable is None:
+            run(*link.split())
+        else:
+            cable.lay(machines, CABLE)
         for side, machine in machines.items():
             machine.run("ip", "address", "add", f"{ADDRESSES[side]}/24", "dev", CABLE)
             machine.run("ip", "link", "set", "lo", "up")
@@ -89,11 +96,15 @@ class TwoMachines:
 
 
 @contextmanager
-def two_machines() -> Iterator[TwoMachines]:
-    """Made, and removed."""
+def two_machines(cable: Cable | None = None) -> Iterator[TwoMachines]:
+    """Made, and removed; with a veth pair between them unless there is a ``cable``."""
     require_machines("ip", "iptables")
+    if cable is not None and not Path("/dev/net/tun").exists():
+        cannot_run("/dev/net/tun", "the kernel has no TAP devices here")
     with ExitStack() as stack:
         machines = {
             side: stack.enter_context(closing(Machine(side, is_apart=True))) for side in ADDRESSES
         }
-        yield TwoMachines(machines)
+        if cable is not None:
+            stack.enter_context(closing(cable))
+        yield TwoMachines(machines, cable)

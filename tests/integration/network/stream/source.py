@@ -19,7 +19,7 @@ def send(node):
     if sent == BREAKS_AT:
         raise ValueError("broken")
     if sent == COUNT:
-        node.shutdown("all sent")
+        node.shutdown("all sent", drain_s=float(os.environ.get("DRAIN_S", "5")))
     image = node.make_packet("image")
     image.header.stamp.sec, image.header.stamp.nanosec = divmod(time.monotonic_ns(), 10**9)
     image.header.frame_id = str(sent)

@@ -1,0 +1,67 @@
+"""Lossless connections lose nothing under load.
+
+``python -m tests.load`` sends a million packets in each run.
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from containers import require_containers
+
+from .running import BACKENDS, Load, count_problems, judge_latency, judge_memory, run
+from .shapes import LARGEST_BYTES, SHAPES, Shape
+
+_PACKETS = 3000
+
+
+# Stars of 17 containers take long to start.
+_LONG = {("1-to-16", "docker"), ("16-to-1", "docker")}
+_ROUND = [
+    pytest.param(*cell, marks=[pytest.mark.acceptance] if cell in _LONG else [])
+    for cell in itertools.product(SHAPES, BACKENDS)
+]
+
+
+@pytest.mark.parametrize(("shape", "backend"), _ROUND)
+def test_no_packet_is_lost_or_changed(shape: str, backend: str, tmp_path: Path) -> None:
+    if backend == "docker":
+        require_containers()
+    load = run(shape, backend, _PACKETS, tmp_path, largest=LARGEST_BYTES)
+    assert load.problems == []
+    assert load.lossless >= 0.99 * _PACKETS
+
+
+PAIR = Shape({"a": "source", "b": "sink"}, [("a", "b", 0, 1)])
+
+
+def found(limit: int, lost: int = 0, **of_b: int) -> list[str]:
+    """What is wrong where ``a`` has sent 5 packets and ``b`` notes this."""
+    noted = {"count": 5, "chain": 77, "skipped": 0, **of_b}
+    told: dict[str, Any] = {"a": {"sent": {"chain": 77}}, "b": {"sources": {"a": noted}}}
+    shape = Shape(PAIR.plugins, [("a", "b", limit, 1)])
+    return list(count_problems(shape, 5, told, [{"connection": "a.o -> b.x", "lost": lost}]))
+
+
+def test_what_is_lost_or_changed_is_noticed() -> None:
+    assert found(0) == []
+    assert "4 of 5 packets" in found(0, count=4)[0]
+    assert "hashes" in found(0, chain=78)[0]
+    assert "1 lost" in found(0, lost=1)[0]
+    assert found(3, skipped=3, count=2) == []
+    assert "4 lost in a row" in found(3, skipped=4)[0]
+
+
+def test_what_grows_is_noticed() -> None:
+    flat, slower, larger = Load("ring", "process"), Load("ring", "process"), Load("ring", "process")
+    judge_latency(flat, [[1.0] * 500])
+    judge_latency(slower, [[1.0] * 250 + [5.0] * 250])
+    judge_memory(flat, [10_000_000] * 200)
+    judge_memory(larger, [10_000_000 + 200_000 * n for n in range(200)])
+    assert flat.problems == []
+    assert slower.problems == ["latency grew from 1.00 to 5.00 ms"]
+    assert larger.problems[0].startswith("memory grew from ")
