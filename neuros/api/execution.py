@@ -30,9 +30,9 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
-from neuros.ports import Shown
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
+from neuros.viewers.registered import Shown
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)

@@ -1,12 +1,78 @@
-"""The registered viewers, and the choice of those that show a run."""
+"""What a viewer is, which are registered, and the choice of those that show a run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Reaper, Shown, View, Viewer
+from neuros.ports import BackEnd, Reaper
+from neuros.project.model import Project
 from neuros.registry import Registry
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The run that is shown.
+
+    Attributes:
+        environment: what the environment of its nodes has beside that of the launcher.
+        logs: by node.
+        names: the nodes of this run; the others of the project run elsewhere.
+    """
+
+    run_id: str
+    folder: Path
+    environment: Mapping[str, str]
+    logs: Mapping[str, Path]
+    project: Project
+    names: Sequence[str]
+    is_one_process: bool
+
+
+class View(Protocol):
+    """A viewer made ready for one run."""
+
+    def start(self, run: Shown, reaper: Reaper) -> str:
+        """Open it, once there is a control socket; returns what to tell the user, as its address.
+
+        Raises ``EnvironmentFault``.
+        """
+
+    def finish(self) -> None:
+        """Close it with the run, also where it was not started."""
+
+
+class Viewer(ABC):
+    """What shows runs, in a window or a page. An entry point of the group ``neuros.viewers``.
+
+    Attributes:
+        name: in ``--viewer``; that of the entry point.
+        place: where it shows something, as in "in *the dashboard*".
+        ranks: what it shows: the ``graph`` of a run (``--node-graph``), what its ``packets`` say
+            (``--visualisations``). The viewer with the highest number that can be used is taken.
+    """
+
+    name: str
+    place: str
+    ranks: Mapping[str, int] = {}
+
+    @abstractmethod
+    def prepare(self, back_end: BackEnd, subject: str | None, port: int | None) -> View:
+        """Find what it needs to show a run of this back end.
+
+        Args:
+            subject: what it was chosen to show; ``None`` where it was asked for by its name.
+            port: the user's wish, for a viewer that serves a page.
+
+        Raises:
+            EnvironmentFault: if it cannot be used here, in a few words.
+            UsageError: if it cannot have the port.
+        """
+
 
 VIEWERS: Registry[Viewer] = Registry("neuros.viewers", "viewer", Viewer)
 

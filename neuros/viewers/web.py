@@ -16,8 +16,9 @@ from urllib.parse import quote, urlsplit
 
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.ports import BackEnd, Reaper, Shown, Viewer
+from neuros.ports import BackEnd, Reaper
 from neuros.viewers.project_view import project_view
+from neuros.viewers.registered import Shown, Viewer
 from neuros.viewers.windows import open_page
 
 HOST = "127.0.0.1"

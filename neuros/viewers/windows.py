@@ -14,8 +14,9 @@ from typing import Any
 from neuros.backends.docker.tool import ToolContainer, find_tool_image
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Reaper, Shown, Viewer
+from neuros.ports import BackEnd, Reaper
 from neuros.project.model import Project
+from neuros.viewers.registered import Shown, Viewer
 
 RVIZ_FILE = "project.rviz"
 _END_S = 2.0

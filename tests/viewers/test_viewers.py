@@ -10,10 +10,10 @@ import pytest
 
 from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Reaper, Shown, Viewer
+from neuros.ports import BackEnd, Reaper
 from neuros.project.load import load_project
 from neuros.viewers import registered
-from neuros.viewers.registered import Views
+from neuros.viewers.registered import Shown, Viewer, Views
 
 PROCESS = BACK_ENDS.load("process")
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neuros.ports import BackEnd, Reaper, Shown, Viewer
+from neuros.ports import BackEnd, Reaper
+from neuros.viewers.registered import Shown, Viewer
 
 
 class Note:
