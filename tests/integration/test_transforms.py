@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 from launching import BACKENDS, launch
+from needs import COMPILER
 
 from neuros.backends.domain import choose_domain
 
 PROJECT = Path(__file__).parent / "transforms"
 
 
+@pytest.mark.needs(*COMPILER)
 @pytest.mark.parametrize("back_end", BACKENDS)
 def test_a_listener_chains_what_a_broadcaster_has_sent(tmp_path: Path, back_end: str) -> None:
     with choose_domain(None, {}, False) as domain:

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from launching import BACKENDS, Finished, launch
 from message_packages import write_package
 from message_values import is_empty, parts, right_messages, wrong_messages
+from needs import COMPILER
 from rclpy.serialization import deserialize_message, serialize_message
 
 import neuros.bag
@@ -183,6 +184,7 @@ def odd_messages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Any]
         yield [message_class(f"value_msgs/msg/{name}") for name in ("Everything", "Odd", "Nothing")]
 
 
+@pytest.mark.needs(*COMPILER)
 def test_fields_of_every_kind_arrive_alike_or_are_refused(odd_messages: list[Any]) -> None:
     for kind, each in itertools.product(odd_messages, (_arrives_alike, _is_refused)):
         each(kind)
