@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +9,13 @@ from typing import Any
 
 from neuros.analysis.packets import FOLDER, read_packets
 from neuros.analysis.run_record import PastRun, open_run
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
 from neuros.recording.bag_reader import Bag, open_bag
 from neuros.recording.recording_plan import RecordingPlan, load_plan
+from neuros.recording.run_file import read_object
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 
@@ -26,6 +26,7 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
     Raises:
         UsageError: if the run or the node does not exist, or was not recorded so that the node
             can be replayed.
+        EnvironmentFault: if a file of the run is damaged.
     """
     run = open_run(run_folder)
     if name not in run.record["nodes"]:
@@ -39,9 +40,9 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         )
     file = run_folder / name / "node.json"
     try:
-        return run, node_file_from_json(json.loads(file.read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"replay: {file} cannot be read ({error})") from error
+        return run, node_file_from_json(read_object(file))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise EnvironmentFault(f"replay: {file} cannot be read ({error})") from error
 
 
 class RecordedNode:

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Collection, Iterator
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element, display_name, place_of
 from neuros.project.suggest import did_you_mean, listed
 
+MOST_PROBLEMS = 1000
+"""Of one kind that are looked for: nobody reads more, and to find a million takes long."""
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
 
 _KINDS = {
@@ -71,8 +74,9 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
 
 
 def _violations_of(element: Element, name: str) -> list[Problem]:
-    found = _validator(name).iter_errors(element.plain)
-    return [problem for error in found for problem in _sentences(error, element)]
+    errors = _validator(name).iter_errors(element.plain)
+    found = (problem for error in errors for problem in _sentences(error, element))
+    return [*islice(found, MOST_PROBLEMS)]
 
 
 @cache
@@ -88,11 +92,19 @@ def _validator(name: str) -> Any:
         if isinstance(instance, str) and not re.search(end_exactly, instance):
             yield ValidationError(f"does not match {expected}")
 
+    def unique(validator: Any, wanted: bool, instance: Any, of: Any) -> Iterator[ValidationError]:
+        # It takes the square of their number, and there may be millions.
+        if not isinstance(instance, list) or len(instance) <= of["maxItems"]:
+            yield from Draft202012Validator.VALIDATORS["uniqueItems"](
+                validator, wanted, instance, of
+            )
+
     schemas = {key: schema(key) for key in ("project", "node")}
     registry = Registry().with_resources(
         (content["$id"], Resource.from_contents(content)) for content in schemas.values()
     )
-    return extend(Draft202012Validator, {"pattern": pattern})(schemas[name], registry=registry)
+    own = {"pattern": pattern, "uniqueItems": unique}
+    return extend(Draft202012Validator, own)(schemas[name], registry=registry)
 
 
 def _sentences(error: Any, root: Element) -> Iterator[Problem]:
@@ -138,6 +150,8 @@ def _sentence(error: Any) -> tuple[str, str]:
         "exclusiveMinimum": f"must be more than {expected}, but is {found}",
         "minLength": "must not be empty",
         "minItems": "must not be empty",
+        "maximum": f"must be at most {expected}, but is {found}",
+        "maxItems": f"has more than {expected} items",
         "maxLength": f"is longer than {expected} characters",
         "uniqueItems": "contains the same item twice",
     }

@@ -254,7 +254,7 @@ def _recorded(run: Path) -> dict[str, int]:
     try:
         topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (UsageError, ValueError, KeyError, TypeError, AttributeError):
+    except (UsageError, EnvironmentFault, KeyError):
         return {}
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, ProtocolError
 
 # CDR: two bytes for the encoding (1: little-endian), two unused ones, and the number
 # (OMG DDSI-RTPS 2.5, 10.2).
@@ -60,7 +60,14 @@ def encode_position(position: int) -> bytes:
 
 
 def decode_position(data: bytes) -> int:
-    """The number in a ``std_msgs/msg/UInt64``, from a sender of either byte order."""
-    kind = _POSITION if data[1] else _BIG_ENDIAN_POSITION
-    position: int = kind.unpack(data)[1]
+    """The number in a ``std_msgs/msg/UInt64``, from a sender of either byte order.
+
+    Raises:
+        ProtocolError: if it is none.
+    """
+    try:
+        kind = _POSITION if data[1] else _BIG_ENDIAN_POSITION
+        position: int = kind.unpack(data)[1]
+    except (IndexError, struct.error) as error:
+        raise ProtocolError(f"{len(data)} bytes are no acknowledgement") from error
     return position

@@ -25,7 +25,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import urlencode, urlsplit
+from urllib.parse import SplitResult, urlencode, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -68,7 +68,10 @@ _REQUESTS: Mapping[str, Message] = {
     "resume": Resume(),
     "stop": End("ended from the dashboard"),
 }
-_NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
+_NOT_UNDERSTOOD = (
+    *(ValueError, LookupError, TypeError, AttributeError, OverflowError),
+    RecursionError,
+)
 
 
 class LogSource(Protocol):
@@ -215,6 +218,14 @@ class Dashboard:
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "[::1]", "::1"}
 
 
+def _split(address: str) -> SplitResult:
+    """The parts of an address; of what is none, empty ones."""
+    try:
+        return urlsplit(address)
+    except ValueError:  # "//[" has half a pair of brackets
+        return urlsplit("")
+
+
 class Access:
     """ASGI middleware that lets only the user's own browser through: it has the printed token.
 
@@ -242,9 +253,9 @@ class Access:
 
     def _refusal(self, request: Request) -> Response | None:
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
+        if _split(f"//{host}").hostname not in _LOCAL_NAMES:
             return PlainTextResponse("this dashboard answers to localhost only", 403)
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and _split(origin).netloc != host:
             return PlainTextResponse("another page may not speak for this one", 403)
         given = request.query_params.get("token") or request.cookies.get(self._cookie, "")
         if not secrets.compare_digest(given.encode(), self._token.encode()):
