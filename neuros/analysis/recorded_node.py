@@ -9,6 +9,7 @@ from typing import Any
 
 from neuros.analysis.packets import FOLDER, read_packets
 from neuros.analysis.run_record import PastRun, open_run
+from neuros.engine.event_log import is_understood
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
@@ -65,6 +66,8 @@ class RecordedNode:
         self.event_log: array[int] = array("q")
         data = _event_log_of(run.folder, self._name).read_bytes()
         self.event_log.frombytes(data[: len(data) // 8 * 8])
+        if not is_understood(self.event_log):
+            raise EnvironmentFault(f"{_event_log_of(run.folder, self._name)} is damaged")
         self._arrivals: dict[Connection | str, Sequence[bytes | None]] = {}
         self._check_inputs()
 

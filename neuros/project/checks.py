@@ -87,9 +87,10 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
         name = node.string("name")
         if name is None:
             continue
-        other, other_entry = first.setdefault(name.lower(), (node, entry))
-        if other is node:
+        if name.lower() not in first:
+            first[name.lower()] = node, entry
             continue
+        other, other_entry = first[name.lower()]
         if other.source.file == node.source.file and other.pointer == node.pointer:
             # One node file, used twice: both names have one place.
             yield entry.problem(f"the node name '{name}' occurs twice", _where(other_entry))
