@@ -30,8 +30,8 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         EnvironmentFault: if a file of the run is damaged.
     """
     run = open_run(run_folder)
-    if name not in run.record["nodes"]:
-        names = ", ".join(run.record["nodes"])
+    if name not in run.nodes:
+        names = ", ".join(run.nodes)
         raise UsageError(f"replay: {run_folder} has no node '{name}'; it has {names}")
     load_plan(run_folder)
     if not _event_log_of(run_folder, name).is_file():

@@ -305,9 +305,8 @@ def open_run(folder: Path) -> PastRun:
         EnvironmentFault: if it is damaged.
     """
     run = PastRun(folder, read_run_file(folder))
-    for key in ("connections", "nodes"):
-        if key not in run.record:
-            raise EnvironmentFault(f"{folder / RUN_FILE} is broken: it has no {key}")
+    if "connections" not in run.record:
+        raise EnvironmentFault(f"{folder / RUN_FILE} is broken: it has no connections")
     return run
 
 

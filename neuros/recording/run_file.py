@@ -65,12 +65,12 @@ def read_object(file: Path) -> dict[str, Any]:
     """The JSON object in a file of a run folder.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError, NotADirectoryError: if there is no such file.
         EnvironmentFault: if it cannot be read, or holds anything else.
     """
     try:
         found = json.loads(read_bytes(file))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise
     except OSError as error:
         raise EnvironmentFault(f"{file} cannot be read ({error.strerror or error})") from error

@@ -33,6 +33,8 @@ from neuros.control.link import ControlLink, decode, encode, kind_of
 from neuros.engine.replay import Script
 from neuros.errors import ControlError, NeurosError, ProtocolError
 from neuros.launcher.peers import RUNNING, PeerState, state_from
+from neuros.project.graph import graph_mermaid, graph_text
+from neuros.project.graph_svg import graph_svg
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
@@ -148,13 +150,12 @@ def as_bytes(value: Any) -> bytes:
 
 
 def check_project(folder: Path) -> None:
-    """``validate`` and ``graph``; a valid project can be split, and told to its nodes."""
-    code = command("validate", str(folder), codes=(0, 3))
-    for form in ("text", "mermaid", "svg"):
-        command("graph", str(folder), "--format", form, codes=(0, 3))
-    if code:
+    """``validate``, and what ``graph`` draws; a valid project can be split, and told to its nodes."""
+    if command("validate", str(folder), codes=(0, 3)):
         return
     project = load_project(folder / "project.json", workspace=folder).project
+    for draw in (graph_text, graph_mermaid, graph_svg):
+        assert draw(project).encode()
     for file in split(project, lambda _: Folders(folder, folder, folder)):
         text = json.dumps(node_file_to_json(file), allow_nan=False)
         assert node_file_from_json(json.loads(text)) == replace(
