@@ -112,7 +112,7 @@ class RecordedNode:
 
     def message(self, data: bytes, type_name: str) -> Any:
         """A message of a type that the bag has."""
-        return self._bag.store.deserialize_cdr(data, type_name)
+        return self._bag.message(data, type_name)
 
     # ------------------------------------------------------------------ inside
 

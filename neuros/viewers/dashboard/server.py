@@ -25,11 +25,10 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import SplitResult, urlencode, urlsplit
+from urllib.parse import SplitResult, quote, urlencode, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import URL
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import (
@@ -271,7 +270,7 @@ class Access:
         if "token" not in request.query_params:
             return None
         rest = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]
-        url = URL(request.url.path).replace(query=urlencode(rest))
-        answer = RedirectResponse(str(url), 303)
+        path, query = f"/{quote(request.scope['path'].lstrip('/'))}", urlencode(rest)
+        answer = RedirectResponse(f"{path}?{query}" if query else path, 303)
         answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
         return answer
