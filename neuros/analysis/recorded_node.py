@@ -14,6 +14,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
+from neuros.project.validate import node_file_mistake
 from neuros.recording.bag_reader import Bag, open_bag
 from neuros.recording.recording_plan import RecordingPlan, load_plan
 from neuros.recording.run_file import read_object
@@ -41,8 +42,11 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         )
     file = run_folder / name / "node.json"
     try:
-        return run, node_file_from_json(read_object(file))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        content = read_object(file)
+        if wrong := node_file_mistake(content):
+            raise EnvironmentFault(f"replay: {file} is damaged: {wrong}")
+        return run, node_file_from_json(content)
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise EnvironmentFault(f"replay: {file} cannot be read ({error})") from error
 
 

@@ -52,6 +52,12 @@ def schema(name: str) -> dict[str, Any]:
     return content
 
 
+def node_file_mistake(content: Any) -> str:
+    """What is wrong with the content of a ``node.json``, empty if nothing is."""
+    error = next(_validator("node", "#/$defs/node_file").iter_errors(content), None)
+    return "" if error is None else f"{error.json_path}: {_sentence(error)[0]}"
+
+
 def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tuple[Problem, ...]:
     """The NEST nodes, among those of ``names`` (``None``: all), that would have to share a process.
 
@@ -80,7 +86,7 @@ def _violations_of(element: Element, name: str) -> list[Problem]:
 
 
 @cache
-def _validator(name: str) -> Any:
+def _validator(name: str, part: str = "") -> Any:
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
     from jsonschema.validators import extend
@@ -104,7 +110,8 @@ def _validator(name: str) -> Any:
         (content["$id"], Resource.from_contents(content)) for content in schemas.values()
     )
     own = {"pattern": pattern, "uniqueItems": unique}
-    return extend(Draft202012Validator, own)(schemas[name], registry=registry)
+    form = {"$ref": schemas[name]["$id"] + part}
+    return extend(Draft202012Validator, own)(form, registry=registry)
 
 
 def _sentences(error: Any, root: Element) -> Iterator[Problem]:

@@ -86,6 +86,7 @@ def change_json(data: bytes, chance: random.Random) -> bytes:
     """Replace, leave out, repeat or rename values in JSON; what is none is changed as bytes."""
     try:
         root = [json.loads(data)]
+        _text(root[0])
     except (ValueError, RecursionError):
         return change_bytes(data, chance)
     for _ in range(chance.randint(1, 3)):
