@@ -214,7 +214,8 @@ def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[NeurosError]
     """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
     from neuros.analysis.run_record import open_for_review
 
-    runs, refused = [], []
+    runs: list[PastRun] = []
+    refused: list[NeurosError] = []
     for folder in folders:
         try:
             runs.append(open_for_review(folder))

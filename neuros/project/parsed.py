@@ -87,7 +87,7 @@ def parse_project(file: Path, roots: Roots) -> ParsedProject:
     read = cache(read_file)
     seen = 0
     for entry in root.items("nodes"):
-        waiting = [(entry, (file,))]
+        waiting: list[tuple[Element, _Chain]] = [(entry, (file,))]
         while waiting:
             # Files may import each other so often that nobody could count to the end.
             if (seen := seen + 1) > _MOST_NODES:
