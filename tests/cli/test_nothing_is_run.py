@@ -88,7 +88,8 @@ def test_nothing_of_a_project_is_run_to_look_at_it(project: Path, command: list[
 
 
 def test_only_import_runs_plugins(project: Path) -> None:
-    node = {"name": "a", "container": "neuros_python", "plugin": "plugin.py"}
+    node: dict[str, Any] = {"name": "a", "container": "neuros_python", "plugin": "plugin.py"}
+    node["outputs"] = [{"name": "x", "type": STRING}]
     (project / "project.json").write_text(json.dumps({"nodes": [node]}))
     neuros(project, "validate", "--import", ".")
     assert (project.parent / "was run").exists()
