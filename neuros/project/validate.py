@@ -20,8 +20,8 @@ from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element, display_name, place_of
 from neuros.project.suggest import did_you_mean, listed
 
-MOST_PROBLEMS = 1000
-"""Of one kind that are looked for: nobody reads more, and to find a million takes long."""
+MOST_PROBLEMS = 200
+"""Of one kind that are looked for: nobody reads more, and to find all takes minutes."""
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
 
 _KINDS = {

@@ -14,7 +14,7 @@ from neuros.errors import ProjectError
 from neuros.project.load import load_project
 
 NODE: dict[str, Any] = {"name": "a", "container": "neuros_python", "plugin": "p.py"}
-PROMPT_S = 10.0
+PROMPT_S = 60.0  # a hang lasts for ever
 
 
 def problems_of(folder: Path, content: Any = None, **override: str) -> str:
@@ -109,4 +109,4 @@ def test_thousands_of_mistakes_are_not_all_sought(tmp_path: Path) -> None:
     connections = [{**wrong, "destination_input": f"x{number}"} for number in range(10_000)]
     text = problems_of(tmp_path, {"nodes": nodes, "connections": connections})
     assert "there is no node 'nobody'" in text
-    assert len(text.splitlines()) < 5000
+    assert len(text.splitlines()) <= 400
