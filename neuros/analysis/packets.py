@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from xxhash import xxh3_128_hexdigest
 
 from neuros.project.model import Connection
+from neuros.project.scanner import read_bytes
 
+_MOST_HOOKS = 10_000
 FOLDER = "packets"
 PERCENTILES = (50, 90, 99)
 
@@ -35,6 +37,7 @@ class Packets:
         received: the digest of each that arrived, (received,).
         taken: of each that a hook started on, its place among those that arrived, from 1, (taken,).
         taken_ns: when that was, (taken,).
+        damaged: files of which the rest is left out, from an entry that no node has written.
     """
 
     sent_ns: Numbers
@@ -42,6 +45,7 @@ class Packets:
     received: Numbers
     taken: Numbers
     taken_ns: Numbers
+    damaged: tuple[Path, ...] = ()
 
     @property
     def consumed(self) -> Numbers:
@@ -93,6 +97,9 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
     sender = run_folder / connection.source_node / FOLDER
     receiver = run_folder / connection.destination_node / FOLDER
     taken = _numbers(receiver / f"{index}.taken", np.int64)
+    good = _up_to_first(taken < 1)
+    damaged = () if good == len(taken) else (receiver / f"{index}.taken",)
+    taken = taken[:good]
     taken_ns = _numbers(receiver / f"{index}.taken_ns", np.int64)
     both = min(len(taken), len(taken_ns))
     return Packets(
@@ -101,6 +108,7 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         received=_numbers(receiver / f"{index}.digests", np.uint64),
         taken=taken[:both],
         taken_ns=taken_ns[:both],
+        damaged=damaged,
     )
 
 
@@ -151,6 +159,7 @@ class Trace:
         which: of each execution, its hook's place in ``hooks``, (executions,).
         starts_ns, ends_ns: from when to when, (executions,).
         credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
+        damaged: files of which the rest is left out, from an entry that no node has written.
     """
 
     hooks: tuple[tuple[str, str], ...]
@@ -158,6 +167,7 @@ class Trace:
     starts_ns: Numbers
     ends_ns: Numbers
     credits: Numbers
+    damaged: tuple[Path, ...] = ()
 
     @property
     def is_running(self) -> Numbers:
@@ -170,22 +180,34 @@ class Trace:
 def read_trace(folder: Path) -> Trace:
     """Read the lists of a node; empty where there are none."""
     executions = _numbers(folder / "executions", np.int64, 3)
+    which, starts_ns, ends_ns = executions.T
+    good = _up_to_first(
+        (which < 0) | (which >= _MOST_HOOKS) | (starts_ns < 0) | (ends_ns < starts_ns)
+    )
+    damaged = () if good == len(executions) else (folder / "executions",)
+    executions = executions[:good]
     try:
-        hooks = json.loads((folder / "hooks.json").read_text("utf-8"))
+        hooks = json.loads(read_bytes(folder / "hooks.json"))
         names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         names = []
     # A node that was killed may have listed a hook's execution, and not its name.
     count = int(executions[:, 0].max()) + 1 if len(executions) else 0
     names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
     which, starts_ns, ends_ns = executions.T
-    return Trace(tuple(names), which, starts_ns, ends_ns, _numbers(folder / "credits", np.int64, 3))
+    arrivals = _numbers(folder / "credits", np.int64, 3)
+    return Trace(tuple(names), which, starts_ns, ends_ns, arrivals, damaged)
+
+
+def _up_to_first(wrong: Numbers) -> int:
+    """The number of rows in front of the first wrong one."""
+    return int(np.argmax(wrong)) if wrong.any() else len(wrong)
 
 
 def _numbers(file: Path, kind: Any, columns: int = 1) -> Numbers:
     """All complete rows; one number in each makes an array of one dimension."""
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
     except OSError:  # the node has sent, or received, nothing
         data = b""
     found = np.frombuffer(data[: len(data) // (8 * columns) * 8 * columns], dtype=kind)

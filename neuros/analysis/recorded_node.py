@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +9,15 @@ from typing import Any
 
 from neuros.analysis.packets import FOLDER, read_packets
 from neuros.analysis.run_record import PastRun, open_run
-from neuros.errors import UsageError
+from neuros.engine.event_log import is_understood
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
+from neuros.project.validate import node_file_mistake
 from neuros.recording.bag_reader import Bag, open_bag
 from neuros.recording.recording_plan import RecordingPlan, load_plan
+from neuros.recording.run_file import read_object
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 
@@ -26,10 +28,11 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
     Raises:
         UsageError: if the run or the node does not exist, or was not recorded so that the node
             can be replayed.
+        EnvironmentFault: if a file of the run is damaged.
     """
     run = open_run(run_folder)
-    if name not in run.record["nodes"]:
-        names = ", ".join(run.record["nodes"])
+    if name not in run.nodes:
+        names = ", ".join(run.nodes)
         raise UsageError(f"replay: {run_folder} has no node '{name}'; it has {names}")
     load_plan(run_folder)
     if not _event_log_of(run_folder, name).is_file():
@@ -39,9 +42,12 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         )
     file = run_folder / name / "node.json"
     try:
-        return run, node_file_from_json(json.loads(file.read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"replay: {file} cannot be read ({error})") from error
+        content = read_object(file)
+        if wrong := node_file_mistake(content):
+            raise EnvironmentFault(f"replay: {file} is damaged: {wrong}")
+        return run, node_file_from_json(content)
+    except (OSError, ValueError, TypeError, OverflowError) as error:
+        raise EnvironmentFault(f"replay: {file} cannot be read ({error})") from error
 
 
 class RecordedNode:
@@ -64,6 +70,8 @@ class RecordedNode:
         self.event_log: array[int] = array("q")
         data = _event_log_of(run.folder, self._name).read_bytes()
         self.event_log.frombytes(data[: len(data) // 8 * 8])
+        if not is_understood(self.event_log):
+            raise EnvironmentFault(f"{_event_log_of(run.folder, self._name)} is damaged")
         self._arrivals: dict[Connection | str, Sequence[bytes | None]] = {}
         self._check_inputs()
 
@@ -108,7 +116,7 @@ class RecordedNode:
 
     def message(self, data: bytes, type_name: str) -> Any:
         """A message of a type that the bag has."""
-        return self._bag.store.deserialize_cdr(data, type_name)
+        return self._bag.message(data, type_name)
 
     # ------------------------------------------------------------------ inside
 

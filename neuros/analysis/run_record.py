@@ -6,7 +6,6 @@ run that was cut off or of an older version, too, and says what is missing.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 from neuros.backends.registered import ran_in_one_process
 from neuros.control import Report
 from neuros.engine.time_budget import TimeBudget, time_budget_of
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Connection, NodeFile, Project
 from neuros.project.split import project_to_json
-from neuros.recording.run_file import FORMAT, RUN_FILE, read_run_file
+from neuros.recording.run_file import FORMAT, RUN_FILE, check_record, read_object, read_run_file
 
 if TYPE_CHECKING:
     from neuros.analysis.packets import Numbers, Packets, Trace
@@ -187,10 +186,9 @@ def _node(name: str, ended: Ended) -> dict[str, Any]:
 def _results(node_folder: Path) -> dict[str, Any]:
     """The results that the node's plugin has saved."""
     try:
-        results = json.loads((node_folder / "results.json").read_text("utf-8"))
-    except (OSError, ValueError):
+        return read_object(node_folder / "results.json")
+    except (FileNotFoundError, EnvironmentFault):
         return {}
-    return results if isinstance(results, dict) else {}
 
 
 def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
@@ -288,10 +286,14 @@ class PastRun:
     @cached_property
     def traces(self) -> dict[str, Trace]:
         """The first executions of every node that has listed them."""
+        found = {name: self.trace(name) for name in self.nodes}
+        return {name: trace for name, trace in found.items() if len(trace.starts_ns)}
+
+    def trace(self, node: str) -> Trace:
+        """The first executions of a node, as far as it has listed them."""
         from neuros.analysis.packets import FOLDER, read_trace
 
-        found = {name: read_trace(self.folder / name / FOLDER) for name in self.nodes}
-        return {name: trace for name, trace in found.items() if len(trace.starts_ns)}
+        return read_trace(self.folder / node / FOLDER)
 
 
 def _connection_of(figures: Mapping[str, Any]) -> Connection:
@@ -307,14 +309,11 @@ def open_run(folder: Path) -> PastRun:
 
     Raises:
         UsageError: if it is none, the run has not ended, or another version of NeuROS wrote it.
+        EnvironmentFault: if it is damaged.
     """
     run = PastRun(folder, read_run_file(folder))
-    try:
-        _ = run.record["connections"], run.ends
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UsageError(
-            f"{folder / RUN_FILE} is broken (its connections cannot be read: {error!r})"
-        ) from error
+    if "connections" not in run.record:
+        raise EnvironmentFault(f"{folder / RUN_FILE} is broken: it has no connections")
     return run
 
 
@@ -323,20 +322,14 @@ def open_for_review(folder: Path) -> PastRun:
 
     Raises:
         UsageError: if no run has left it behind, the run goes on, or another version wrote it.
+        EnvironmentFault: if it is damaged.
     """
-    try:
-        record, missing = _read_record(folder)
-        run = PastRun(folder, record)
-        missing += _missing_lists(run)
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        raise UsageError(f"{folder / 'run.json'} is broken: it does not describe a run") from error
-    return replace(run, missing=tuple(missing))
-
-
-def _read_record(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    if not (folder / RUN_FILE).exists():
-        return _from_project(folder)
-    return read_run_file(folder), []
+    if (folder / RUN_FILE).exists():
+        record, missing = read_run_file(folder), list[str]()
+    else:
+        record, missing = _from_project(folder)
+    run = PastRun(folder, record)
+    return replace(run, missing=(*missing, *_missing_lists(run)))
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
@@ -345,24 +338,22 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
     if not (folder / "project.json").is_file():
         raise UsageError(f"{folder} has no run.json: it is no folder that a run has left behind")
-    project = _json_object(folder / "project.json")
-    connections = []
-    for index, each in enumerate(project.get("connections", ())):
-        name = (
-            f"{each['source_node']}.{each['source_output']} ->"
-            f" {each['destination_node']}.{each['destination_input']}"
-        )
-        figures = {
-            "connection": name,
-            "index": index,
-            "discard_limit": each.get("discard_limit"),
-            "queue_size": each.get("queue_size", 1),
-        }
-        packets = read_packets(folder, _connection_of(figures))
-        sent, received = len(packets.sent_ns), len(packets.received)
-        figures |= {"sent": sent, "received": received, "consumed": len({*packets.taken.tolist()})}
-        connections.append(figures | packet_figures(packets, may_lose=may_have_lost(figures)))
-    nodes = {node["name"]: {"report": None} for node in project.get("nodes", ())}
+    project = read_object(folder / "project.json")
+    try:
+        connections = [
+            {
+                "connection": "{source_node}.{source_output} -> {destination_node}"
+                ".{destination_input}".format_map(each),
+                "index": index,
+                "discard_limit": each.get("discard_limit"),
+                "queue_size": each.get("queue_size", 1),
+            }
+            for index, each in enumerate(project.get("connections", ()))
+        ]
+        nodes = {str(node["name"]): {"report": None} for node in project.get("nodes", ())}
+    except (AttributeError, KeyError, TypeError) as error:
+        text = f"{folder / 'project.json'} is broken: it is no project"
+        raise EnvironmentFault(text) from error
     record = {
         "project": folder.parent.name if folder.parent.parent.name == "runs" else folder.name,
         "reason": "the run goes on, or its launcher was killed",
@@ -370,6 +361,12 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
         "nodes": nodes,
         "expanded_project": project,
     }
+    check_record(record, folder / "project.json")
+    for figures in connections:
+        packets = read_packets(folder, _connection_of(figures))
+        sent, received = len(packets.sent_ns), len(packets.received)
+        figures |= {"sent": sent, "received": received, "consumed": len({*packets.taken.tolist()})}
+        figures |= packet_figures(packets, may_lose=may_have_lost(figures))
     return record, [
         "run.json: the run goes on, or its launcher was killed. Packets are counted from the"
         " nodes' lists (up to a second before the end); how nodes spent their time, losses and"
@@ -390,18 +387,7 @@ def _missing_lists(run: PastRun) -> list[str]:
         missing.append("times of single packets: no node has listed any")
     if not run.traces and run.nodes:
         missing.append("the first executions of hooks: no node has listed any")
+    damaged = [file for packets in run.packets.values() for file in packets.damaged]
+    damaged += [file for name in run.nodes for file in run.trace(name).damaged]
+    missing += [f"the rest of {file}: the file is damaged" for file in damaged]
     return missing
-
-
-def _json_object(file: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(file.read_text("utf-8"))
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise UsageError(f"{file} is broken ({error}): was the disk full?") from error
-    if not isinstance(found, dict):
-        raise UsageError(f"{file} is broken: it holds no object")
-    return found

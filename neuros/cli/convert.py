@@ -88,16 +88,16 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
         raise EnvironmentFault(text) from error
     named = Path(options.file)
-    if not named.exists():
+    if not os.path.exists(named):
         raise UsageError(f"{named}: there is no such file")
     try:
         source = model_file(named)
     except NotFound as error:
         raise UsageError(str(error)) from None
     output = Path(options.output) if options.output else source.with_suffix(".xml")
-    if output.is_dir():
-        raise UsageError(f"{output}: is a folder; name the file to write")
-    if output.exists() and not options.force and not is_ours(output):
+    if os.path.exists(output) and not output.is_file():
+        raise UsageError(f"{output}: is no file; name the file to write")
+    if os.path.exists(output) and not options.force and not is_ours(output):
         raise UsageError(f"{output}: exists and is not from this command: name another, or --force")
     folders = [Path(folder) for folder in options.include]
     for folder in folders:

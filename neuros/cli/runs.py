@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.sessions import Session, sessions
 from neuros.backends.shared_memory import remove_dead_runs
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault, NeurosError, UsageError
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
@@ -210,15 +210,16 @@ def _compare(options: argparse.Namespace) -> int:
     return EXIT_LEFT_OUT if refused else 0
 
 
-def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[UsageError]]:
+def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[NeurosError]]:
     """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
     from neuros.analysis.run_record import open_for_review
 
-    runs, refused = [], []
+    runs: list[PastRun] = []
+    refused: list[NeurosError] = []
     for folder in folders:
         try:
             runs.append(open_for_review(folder))
-        except UsageError as error:
+        except (UsageError, EnvironmentFault) as error:
             refused.append(error)
     if not runs:
         raise UsageError("\n".join(map(str, refused)))

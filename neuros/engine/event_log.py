@@ -202,6 +202,12 @@ def is_whole(event_log: Iterable[int]) -> bool:
     return _entry(EventKind.STOP) in event_log
 
 
+def is_understood(event_log: Iterable[int]) -> bool:
+    """Whether every entry is of a kind that there is."""
+    kinds = {~number & _mask(_KIND_BITS) for number in event_log if number < 0}
+    return kinds <= {*map(int, EventKind)}
+
+
 def _entry(kind: EventKind, place: int = 0, position: int = 0) -> int:
     return ~(kind | place << _KIND_BITS | position << _POSITION_SHIFT)
 

@@ -206,8 +206,13 @@ class StallDetector:
         return hook is not None and (name, hook["name"], hook["executions"]) in self._named_hooks
 
     def _waiting(self) -> list[str]:
-        """Connections whose other end has not been found yet."""
-        return sorted({key for report in self._reports.values() for key in report.waiting_for})
+        """Connections whose other end has not been found yet; what carries packets has been."""
+        reports = [*self._reports.values()]
+        waiting = {key for report in reports for key in report.waiting_for}
+        for metrics in (report.metrics for report in reports if report.metrics):
+            waiting -= {key for key, counts in metrics["incoming"].items() if counts["received"]}
+            waiting -= {key for key, sent in metrics["outgoing"].items() if sent["acknowledged"]}
+        return sorted(waiting)
 
     def _executing(self, name: str) -> ExecutingHook | None:
         metrics = self._reports[name].metrics

@@ -47,6 +47,15 @@ _C = re.compile(
     "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
     "union|unsigned|void|volatile|while"
 )
+_CPP = re.compile(
+    "alignas|alignof|and_eq|asm|bitand|bitor|bool|catch|char(8|16|32)_t|compl|const_cast|constexpr|"
+    "decltype|delete|dynamic_cast|explicit|export|false|friend|mutable|namespace|new|noexcept|"
+    "not_eq|nullptr|operator|or_eq|private|protected|public|reinterpret_cast|static_assert|"
+    "static_cast|template|this|thread_local|throw|true|typeid|typename|using|virtual|wchar_t|xor|"
+    "xor_eq"
+)
+# Of the compiler, with GNU's extensions, and of headers that the generated code includes.
+_MACROS = re.compile("linux|unix|i386|complex|errno|st_[acm]time|s[ai]_[a-z_]+")
 
 
 def check(packages: Sequence[Package], workspaces: Workspaces) -> list[Problem]:
@@ -234,9 +243,14 @@ def _type(package: str, text: str) -> Type:
 
 
 def _check_words(name: str, column: int) -> None:
-    language = "Python" if keyword.iskeyword(name) else "C" if _C.fullmatch(name) else None
-    if language:
-        raise _Wrong(f"the name '{name}'", f"one that is no keyword of {language}", column)
+    for language, is_taken in (
+        ("keyword of Python", keyword.iskeyword(name)),
+        ("keyword of C", _C.fullmatch(name)),
+        ("keyword of C++", _CPP.fullmatch(name)),
+        ("macro of C", _MACROS.fullmatch(name)),
+    ):
+        if is_taken:
+            raise _Wrong(f"the name '{name}'", f"one that is no {language}", column)
 
 
 def _parts(lines: list[str]) -> Iterator[dict[int, str]]:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from neuros.errors import Problem
 from neuros.project.message_types import normalised
@@ -20,6 +22,7 @@ from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
 from neuros.project.plugin_files import DeclaredHook, PluginFile, Remark, read_plugin
 from neuros.project.scanner import Element, display_name
 from neuros.project.suggest import did_you_mean
+from neuros.project.validate import MOST_PROBLEMS
 
 Side = Literal["inputs", "outputs"]
 _SIDES: tuple[Side, ...] = ("inputs", "outputs")
@@ -51,17 +54,18 @@ _KNOWN_PREFIXES = (
 
 def mistakes(parsed: ParsedProject) -> list[Problem]:
     """Everything that does not fit together."""
-    return [
-        *_duplicate_nodes(parsed),
-        *_duplicate_ports(parsed),
-        *_duplicate_connections(parsed),
-        *_connection_ends(parsed),
-        *_budget_mistakes(parsed),
-        *_qos_of_connections(parsed),
-        *_rules_without_sense(parsed),
-        *_long_names(parsed),
-        *_parameter_mistakes(parsed),
-    ]
+    checks = (
+        _duplicate_nodes,
+        _duplicate_ports,
+        _duplicate_connections,
+        _connection_ends,
+        _budget_mistakes,
+        _qos_of_connections,
+        _rules_without_sense,
+        _long_names,
+        _parameter_mistakes,
+    )
+    return [problem for check in checks for problem in islice(check(parsed), MOST_PROBLEMS)]
 
 
 def remarks(parsed: ParsedProject) -> list[Problem]:
@@ -83,9 +87,10 @@ def _duplicate_nodes(parsed: ParsedProject) -> Iterator[Problem]:
         name = node.string("name")
         if name is None:
             continue
-        other, other_entry = first.setdefault(name.lower(), (node, entry))
-        if other is node:
+        if name.lower() not in first:
+            first[name.lower()] = node, entry
             continue
+        other, other_entry = first[name.lower()]
         if other.source.file == node.source.file and other.pointer == node.pointer:
             # One node file, used twice: both names have one place.
             yield entry.problem(f"the node name '{name}' occurs twice", _where(other_entry))
@@ -120,6 +125,12 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
     nodes: dict[str, list[Element]] = {}
     for node in parsed.nodes:
         nodes.setdefault(node.string("name") or "", []).append(node)
+
+    @cache
+    def ports(name: str, side: str) -> dict[str | None, Element]:
+        every = [each for node in nodes[name] for each in node.items(side)]
+        return {each.string("name"): each for each in reversed(every)}
+
     all_known = parsed.is_complete and all(node.string("name") for node in parsed.nodes)
     for connection in parsed.connections:
         found: list[Element] = []
@@ -135,7 +146,7 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
                     hint = did_you_mean(name, nodes)
                     yield connection.value[node_key].problem(f"there is no node '{name}'", hint)
                 continue
-            end = _port(nodes[name], name, port, side) if port else None
+            end = _port(nodes[name], ports, name, port, side) if port else None
             if isinstance(end, Element):
                 found.append(end)
                 if end.member("external_topic") is not None:
@@ -149,20 +160,22 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
         yield from _different_types(connection, found)
 
 
+_Ports: TypeAlias = "Callable[[str, str], Mapping[str | None, Element]]"
+
+
 def _port(
-    nodes: Sequence[Element], node: str, port: str, side: str
+    nodes: Sequence[Element], ports: _Ports, node: str, port: str, side: str
 ) -> Element | tuple[str, str] | None:
     """The port of the nodes of one name, or what is wrong with it; ``None`` if that is unknown."""
-    ports = [each for node_ in nodes for each in node_.items(side)]
-    names = [each.string("name") for each in ports]
+    names = ports(node, side)
     if port in names:
-        return ports[names.index(port)]
+        return names[port]
     members = [member for node_ in nodes if (member := node_.member(side))]
     if None in names or not all(isinstance(member.value, list) for member in members):
         return None
     other = "outputs" if side == "inputs" else "inputs"
     hint = did_you_mean(port, filter(None, names))
-    if any(each.string("name") == port for node_ in nodes for each in node_.items(other)):
+    if port in ports(node, other):
         hint = f"it has an {other[:-1]} of that name"
     return f"node '{node}' has no {side[:-1]} '{port}'", hint
 
@@ -199,8 +212,9 @@ def _budget_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
         return
     names = [_connection_name(connection) for connection in parsed.connections]
     known = [name for name in names if name is not None]
+    known_names = {*known}
     for name, member in limits.value.items():
-        if name not in known and len(known) == len(names):
+        if name not in known_names and len(known) == len(names):
             hint = did_you_mean(name, known) or "write 'a.out -> b.in', as `neuros launch` does"
             yield member.key_problem(f"there is no connection '{name}'", hint)
 

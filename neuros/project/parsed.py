@@ -14,9 +14,11 @@ other lists an index.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import TypeAlias
 
 from neuros.errors import Problem
 from neuros.project.names import Names, names_from
@@ -27,6 +29,7 @@ from neuros.project.scanner import (
     SourceError,
     display_name,
     escape,
+    half_character,
     parse,
     read_file,
 )
@@ -34,6 +37,8 @@ from neuros.project.suggest import did_you_mean
 
 ENDS = ("source_node", "source_output", "destination_node", "destination_input")
 """The keys of a connection that name its ends."""
+_MOST_NODES = 10_000
+_LONGEST_CHAIN = 50
 _FORMS = {
     "nodes": "nodes.NAME.KEY=VALUE",
     "connections": "connections.SRC.OUT.DST.IN.KEY=VALUE",
@@ -79,21 +84,34 @@ def parse_project(file: Path, roots: Roots) -> ParsedProject:
     nodes = root.member("nodes")
     is_list = nodes is not None and isinstance(nodes.value, list)
     parsed = ParsedProject(root, roots, is_complete=is_list, problems=duplicates)
+    read = cache(read_file)
+    seen = 0
     for entry in root.items("nodes"):
-        _expand(parsed, entry, (file,))
+        waiting: list[tuple[Element, _Chain]] = [(entry, (file,))]
+        while waiting:
+            # Files may import each other so often that nobody could count to the end.
+            if (seen := seen + 1) > _MOST_NODES:
+                text = f"the project has more than {_MOST_NODES} nodes and node files"
+                raise SourceError(entry.problem(text, "do files import each other many times?"))
+            waiting += _expand(parsed, *waiting.pop(), read)[::-1]
         parsed.entries += [entry] * (len(parsed.nodes) - len(parsed.entries))
     return parsed
 
 
-def _expand(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> None:
-    """Add the node, or nodes, of an entry; ``chain`` is the files that lead to it."""
+_Chain: TypeAlias = "tuple[Path, ...]"
+_Read: TypeAlias = "Callable[[Path], tuple[Element, list[Problem]]]"
+
+
+def _expand(
+    parsed: ParsedProject, entry: Element, chain: _Chain, read: _Read
+) -> list[tuple[Element, _Chain]]:
+    """Add the node of an entry, or return what else it holds; ``chain``: files that lead to it."""
     if isinstance(entry.value, dict):
         parsed.nodes.append(entry)
     elif isinstance(entry.value, list) and len(chain) > 1:
-        for item in entry.value:
-            _expand(parsed, item, chain)
+        return [(item, chain) for item in entry.value]
     elif isinstance(entry.value, str) and entry.value:
-        _import(parsed, entry, chain)
+        return _import(parsed, entry, chain, read)
     else:
         parsed.is_complete = False
         if len(chain) > 1:
@@ -102,15 +120,20 @@ def _expand(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> N
                     "a node file holds a node, the path of another node file, or a list of both"
                 )
             )
+    return []
 
 
-def _import(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> None:
+def _import(
+    parsed: ParsedProject, entry: Element, chain: _Chain, read: _Read
+) -> list[tuple[Element, _Chain]]:
     try:
         file = parsed.roots.find(entry.value, entry.source.folder)
         if file in chain:
             loop = " -> ".join(display_name(link) for link in (*chain[chain.index(file) :], file))
             raise PathError(f"node files import each other in a circle: {loop}")
-        element, duplicates = read_file(file)
+        if len(chain) > _LONGEST_CHAIN:
+            raise PathError(f"more than {_LONGEST_CHAIN} node files import one another in a row")
+        element, duplicates = read(file)
     except PathError as error:
         parsed.problems.append(entry.problem(error.text, error.hint))
         parsed.is_complete = False
@@ -119,7 +142,8 @@ def _import(parsed: ParsedProject, entry: Element, chain: tuple[Path, ...]) -> N
         parsed.is_complete = False
     else:
         parsed.problems.extend(duplicates)
-        _expand(parsed, element, (*chain, file))
+        return [(element, (*chain, file))]
+    return []
 
 
 def names_of(parsed: ParsedProject) -> Names:
@@ -143,6 +167,8 @@ def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
     source = Source(f"--set {text}", parsed.roots.project, text)
     target, equals, value = text.partition("=")
     kind, *steps = target.split(".")
+    if half := half_character(text):
+        return [source.problem(0, "", half, "arguments are UTF-8")]
     if kind not in _FORMS:
         hint = did_you_mean(kind, _FORMS)
         text = "must begin with 'nodes.', 'connections.' or 'budgets.'"

@@ -19,8 +19,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
+from neuros.project.scanner import read_bytes
 from neuros.project.suggest import did_you_mean
 
+_MOST_BYTES = 4 << 20
 _HOOKS = "neuros.hooks"
 _ARGUMENTS = {
     "neuros_initialise": ("inputs", "outputs"),
@@ -118,21 +120,22 @@ _PARSING = threading.Lock()
 
 @lru_cache(maxsize=256)
 def _read(path: Path, *_: int) -> PluginFile:
-    plugin, source = PluginFile(path), path.read_bytes()
+    plugin, source = PluginFile(path), read_bytes(path, _MOST_BYTES)
     try:
-        with _PARSING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of syntax: Python shows them when the plugin runs
-            tree = ast.parse(source, str(path))
-            compile(tree, str(path), "exec", dont_inherit=True)
-    except SyntaxError as error:
-        remark = Remark(error.lineno or 1, error.offset or 1, f"syntax error: {error.msg}")
-        (plugin.doubts if _may_be_newer(error, source) else plugin.mistakes).append(remark)
-    except ValueError as error:  # a NUL character, up to Python 3.11
-        plugin.mistakes.append(Remark(1, 1, f"syntax error: {error}"))
-    except RecursionError:
+        try:
+            with _PARSING, warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of syntax: Python shows them when it runs
+                tree = ast.parse(source, str(path))
+                compile(tree, str(path), "exec", dont_inherit=True)
+        except SyntaxError as error:
+            remark = Remark(error.lineno or 1, error.offset or 1, f"syntax error: {error.msg}")
+            (plugin.doubts if _may_be_newer(error, source) else plugin.mistakes).append(remark)
+        except ValueError as error:  # a NUL character, up to Python 3.11
+            plugin.mistakes.append(Remark(1, 1, f"syntax error: {error}"))
+        else:
+            _Reader(plugin, tree).read()
+    except (RecursionError, MemoryError):  # so deeply nested that Python gives up, in either way
         pass
-    else:
-        _Reader(plugin, tree).read()
     return plugin
 
 

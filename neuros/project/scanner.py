@@ -10,8 +10,10 @@ decoder.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+import stat
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -22,7 +24,9 @@ from typing import Any, NoReturn
 from neuros.errors import Problem
 
 _MAX_DEPTH = 100
+_MOST_BYTES = 4 << 20
 _SPACE = re.compile(r"[ \t\n\r]*")
+_HALF_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -143,11 +147,33 @@ def display_name(path: Path) -> str:
         return str(path)
 
 
+def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
+    """The content of a file that somebody else has written, and who may not make us wait.
+
+    Raises:
+        OSError: if it cannot be read, has more than ``most_bytes``, or is a pipe or device, which
+            may have no end.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError("it is no ordinary file")
+        if most_bytes is not None and status.st_size > most_bytes:
+            raise OSError(f"it has more than {most_bytes >> 20} MiB")
+        return file.read()
+
+
+def half_character(text: str) -> str:
+    r"""What is wrong with a text that cannot be written as UTF-8 for a lone ``'\ud800'``, or ""."""
+    found = _HALF_CHARACTER.search(text)
+    return f"there is half a character, \\u{ord(found[0]):04x}" if found else ""
+
+
 def read_file(path: Path) -> tuple[Element, list[Problem]]:
     """Read a JSON file; the problems are its duplicate keys. Raises :class:`SourceError`."""
     name = display_name(path)
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = read_bytes(path, _MOST_BYTES).decode("utf-8")
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise SourceError(Problem(name, 1, 1, "/", f"cannot be read: {reason}")) from error
@@ -206,6 +232,10 @@ class _Scanner:
             return self._fail_value(start, error, pointer)
         except ValueError as error:  # NaN and the like, or an integer of thousands of digits
             self._fail(start, pointer, str(error))
+        if isinstance(value, str) and (half := half_character(value)):
+            self._fail(start, pointer, half, "a character beyond \\uffff takes two escapes")
+        if isinstance(value, float) and math.isinf(value):
+            self._fail(start, pointer, "the number is too large")
         return Element(value, self.source, start, end, pointer)
 
     def _sequence(self, parent: Element, closing: str, read: Any) -> int:

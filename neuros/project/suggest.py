@@ -5,10 +5,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_MOST_WORDS = 1000  # to compare with more takes seconds
+
 
 def did_you_mean(found: str, allowed: Iterable[str]) -> str:
     """``did you mean 'x'?`` for the closest of the allowed words, empty if none is close."""
-    words = {word.lower(): word for word in sorted(allowed, reverse=True)}
+    words = {word.lower(): word for word in sorted(allowed, reverse=True)[-_MOST_WORDS:]}
     close = difflib.get_close_matches(found.lower(), words, n=1, cutoff=0.6)
     return f"did you mean '{words[close[0]]}'?" if close else ""
 

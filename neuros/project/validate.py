@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Collection, Iterator
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element, display_name, place_of
 from neuros.project.suggest import did_you_mean, listed
 
+MOST_PROBLEMS = 200
+"""Of one kind that are looked for: nobody reads more, and to find all takes minutes."""
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
 
 _KINDS = {
@@ -49,6 +52,12 @@ def schema(name: str) -> dict[str, Any]:
     return content
 
 
+def node_file_mistake(content: Any) -> str:
+    """What is wrong with the content of a ``node.json``, empty if nothing is."""
+    error = next(_validator("node", "#/$defs/node_file").iter_errors(content), None)
+    return "" if error is None else f"{error.json_path}: {_sentence(error)[0]}"
+
+
 def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tuple[Problem, ...]:
     """The NEST nodes, among those of ``names`` (``None``: all), that would have to share a process.
 
@@ -71,12 +80,13 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
 
 
 def _violations_of(element: Element, name: str) -> list[Problem]:
-    found = _validator(name).iter_errors(element.plain)
-    return [problem for error in found for problem in _sentences(error, element)]
+    errors = _validator(name).iter_errors(element.plain)
+    found = (problem for error in errors for problem in _sentences(error, element))
+    return [*islice(found, MOST_PROBLEMS)]
 
 
 @cache
-def _validator(name: str) -> Any:
+def _validator(name: str, part: str = "") -> Any:
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
     from jsonschema.validators import extend
@@ -88,11 +98,20 @@ def _validator(name: str) -> Any:
         if isinstance(instance, str) and not re.search(end_exactly, instance):
             yield ValidationError(f"does not match {expected}")
 
+    def unique(validator: Any, wanted: bool, instance: Any, of: Any) -> Iterator[ValidationError]:
+        # It takes the square of their number, and there may be millions.
+        if not isinstance(instance, list) or len(instance) <= of["maxItems"]:
+            yield from Draft202012Validator.VALIDATORS["uniqueItems"](
+                validator, wanted, instance, of
+            )
+
     schemas = {key: schema(key) for key in ("project", "node")}
     registry = Registry().with_resources(
         (content["$id"], Resource.from_contents(content)) for content in schemas.values()
     )
-    return extend(Draft202012Validator, {"pattern": pattern})(schemas[name], registry=registry)
+    own = {"pattern": pattern, "uniqueItems": unique}
+    form = {"$ref": schemas[name]["$id"] + part}
+    return extend(Draft202012Validator, own)(form, registry=registry)
 
 
 def _sentences(error: Any, root: Element) -> Iterator[Problem]:
@@ -138,6 +157,8 @@ def _sentence(error: Any) -> tuple[str, str]:
         "exclusiveMinimum": f"must be more than {expected}, but is {found}",
         "minLength": "must not be empty",
         "minItems": "must not be empty",
+        "maximum": f"must be at most {expected}, but is {found}",
+        "maxItems": f"has more than {expected} items",
         "maxLength": f"is longer than {expected} characters",
         "uniqueItems": "contains the same item twice",
     }

@@ -26,7 +26,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
-from neuros.recording.stored import StoredTopics, opened, stored_messages
+from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 Column: TypeAlias = npt.NDArray[Any]
 _LOG_TIME, _PUBLISH_TIME = "log_time_ns", "publish_time_ns"
@@ -72,20 +72,21 @@ class RecordedTopic:
     def messages(self) -> Iterator[tuple[RawPacket, Any]]:
         """Packets and messages, made by ``rosbags`` one by one."""
         for packet in self.raw():
-            yield packet, self._bag.store.deserialize_cdr(packet.data, self.type)
+            yield packet, self._bag.message(packet.data, self.type)
 
     def message(self, place: int) -> Any:
         """The message at a place, from 0. Raises ``IndexError``."""
-        return self._bag.store.deserialize_cdr(self.raw()[place].data, self.type)
+        return self._bag.message(self.raw()[place].data, self.type)
 
     def columns(self) -> dict[str, Column]:
         """A column for each field, and the two times; see :meth:`array`."""
         packets = self.raw()
-        return {
-            _LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
-            _PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
-            **columns_of([p.data for p in packets], self.type, self._bag.store),
-        }
+        with damage_of(self._bag.folder):
+            return {
+                _LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
+                _PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
+                **columns_of([p.data for p in packets], self.type, self._bag.store),
+            }
 
     def array(self) -> npt.NDArray[Any]:
         """A structured array, one row per packet.
@@ -149,14 +150,14 @@ class Bag:
         recorded: Mapping[str, int] | None = None,
     ) -> None:
         self.folder = folder
-        with opened(folder) as reader:
+        with opened(folder) as reader, damage_of(folder):
             self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
             self.duration_s = reader.duration / 1e9
             found = {c.topic: c for c in reader.connections}
-        self.store = _store_of(found.values())
-        self.topics = {
-            name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
-        }
+            self.store = _store_of(found.values())
+            self.topics = {
+                name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
+            }
         self.missing = {
             name: lost
             for name, count in (recorded or {}).items()
@@ -210,6 +211,11 @@ class Bag:
         there = [topic.connection or topic.name for topic in self.topics.values()]
         raise KeyError(f"{name}: there are {', '.join(there)}")
 
+    def message(self, data: bytes, type_name: str) -> Any:
+        """A message of a type that the bag has. Raises ``EnvironmentFault`` for other bytes."""
+        with damage_of(self.folder):
+            return self.store.deserialize_cdr(data, type_name)
+
     def packets_of(self, name: str) -> list[RawPacket]:
         """All packets of a topic, by their wall time."""
         if name not in self._packets:
@@ -254,7 +260,7 @@ def _recorded(run: Path) -> dict[str, int]:
     try:
         topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (UsageError, ValueError, KeyError, TypeError, AttributeError):
+    except (UsageError, EnvironmentFault, KeyError):
         return {}
 
 

@@ -10,13 +10,15 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from neuros.errors import UsageError
+from neuros.control.link import read_as
+from neuros.errors import ControlError, EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, Node, Project
 from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import ASKED, DEPTH, OFFERED
+from neuros.recording.run_file import NODE_NAME, read_object
 
 CLOCK = "/clock"
 PLAN_NAME = "recording.json"
@@ -87,29 +89,27 @@ def load_plan(run: Path) -> RecordingPlan:
 
     Raises:
         UsageError: if there is none, or this version of NeuROS cannot read it.
+        EnvironmentFault: if it is damaged.
     """
     path = run / PLAN_NAME
     try:
-        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
-        version = content.pop("version")
+        content = read_object(path)
+        version = content.pop("version", None)
         if version != _VERSION:
             raise UsageError(
                 f"{path} is of version {version}, and this NeuROS reads version {_VERSION}"
             )
-        content["topics"] = tuple(Topic(**topic) for topic in content["topics"])
-        content["streams"] = {
-            node: tuple(Stream(s["way"], s["name"], tuple(s["topics"])) for s in streams)
-            for node, streams in content["streams"].items()
-        }
-        for key in ("listen", "wanted"):
-            content[key] = tuple(content[key])
-        return RecordingPlan(**content)
+        plan = read_as(RecordingPlan, content)
+        places = {place for each in plan.streams.values() for s in each for place in s.topics}
+        if not places <= {*range(len(plan.topics))} or not all(
+            map(NODE_NAME.fullmatch, plan.streams)
+        ):
+            raise ControlError("its streams do not belong to its topics and nodes")
+        return plan
     except (FileNotFoundError, NotADirectoryError) as error:
         raise UsageError(_why_no_plan(run)) from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UsageError(f"{path} is damaged: {error}") from error
+    except (EnvironmentFault, ControlError) as error:
+        raise EnvironmentFault(f"{path} is damaged: {error}") from error
 
 
 def _why_no_plan(run: Path) -> str:

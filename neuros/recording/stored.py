@@ -110,17 +110,25 @@ def opened(folder: Path) -> Iterator[Reader]:
         EnvironmentFault: if it cannot.
     """
     with ExitStack() as stack:
-        try:
+        with damage_of(folder):
             _check_summaries(folder)
             reader = Reader(folder)
             reader.open()
             stack.callback(reader.close)
             _check_definitions(reader)
-        # Of a damaged file it may believe anything.
-        except Exception as error:
-            why = " ".join(str(error).split()) or type(error).__name__
-            raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
         yield reader
+
+
+@contextmanager
+def damage_of(folder: Path) -> Iterator[None]:
+    """Turn what ``rosbags`` raises for a bag into ``EnvironmentFault``; that may be anything."""
+    try:
+        yield
+    except EnvironmentFault:
+        raise
+    except Exception as error:
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
 
 
 def _check_definitions(reader: Reader) -> None:
@@ -128,6 +136,8 @@ def _check_definitions(reader: Reader) -> None:
     storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
     there = {each.topic for storage in storages for each in storage.connections}
     for connection in reader.connections:
+        if type(connection.msgcount) is not int or connection.msgcount < 0:
+            raise ReaderError(f"{connection.topic} has {connection.msgcount} packets")
         is_there = connection.topic in there or not connection.msgcount
         if connection.msgdef.format == MessageDefinitionFormat.NONE or not is_there:
             what = f"{connection.topic} of type {connection.msgtype}"
@@ -219,7 +229,7 @@ def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_
         elif kind == MESSAGE and size >= MESSAGE_HEAD.size:
             number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content, at)
             start = at + MESSAGE_HEAD.size
-            if number in topics:
+            if number in topics and max(log_ns, publish_ns) < 1 << 63:
                 yield topics[number], log_ns, publish_ns, offset + start, view[start:end]
         at = end
 

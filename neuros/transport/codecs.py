@@ -9,8 +9,10 @@ layout of a message class is worked out once: runs of numbers become one ``struc
 strings and sequences are looked at one by one. The encoding is that of rclpy (plain CDR,
 little-endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
 Messages have been checked before (:mod:`neuros.transport.values`). Unusual classes and bytes are
-left to rclpy, and so are errors: single characters, more items than a bound allows, senders of the
-other byte order.
+left to rclpy: single characters, what a plugin made of a message, senders of the other byte order.
+
+Anybody in the domain may publish anything: what is no message is a :class:`WrongBytes`, and takes
+no memory for more items than there are bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +27,16 @@ from typing import Any, Protocol, TypeAlias
 import numpy
 from rclpy.serialization import deserialize_message, serialize_message
 
+from neuros.errors import ProtocolError
 from neuros.transport.schema import Leaf, Shape, Sort, Type, schema
+
+
+class WrongBytes(ProtocolError):
+    """Bytes that are no message of the type of their topic."""
+
+    def __init__(self, kind: type, data: bytes, why: object) -> None:
+        name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
+        super().__init__(f"{len(data)} bytes are no {name}: {why}")
 
 
 class Encoder(Protocol):
@@ -39,7 +50,11 @@ class Decoder(Protocol):
     """The receiver's half of a codec."""
 
     def decode(self, data: bytes) -> Any:
-        """The packet that was published as ``data``; ``None`` if it was lost on its way."""
+        """The packet that was published as ``data``; ``None`` if it was lost on its way.
+
+        Raises:
+            WrongBytes: if they are none.
+        """
 
 
 class Codec(Encoder, Decoder, Protocol):
@@ -59,7 +74,10 @@ class MessageCodec:
 
     def decode(self, data: bytes) -> Any:
         """The message."""
-        return deserialize_message(data, self._kind)
+        try:
+            return deserialize_message(data, self._kind)
+        except Exception as error:  # rclpy does not say which
+            raise WrongBytes(self._kind, data, error) from error
 
 
 class CdrCodec(MessageCodec):
@@ -81,8 +99,10 @@ class CdrCodec(MessageCodec):
         """The message."""
         try:
             return self._decode(data)
-        except NOT_OURS:
+        except Unusual:
             return super().decode(data)
+        except (struct.error, ValueError) as error:
+            raise WrongBytes(self._kind, data, error) from error
 
 
 @cache
@@ -114,14 +134,15 @@ class Unusual(Exception):
 
 
 NOT_OURS = (Unusual, struct.error, AttributeError, TypeError, ValueError, OverflowError)
-"""Writing and reading raise these for a message that is left to rclpy."""
+"""Writing raises these for a message that is left to rclpy."""
 
 
 @cache
 def cdr(kind: type) -> tuple[Encode, Decode] | None:
     """The encoder and decoder of a message class; ``None`` where only rclpy has them.
 
-    Both raise one of ``NOT_OURS`` for a message that is left to rclpy.
+    The encoder raises one of ``NOT_OURS`` for a message that is left to rclpy, the decoder
+    ``Unusual``, and ``ValueError`` or ``struct.error`` for what is none.
     """
     try:
         parts = _parts_of(kind)
@@ -335,6 +356,7 @@ class Items(Part):
         items, read_item, count = [], self._read_item, self._size
         if count is None:
             count, at = _read_length(data, at, self._most)
+            _check_length(data, at, count)  # each takes a byte at least
         for _ in range(count):
             item, at = read_item(data, at)
             items.append(item)
@@ -368,8 +390,7 @@ class Buffer(Part):
         if count:
             at += -at % self._size
             end = at + count * self._size
-            if end + _START > len(data):
-                raise Unusual
+            _check_length(data, at, count * self._size)
             numbers.frombytes(memoryview(data)[at + _START : end + _START])
             at = end
         values.append(numbers)
@@ -422,8 +443,13 @@ def _read_length(data: bytes, at: int, most: int | None = None) -> tuple[int, in
     at += -at & 3
     length = _LENGTH.unpack_from(data, at + _START)[0]
     if most is not None and length > most:
-        raise Unusual
+        raise ValueError(f"{length} items where {most} are allowed")
     return length, at + 4
+
+
+def _check_length(data: bytes, at: int, size: int) -> None:
+    if at + _START + size > len(data):
+        raise ValueError(f"{size} bytes are to begin at byte {at + _START}")
 
 
 def write_text(text: str, pieces: Pieces, at: int) -> int:
@@ -441,8 +467,10 @@ def read_text(data: bytes, at: int) -> tuple[str, int]:
     at += 4
     end = at + length
     encoded = data[at + _START : end + _START]
-    if len(encoded) != length or encoded.find(0) != length - 1:
-        raise Unusual
+    if len(encoded) != length:
+        _check_length(data, at, length)
+    if encoded.find(0) != length - 1:  # as rclpy has it
+        return str(encoded.partition(b"\0")[0], "utf-8", "replace"), end
     return str(encoded[:-1], "utf-8", "replace"), end
 
 
@@ -458,5 +486,6 @@ def write_wide_text(text: str, pieces: Pieces, at: int) -> int:
 def read_wide_text(data: bytes, at: int) -> tuple[str, int]:
     """The text at a place, and the place behind it."""
     count, at = _read_length(data, at)
+    _check_length(data, at, 4 * count)
     units = struct.unpack_from(f"<{count}I", data, at + _START)
     return struct.pack(f"<{count}H", *units).decode("utf-16-le"), at + 4 * count

@@ -16,6 +16,7 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import re
 import stat
 from array import array
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ SHARED_MEMORY = Path("/dev/shm")
 NAME_PREFIX = "neuros"
 """Prefix of the names of segments: ``neuros_<run id>_``; a run's own are removed by that."""
 
+_NAME = re.compile(rf"{NAME_PREFIX}_[\w.-]+")
 _ALIGNMENT = 64  # a cache line: buffers begin where vector instructions like it
 _HEADER_BYTES = _ALIGNMENT  # the generation, as 8 bytes
 _GROWTH = 1.5  # at least, from a segment to its successor
@@ -145,6 +147,8 @@ class SegmentReader:
         found: list[StoredBuffer] = []
         at = start + _HEADER_BYTES
         for typecode, length in zip(typecodes, place.lengths, strict=True):
+            if length % array(typecode).itemsize:
+                raise ValueError(f"{place} has parts of numbers")
             found.append(StoredBuffer(mapping, start // 8, place.generation, at, length, typecode))
             at += _aligned(length)
         return found
@@ -231,11 +235,16 @@ def _create(folder: Path, owner: str, slots: int, slot_bytes: int) -> _Mapping:
 
 
 def _open(folder: Path, place: Place) -> _Mapping:
-    descriptor = os.open(folder / place.segment, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    if not _NAME.fullmatch(place.segment):
+        raise ValueError(f"'{place.segment}' is the name of no segment")
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(folder / place.segment, flags)
     try:
         status = os.fstat(descriptor)
         if status.st_uid != os.getuid() or not stat.S_ISREG(status.st_mode):
             raise PermissionError(f"{place.segment} in shared memory is somebody else's")
+        if status.st_size % 8:
+            raise ValueError(f"{place.segment} has {status.st_size} bytes")
         memory = mmap.mmap(
             descriptor,
             status.st_size,

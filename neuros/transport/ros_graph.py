@@ -29,7 +29,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
-from neuros.transport.codecs import message_codec
+from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
@@ -91,22 +91,35 @@ class ExternalTopics:
     def _subscription(self, port: Port, topic: str, inbox: Inbox) -> Subscription:
         kind = message_class(port.type)
         profile = qos_profile(port.qos or ASKED)
+        deliver = partial(inbox.on_external_packet, port)
         check = QosCheck(self._ros_node, self._loop, port, self._full(topic), profile)
         return self._ros_node.create_subscription(
             kind,
             topic,
-            self._loop.guarded(self._receiver(kind, partial(inbox.on_external_packet, port))),
+            self._loop.guarded(self._receiver(kind, topic, deliver)),
             profile,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check.on_publisher),
             raw=True,
         )
 
-    def _receiver(self, kind: type, deliver: Callable[[Any], None]) -> Callable[[bytes], None]:
+    def _receiver(
+        self, kind: type, topic: str, deliver: Callable[[Any], None]
+    ) -> Callable[[bytes], None]:
         decode = message_codec(kind).decode
+        warned: list[str] = []
 
         def receive(data: bytes) -> None:
-            if self._is_open:
-                deliver(decode(data))
+            if not self._is_open:
+                return
+            try:
+                packet = decode(data)
+            except WrongBytes as error:  # anybody may publish there
+                if not warned:
+                    warned.append(str(error))
+                    text = f"{topic}: a packet is left out, and others like it: {error}"
+                    self._ros_node.get_logger().warning(text)
+            else:
+                deliver(packet)
 
         return receive
 

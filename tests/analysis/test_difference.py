@@ -12,7 +12,7 @@ import pytest
 
 from neuros.analysis.difference import Verdict, compare, differing_fields
 from neuros.analysis.run_record import PastRun, open_run
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 
 FIRST, SECOND = "a.out -> b.in", "b.out -> c.in"
 
@@ -276,7 +276,7 @@ def test_what_is_no_run_of_this_version_is_refused(
 ) -> None:
     if content is not None:
         (tmp_path / "run.json").write_text(content)
-    with pytest.raises(UsageError, match=reason):
+    with pytest.raises((UsageError, EnvironmentFault), match=reason):
         open_run(tmp_path)
 
 

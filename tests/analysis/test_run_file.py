@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.run_file import read_run_file, write_run_file
 
 
@@ -46,5 +46,5 @@ def test_what_is_no_record_is_refused_with_the_reason(tmp_path: Path) -> None:
         read_run_file(tmp_path)
     for text, reason in (("{", "is broken"), ("[]", "holds no object"), ("{}", "has format None")):
         (tmp_path / "run.json").write_text(text)
-        with pytest.raises(UsageError, match=reason):
+        with pytest.raises((UsageError, EnvironmentFault), match=reason):
             read_run_file(tmp_path)

@@ -30,3 +30,19 @@ def test_topics_that_nobody_serves_are_named(back_end: str, tmp_path: Path) -> N
         "input 'mistaken': /mistaken is published as std_msgs/msg/Int32, not as std_msgs/msg/String"
     ) in running.output
     assert "input 'heard'" not in running.output
+
+
+def test_bytes_that_are_no_message_are_left_out_and_the_run_goes_on(tmp_path: Path) -> None:
+    """Anybody in the domain may publish them."""
+    with (
+        choose_domain(None, {}, False) as domain,
+        RosProgram(domain_id=domain.id) as program,
+        start(PROJECT, "--backend", "process", "-d", str(domain.id), cwd=tmp_path) as running,
+    ):
+        kind = message_class("std_msgs/msg/String")
+        heard = program.node.create_publisher(kind, "/heard", 10)
+        program.spin_until(heard.get_subscription_count, 60.0)
+        heard.publish(b"\0\1\0\0\xff\xff\xff\x7fabc\0")
+        running.wait_for("/heard: a packet is left out, and others like it: 12 bytes are no", 60.0)
+        running.wait_for("input 'unheard': nobody publishes on /unheard", 60.0)
+    assert "node 'listener' failed" not in running.output

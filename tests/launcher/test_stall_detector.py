@@ -20,10 +20,12 @@ def report(
     *,
     executing: dict[str, Any] | None = None,
     waiting_for: tuple[str, ...] = (),
+    acknowledged: int = 0,
 ) -> Report:
     metrics: Any = {
         "hooks": {"step": {"executions": executions}},
         "incoming": {"b.o -> a.x": {"received": received}},
+        "outgoing": {"a.o -> c.x": {"acknowledged": acknowledged}},
         "executing": executing,
     }
     return Report(node=node, waiting_for=waiting_for, metrics=metrics)
@@ -124,6 +126,17 @@ def test_waiting_connections_are_named_after_5_seconds_and_then_every_10() -> No
         said += [(tenths / 10, text) for text in remarks(detector, tenths / 10)]
     text = "connections still waiting for their other end: b.o -> a.x; b.p -> a.y"
     assert said == [(5.0, text), (15.0, text), (25.0, text)]
+
+
+def test_connections_that_have_carried_packets_wait_for_nobody() -> None:
+    detector = detector_of("a")
+    waiting = ("a.o -> c.x", "b.o -> a.x")
+    detector.report(report("a", received=1, waiting_for=waiting), 4.0)
+    (text,) = remarks(detector, 5.0)
+    assert "a.o -> c.x" in text
+    assert "b.o -> a.x" not in text
+    detector.report(report("a", received=1, acknowledged=1, waiting_for=waiting), 14.0)
+    assert remarks(detector, 15.0) == []
 
 
 def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:

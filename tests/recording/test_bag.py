@@ -257,7 +257,7 @@ def test_a_run_that_was_not_recorded_and_one_of_another_version_are_said(tmp_pat
     with pytest.raises(UsageError, match="version 99, and this NeuROS reads version 1"):
         neuros.bag.open(tmp_path)
     (tmp_path / "recording.json").write_text('{"version": 1')
-    with pytest.raises(UsageError, match="is damaged"):
+    with pytest.raises(EnvironmentFault, match="is damaged"):
         neuros.bag.open(tmp_path)
 
 

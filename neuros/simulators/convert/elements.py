@@ -9,8 +9,13 @@ from pathlib import Path
 from xml.parsers import expat
 
 from neuros.errors import DescriptionError, Problem
-from neuros.project.scanner import display_name
+from neuros.project.scanner import display_name, read_bytes
 
+_MOST_BYTES = 64 << 20
+_MOST_ELEMENTS = 200_000
+_FILE_ELEMENTS = 20  # what it costs to open a file, in elements
+DEEPEST = 50
+"""Levels of models within models, and twice that many of elements in a file."""
 _UNKNOWN = "the converter does not know this element"
 _EXTENSION = "an extension of its author's own"
 _TAGS_BY_REASON: Mapping[str, str] = {
@@ -96,6 +101,19 @@ class Report:
     def __init__(self) -> None:
         self.problems: list[Problem] = []
         self.notes: list[tuple[Element, str]] = []
+        self._elements = 0
+
+    def count(self, file: Path, elements: int) -> None:
+        """Count elements of a file.
+
+        Raises:
+            DescriptionError: if they are too many. Files can include each other so often that
+                nobody could read to the end.
+        """
+        self._elements += elements
+        if self._elements > _MOST_ELEMENTS:
+            text = f"with it the description has more than {_MOST_ELEMENTS} elements"
+            raise DescriptionError([Problem(display_name(file), 1, 1, "/", text)])
 
     def note_unread(self, roots: Iterable[Element]) -> None:
         """Note the topmost elements that were not read."""
@@ -282,19 +300,28 @@ class Element:
         self.report.notes.append((self, why))
 
 
+class _Unwanted(Exception):
+    """XML that is well-formed, and not taken."""
+
+
 class _Builder:
     """Makes elements of what expat reports."""
 
     def __init__(self, file: Path, report: Report) -> None:
         self.root: Element | None = None
         self._file, self._report, self._open = file, report, list[Element]()
+        self._texts: list[list[str]] = []
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
+        self.parser.EntityDeclHandler = self._refuse_entity
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
         self.parser.CharacterDataHandler = self._characters
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._report.count(self._file, 1)
+        if len(self._open) >= 2 * DEEPEST:
+            raise _Unwanted(f"elements are nested more than {2 * DEEPEST} deep")
         parent = self._open[-1] if self._open else None
         line, column = self.parser.CurrentLineNumber, self.parser.CurrentColumnNumber + 1
         element = Element(tag, attributes, self._file, line, column, self._report, parent)
@@ -303,28 +330,39 @@ class _Builder:
         else:
             parent.children.append(element)
         self._open.append(element)
+        self._texts.append([])
 
     def _end(self, tag: str) -> None:
-        element = self._open.pop()
-        element.text = element.text.strip()
+        self._open.pop().text = "".join(self._texts.pop()).strip()
 
     def _characters(self, text: str) -> None:
         if self._open:
-            self._open[-1].text += text
+            self._texts[-1].append(text)
+
+    def _refuse_entity(self, name: str, *_: object) -> None:
+        # Ten that name each other ten times are 10^9 characters.
+        raise _Unwanted(f"it declares the entity '{name}', which is not supported")
 
 
 def parse(file: Path, report: Report) -> Element | Problem:
-    """The root of an XML file, or why it cannot be read."""
+    """The root of an XML file, or why it cannot be read.
+
+    Raises:
+        DescriptionError: if ``report`` has counted too many elements.
+    """
     line, column = 1, 1
+    report.count(file, _FILE_ELEMENTS)
     builder = _Builder(file, report)
     try:
-        builder.parser.Parse(file.read_bytes(), True)
+        builder.parser.Parse(read_bytes(file, _MOST_BYTES), True)
     except OSError as error:
-        text = f"cannot be read: {error.strerror}"
+        text = f"cannot be read: {error.strerror or error}"
+    except _Unwanted as error:
+        line, column, text = builder.parser.CurrentLineNumber, 1, str(error)
     except expat.ExpatError as error:
         line, column = error.lineno, error.offset + 1
         text = f"this is no XML: {expat.ErrorString(error.code)}"
-    except ValueError as error:
+    except (ValueError, LookupError) as error:  # LookupError: of its encoding
         text = f"this is no XML: {error}"
     else:
         assert builder.root is not None, "expat reports an empty document itself"

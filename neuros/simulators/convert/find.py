@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from neuros.errors import Problem
-from neuros.simulators.convert.elements import Element, Report, parse
+from neuros.simulators.convert.elements import DEEPEST, Element, Report, parse
 
 PATH_VARIABLES = (
     "SDF_PATH",
@@ -64,7 +64,7 @@ class Finder:
         else:
             raise NotFound(f"'{uri}': there is no way to look up '{scheme}://'")
         for candidate in candidates:
-            if candidate.exists():
+            if os.path.exists(candidate):  # which fails for no name, however long
                 return candidate.resolve()
         hint = f"name its folder with -I, or in {' or '.join(PATH_VARIABLES[:2])}"
         raise NotFound(f"'{uri}' cannot be found", "" if scheme == "file" else hint)
@@ -102,7 +102,7 @@ class Includer:
         self._finder, self._report = finder, report
         self.roots: list[Element] = []
 
-    def read(self, file: Path, chain: Sequence[Path] = ()) -> Element | None:
+    def read(self, file: Path, chain: Sequence[Path] = (), depth: int = 0) -> Element | None:
         """The root of an SDF file with everything in it that it includes; problems are reported."""
         root = parse(file, self._report)
         if isinstance(root, Problem):
@@ -113,23 +113,28 @@ class Includer:
             return None
         root.taken = True
         self.roots.append(root)
-        self._expand(root, (*chain, file))
+        self._expand(root, (*chain, file), depth)
         return root
 
-    def _expand(self, owner: Element, chain: Sequence[Path]) -> None:
+    def _expand(self, owner: Element, chain: Sequence[Path], depth: int) -> None:
+        if depth > DEEPEST:
+            owner.problem(f"more than {DEEPEST} models are nested in each other")
+            return
         expanded: list[Element] = []
         for child in owner.children:
             if child.tag == "include":
                 child.taken = True
-                expanded += self._included(child, owner, chain)
+                expanded += self._included(child, owner, chain, depth)
             else:
                 if child.tag in ("world", "model"):
-                    self._expand(child, chain)
+                    self._expand(child, chain, depth + 1)
                 expanded.append(child)
         owner.children = expanded
 
-    def _included(self, include: Element, owner: Element, chain: Sequence[Path]) -> list[Element]:
-        model = self._model(include, chain)
+    def _included(
+        self, include: Element, owner: Element, chain: Sequence[Path], depth: int
+    ) -> list[Element]:
+        model = self._model(include, chain, depth)
         if model is None:
             return []
         if named := include.text_of("name"):
@@ -147,7 +152,7 @@ class Includer:
         model.parent = owner
         return [model]
 
-    def _model(self, include: Element, chain: Sequence[Path]) -> Element | None:
+    def _model(self, include: Element, chain: Sequence[Path], depth: int) -> Element | None:
         uri = include.child("uri")
         if uri is None or not uri.text:
             include.problem("<uri> is missing: which model is to be included?")
@@ -161,7 +166,7 @@ class Includer:
             circle = " -> ".join(link.name for link in (*chain[chain.index(file) :], file))
             uri.problem(f"the file includes itself: {circle}")
             return None
-        root = self.read(file, chain)
+        root = self.read(file, chain, depth)
         if root is None:
             return None
         models = root.each("model")
@@ -177,7 +182,7 @@ def model_file(path: Path) -> Path:
 
     Raises :class:`NotFound`.
     """
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return path
     config = path / "model.config"
     if config.is_file():
@@ -188,7 +193,7 @@ def model_file(path: Path) -> Path:
         if named:
             newest = max(named, key=lambda element: _version(element.attributes.get("version", "")))
             file = path / newest.text
-            if not file.is_file():
+            if not os.path.isfile(file):
                 raise NotFound(f"{newest.place} names '{newest.text}', which does not exist")
             return file
     file = path / "model.sdf"
@@ -198,7 +203,7 @@ def model_file(path: Path) -> Path:
 
 
 def _version(text: str) -> tuple[int, ...]:
-    return tuple(int(part) if part.isdigit() else 0 for part in text.split("."))
+    return tuple(int(part) if part.isdecimal() else 0 for part in text[:20].split("."))
 
 
 def _merged(model: Element, owner: Element) -> list[Element]:

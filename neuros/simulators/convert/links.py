@@ -63,6 +63,7 @@ _CAMERAS = {
 # A rangefinder of MuJoCo's looks along z.
 _TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
 _MOST_RAYS = 1000
+_MOST_PIXELS = 1 << 16
 _SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # where nothing says how many
 _SITE = mujoco.mjtObj.mjOBJ_SITE
 _LIGHTS = {
@@ -244,7 +245,7 @@ def _diffuse(material: Element) -> tuple[float, ...]:
         values = [float(word) for word in element.text.split()]
     except ValueError:
         values = []
-    if len(values) not in (3, 4):
+    if len(values) not in (3, 4) or not all(map(math.isfinite, values)):
         element.problem("a colour is red, green, blue and opacity, each from 0 to 1")
         return base
     return (*values, 1.0)[:4]
@@ -334,6 +335,9 @@ def _add_camera(building: Building, link: Link, element: Element, pose: Pose) ->
     across = settings.number("horizontal_fov", 1.047, positive=True)
     width = image.number("width", 320.0, positive=True)
     height = image.number("height", 240.0, positive=True)
+    if max(width, height) > _MOST_PIXELS:
+        settings.problem(f"an image has at most {_MOST_PIXELS} pixels a side")
+        return
     if across >= math.pi:
         settings.problem(f"a field of view is below pi, not {across:g}")
         return

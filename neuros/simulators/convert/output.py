@@ -40,7 +40,7 @@ class Building:
     masks: dict[int, int] = field(default_factory=dict)
     colliding_meshes: dict[str, Element] = field(default_factory=dict)
     joints: dict[str, list[str]] = field(default_factory=dict)
-    _names: set[tuple[str, str]] = field(default_factory=lambda: {("body", "world")})
+    _names: dict[tuple[str, str], int] = field(default_factory=lambda: {("body", "world"): 1})
 
     def body(self, link: Link | None) -> Any:
         """The body of a link; the world without one."""
@@ -48,11 +48,11 @@ class Building:
 
     def name(self, sort: str, wanted: str, element: Element | None) -> str:
         """A name that no other element of its sort (geom, site, ...) has; a change is noted."""
-        name, number = wanted, 1
-        while (sort, name) in self._names:
+        name, number = wanted, self._names.get((sort, wanted), 0) + 1
+        while number > 1 and (sort, name := f"{wanted}_{number}") in self._names:
             number += 1
-            name = f"{wanted}_{number}"
-        self._names.add((sort, name))
+        self._names[sort, wanted] = number
+        self._names.setdefault((sort, name), 1)
         if number > 1 and element is not None:
             element.remark(f"called '{name}': the name is taken")
         return name

@@ -102,14 +102,23 @@ class Scope:
         if head not in self.frames:
             self._unknown(name, asking)
             return Pose()
-        if head not in self._places:
-            self._places[head] = None
-            self._places[head] = self._placed(head)
+        for each in self._bases(head):
+            if each not in self._places:
+                self._places[each] = None
+                self._places[each] = self._placed(each)
         place = self._places[head]
         if place is None:
             asking.problem(f"'{name}' is placed relative to itself")
             return Pose()
         return place
+
+    def _bases(self, name: str) -> Sequence[str]:
+        """The frames still to be placed for the one of that name, one after another."""
+        found: dict[str, None] = {}
+        while name in self.frames and name not in self._places and name not in found:
+            found[name] = None
+            name = self.frames[name].base.partition("::")[0]
+        return [*found][::-1]
 
     def _placed(self, name: str) -> Pose:
         frame = self.frames[name]

@@ -42,6 +42,7 @@ from neuros.simulators.convert.scopes import (
 
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 _TOLERANCE = 1e-9
+_MOST_LINKS = 1000
 _GRAVITY = (0.0, 0.0, -9.8)
 _MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
 
@@ -159,11 +160,18 @@ def _exclude_contacts(building: Building, scope: Scope) -> None:
         outer = inner.outermost
         if outer.self_collides or outer.is_static:
             continue
-        groups.setdefault(id(outer), []).extend(
+        names = groups.setdefault(id(outer), [])
+        names += [
             building.body(link).name
             for link in inner.links.values()
             if any(id(child) in building.geoms for child in link.element.children)
-        )
+        ]
+        if len(names) > _MOST_LINKS:
+            outer.element.problem(
+                f"more than {_MOST_LINKS} links of one model collide with other things",
+                "<self_collide> needs no list of their pairs",
+            )
+            return
     for names in groups.values():
         for index, first in enumerate(names):
             for second in names[index + 1 :]:

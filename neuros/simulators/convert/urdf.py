@@ -6,6 +6,8 @@ off, so that the names of all links are there, unless the ``<mujoco>`` element s
 
 from __future__ import annotations
 
+import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +38,10 @@ _UNSUPPORTED_ELEMENTS = {
     "safety_controller": "MuJoCo has no such limits",
     "calibration": "nothing to calibrate in a simulation",
 }
+_NUMBERS = re.compile(
+    "xyz|rpy|size|radius|length|scale|value|i[xyz][xyz]|lower|upper|effort|velocity|damping"
+    "|friction|rgba|multiplier|offset"
+)
 _KEPT_NAMES = {"fusestatic": "false", "discardvisual": "false"}
 
 
@@ -53,6 +59,7 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     assert isinstance(root, Element)
     if root.tag != "robot":
         root.problem(f"a URDF file begins with <robot>, not with <{root.tag}>")
+    _check_numbers(root)
     robot = _copy(root)
     unread = _resolve_meshes(robot, root, finder)
     report.raise_any()
@@ -63,8 +70,34 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
             element.note(_UNSUPPORTED_ELEMENTS[element.tag])
         elif element.tag == "mimic" and element.parent is not None:
             _mimic(spec, element, element.parent)
-    model = spec.copy().compile()
+    report.raise_any()
+    model = _compiled(spec, root)
     return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
+
+
+def _check_numbers(element: Element) -> None:
+    """Report numbers that are infinite or none, which MuJoCo takes, or a joint's follower."""
+    if element.tag in _UNSUPPORTED_ELEMENTS:
+        return
+    for key, text in element.attributes.items():
+        for word in (text.split() or [""]) if _NUMBERS.fullmatch(key) else ():
+            try:
+                is_wrong = not math.isfinite(float(word))
+            except ValueError:
+                is_wrong = element.tag == "mimic"  # of others MuJoCo says so
+            if is_wrong:
+                element.problem(f"{key} must be finite, not '{word}'")
+    for child in element.children:
+        _check_numbers(child)
+
+
+def _compiled(spec: Any, root: Element) -> Any:
+    try:
+        return spec.copy().compile()
+    except (ValueError, mujoco.FatalError) as error:
+        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
+        root.report.raise_any()
+        raise
 
 
 def _resolve_meshes(robot: ElementTree.Element, root: Element, finder: Finder) -> set[str]:

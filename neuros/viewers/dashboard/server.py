@@ -25,11 +25,10 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import urlencode, urlsplit
+from urllib.parse import SplitResult, quote, urlencode, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import URL
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import (
@@ -68,7 +67,10 @@ _REQUESTS: Mapping[str, Message] = {
     "resume": Resume(),
     "stop": End("ended from the dashboard"),
 }
-_NOT_UNDERSTOOD = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
+_NOT_UNDERSTOOD = (
+    *(ValueError, LookupError, TypeError, AttributeError, OverflowError),
+    RecursionError,
+)
 
 
 class LogSource(Protocol):
@@ -215,6 +217,14 @@ class Dashboard:
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "[::1]", "::1"}
 
 
+def _split(address: str) -> SplitResult:
+    """The parts of an address; of what is none, empty ones."""
+    try:
+        return urlsplit(address)
+    except ValueError:  # "//[" has half a pair of brackets
+        return urlsplit("")
+
+
 class Access:
     """ASGI middleware that lets only the user's own browser through: it has the printed token.
 
@@ -242,9 +252,9 @@ class Access:
 
     def _refusal(self, request: Request) -> Response | None:
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
-        if urlsplit(f"//{host}").hostname not in _LOCAL_NAMES:
+        if _split(f"//{host}").hostname not in _LOCAL_NAMES:
             return PlainTextResponse("this dashboard answers to localhost only", 403)
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and _split(origin).netloc != host:
             return PlainTextResponse("another page may not speak for this one", 403)
         given = request.query_params.get("token") or request.cookies.get(self._cookie, "")
         if not secrets.compare_digest(given.encode(), self._token.encode()):
@@ -260,7 +270,7 @@ class Access:
         if "token" not in request.query_params:
             return None
         rest = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]
-        url = URL(request.url.path).replace(query=urlencode(rest))
-        answer = RedirectResponse(str(url), 303)
+        path, query = f"/{quote(request.scope['path'].lstrip('/'))}", urlencode(rest)
+        answer = RedirectResponse(f"{path}?{query}" if query else path, 303)
         answer.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
         return answer

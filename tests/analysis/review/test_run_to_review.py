@@ -9,7 +9,7 @@ import pytest
 from run_folders import PACKETS, accounting, run_folder
 
 from neuros.analysis.run_record import open_for_review
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 
 WIRE = "a.out -> b.in"
 
@@ -52,7 +52,7 @@ def test_of_a_run_that_was_cut_off_packets_are_counted(tmp_path: Path) -> None:
 def test_what_is_no_run_is_refused(tmp_path: Path, content: str | None, reason: str) -> None:
     if content is not None:
         (tmp_path / "run.json").write_text(content)
-    with pytest.raises(UsageError, match=reason):
+    with pytest.raises((UsageError, EnvironmentFault), match=reason):
         open_for_review(tmp_path)
 
 

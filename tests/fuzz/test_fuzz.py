@@ -1,0 +1,42 @@
+"""Some hundreds of changed inputs; and every one that was ever answered wrongly."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from .mutation import changed
+from .running import fault_of
+from .targets import TARGETS
+
+CORPUS = Path(__file__).parent / "corpus"
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_an_ordinary_input_is_let_in(name: str) -> None:
+    for data in TARGETS[name].seeds()[:20]:
+        assert not fault_of(TARGETS[name], data)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_any_other_is_answered(name: str) -> None:
+    target = TARGETS[name]
+
+    @settings(max_examples=20)
+    @given(st.randoms(use_true_random=False))
+    def check(chance: random.Random) -> None:
+        data = changed(target.seeds(), target.mutate, chance)
+        assert not fault_of(target, data, measures_memory=True), data
+
+    check()
+
+
+@pytest.mark.parametrize(
+    "file", [pytest.param(file, id="/".join(file.parts[-2:])) for file in CORPUS.glob("*/*")]
+)
+def test_what_was_once_answered_wrongly_is_answered(file: Path) -> None:
+    assert not fault_of(TARGETS[file.parent.name], file.read_bytes(), measures_memory=True)
