@@ -16,6 +16,7 @@ from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
 from neuros.backends.registered import choose
+from neuros.cli.launch import _signals_noted
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
@@ -300,6 +301,18 @@ def test_ctrl_c_without_a_run_is_no_traceback(
 
     monkeypatch.setattr("neuros.cli.projects._validate", interrupted)
     assert main(["validate", "."]) == 130
+
+
+def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as launch.py does
+    try:
+        with _signals_noted() as (signals, _):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert signals == [signal.SIGINT]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert signal.sigwait([signal.SIGINT]) == signal.SIGINT, "it waits, and is never heeded"
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 # ------------------------------------------------------------------ parts

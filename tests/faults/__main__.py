@@ -1,4 +1,4 @@
-"""The fault matrix by command: ``python -m tests.faults --hours 1``, ``--table FILE``.
+"""Faults by command: ``python -m tests.faults --hours 1``, ``--table FILE``, ``--launches 500``.
 
 Runs every cell, or those that are chosen, once, or over and over for some hours. The exit code is
 1 if any of them was not as it must be.
@@ -7,89 +7,110 @@ Runs every cell, or those that are chosen, once, or over and over for some hours
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
+import re
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from .cells import BACKENDS, FAULTS, PLACES, Cell, all_cells
-from .running import Outcome, run
+from . import interrupts, launches, plugins, processes, surroundings
+from .cells import BACKENDS, all_cells
+from .trials import Outcome
+
+WHAT = ("plugins", "processes", "surroundings", "interrupts")
+_Run = Callable[[Path], Outcome]
 
 
 def main() -> int:
     """Run the cells; returns the exit code."""
     options = _options()
-    cells = [
-        cell
-        for cell in all_cells()
-        if cell.backend in (options.backend or BACKENDS)
-        and cell.fault in (options.fault or FAULTS)
-        and cell.place in (options.place or PLACES)
-    ]
+    if options.launches:
+        return _launch(options)
     until_s = time.monotonic() + options.hours * 3600
     outcomes: list[Outcome] = []
-    for _ in itertools.count():
-        with ThreadPoolExecutor(options.jobs) as executor:
-            for outcome in executor.map(lambda cell: _run(cell, options), cells):
-                outcomes.append(outcome)
-                print(_line(outcome), flush=True)
+    while True:
+        outcomes += _round(options)
         if time.monotonic() >= until_s:
             break
     failed = [outcome for outcome in outcomes if outcome.problems]
     print(f"{len(outcomes)} runs, {len(failed)} not as they must be")
     if options.table:
-        _write(options.table, table(outcomes))
+        text = options.table.read_text("utf-8") if options.table.exists() else ""
+        options.table.write_text(with_tables(text, outcomes), "utf-8")
     return 1 if failed else 0
 
 
-def _write(file: Path, text: str) -> None:
-    """Write a table into a file, between the marks of what is generated if it has them."""
-    whole = file.read_text("utf-8") if file.exists() else ""
-    before, begin, rest = whole.partition("<!-- generated: begin -->\n")
-    _, end, after = rest.partition("<!-- generated: end -->")
-    file.write_text(f"{before}{begin}\n{text}\n{end}{after}" if end else text, "utf-8")
+def _launch(options: argparse.Namespace) -> int:
+    began_s, problems = time.monotonic(), 0
+
+    def show(number: int) -> None:
+        if number % 50 == 0:
+            print(f"{number} launches, {time.monotonic() - began_s:.0f} s", flush=True)
+
+    with tempfile.TemporaryDirectory(prefix="neuros-faults-") as folder:
+        for problem in launches.launches(Path(folder), options.launches, show):
+            problems += 1
+            print(problem, flush=True)
+    took_s = time.monotonic() - began_s
+    print(f"{options.launches} launches in {took_s:.0f} s, {problems} not as they must be")
+    return 1 if problems else 0
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """Markdown: faults by place, one table per back end; a cell has exit code and seconds."""
-    by_cell = {str(outcome.cell): outcome for outcome in outcomes}
-    parts = []
-    for backend in BACKENDS:
-        rows = []
-        for fault in FAULTS:
-            shown = [by_cell.get(str(Cell(fault, place, backend))) for place in PLACES]
-            if any(shown):
-                texts = ["" if each is None else _shown(each) for each in shown]
-                rows.append(f"| `{fault}` | {' | '.join(texts)} |")
-        if rows:
-            head = f"| {backend} | {' | '.join(PLACES)} |\n|{' --- |' * (len(PLACES) + 1)}\n"
-            parts.append(head + "\n".join(rows) + "\n")
-    return "\n".join(parts)
+def _round(options: argparse.Namespace) -> list[Outcome]:
+    """Run each of the chosen cells once."""
+    outcomes = []
+    with ThreadPoolExecutor(options.jobs) as executor:
+        for outcome in executor.map(lambda run: _in_folder(run, options), _chosen(options)):
+            outcomes.append(outcome)
+            print(outcome, flush=True)
+    if "interrupts" in options.what:
+        backends = options.backend
+        with ThreadPoolExecutor(options.jobs) as executor:
+            series = [executor.submit(_interrupted, each, options) for each in backends]
+            outcomes += itertools.chain.from_iterable(each.result() for each in series)
+    return outcomes
 
 
-def _shown(outcome: Outcome) -> str:
-    text = f"{outcome.exit_code}, {max(0.0, outcome.took_s):.1f} s"
-    return f"**{text}: {'; '.join(outcome.problems)}**" if outcome.problems else text
+def _chosen(options: argparse.Namespace) -> Iterator[_Run]:
+    """All cells that are chosen, but for interrupts, whose number depends on the machine."""
+    is_chosen = re.compile(options.only).search
+    if "plugins" in options.what:
+        for cell in all_cells():
+            if cell.backend in options.backend and is_chosen(str(cell)):
+                yield functools.partial(plugins.run, cell, flood_bytes=options.flood_bytes)
+    if "processes" in options.what:
+        for fault in processes.process_faults():
+            if fault.backend in options.backend and is_chosen(str(fault)):
+                yield functools.partial(processes.run, fault)
+    if "surroundings" in options.what:
+        for each in surroundings.surroundings():
+            if each.backend in options.backend and is_chosen(str(each)):
+                yield functools.partial(surroundings.run, each)
 
 
-def _line(outcome: Outcome) -> str:
-    problems = "; ".join(outcome.problems) or "ok"
-    return (
-        f"{outcome.cell!s:45} {outcome.exit_code:4} {outcome.took_s:5.1f} s {outcome.bag:9}"
-        f" {problems}\n    {outcome.said}"
-    )
+def _interrupted(backend: str, options: argparse.Namespace) -> list[Outcome]:
+    def run(interrupt: interrupts.Interrupt) -> Outcome:
+        return _in_folder(functools.partial(interrupts.run, interrupt), options)
+
+    step_s = interrupts.STEP_S * (5 if backend == "docker" else 1)
+    outcomes = []
+    for outcome in interrupts.interrupts(backend, run, step_s):
+        outcomes.append(outcome)
+        print(outcome, flush=True)
+    return outcomes
 
 
-def _run(cell: Cell, options: argparse.Namespace) -> Outcome:
+def _in_folder(run: _Run, options: argparse.Namespace) -> Outcome:
     folder = Path(tempfile.mkdtemp(prefix="neuros-faults-"))
     try:
-        outcome = run(cell, folder, flood_bytes=options.flood_bytes)
+        outcome = run(folder)
         if outcome.problems and options.keep:
-            kept = options.keep / str(cell).replace(" ", "_").replace(",", "")
+            kept = options.keep / re.sub(r"\W+", "_", str(outcome.place))
             shutil.rmtree(kept, ignore_errors=True)
             shutil.copytree(folder, kept, symlinks=True)
             (kept / "output.txt").write_text(outcome.output)
@@ -98,21 +119,58 @@ def _run(cell: Cell, options: argparse.Namespace) -> Outcome:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+# ------------------------------------------------------------------ tables
+
+
+def with_tables(text: str, outcomes: Sequence[Outcome]) -> str:
+    """A text with the tables of outcomes in the place of those that it has between its marks.
+
+    A table that is only run in part keeps its other rows.
+    """
+    for name in dict.fromkeys(outcome.place.table for outcome in outcomes):
+        of_table = [outcome for outcome in outcomes if outcome.place.table == name]
+        begin, end = f"<!-- generated: {name} -->\n", "<!-- generated: end -->"
+        before, mark, rest = text.partition(begin)
+        old, _, after = rest.partition(end)
+        made = table(name, of_table, old)
+        text = f"{before}{begin}\n{made}\n{end}{after if mark else chr(10)}"
+    return text
+
+
+def table(name: str, outcomes: Sequence[Outcome], old: str = "") -> str:
+    """Markdown: what happened by when or where; a cell has exit code and seconds."""
+    lines = [line for line in old.splitlines() if line.startswith("| ")]
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    columns = dict.fromkeys(cells[0][1:] if cells else ())
+    rows = {row[0]: dict(zip(columns, row[1:], strict=False)) for row in cells[2:]}
+    for outcome in outcomes:
+        columns[outcome.place.column] = None
+        rows.setdefault(f"`{outcome.place.row}`", {})[outcome.place.column] = outcome.shown
+    head = [name.rpartition(", ")[2], *columns]
+    body = [[row, *(shown.get(each, "") for each in columns)] for row, shown in rows.items()]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)) + "\n"
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m tests.faults", description=__doc__)
-    for name, choices in (("backend", BACKENDS), ("fault", tuple(FAULTS)), ("place", PLACES)):
-        parser.add_argument(f"--{name}", action="append", choices=choices, help="repeatable")
+    parser.add_argument(
+        "what", nargs="*", metavar="WHAT", help=f"{', '.join(WHAT)} (all of them)", default=WHAT
+    )
+    parser.add_argument("--backend", action="append", choices=BACKENDS, help="repeatable (all)")
+    parser.add_argument("--only", default="", metavar="REGEX", help="cells whose name has that")
     parser.add_argument("--hours", type=float, default=0.0, help="repeat for so long (once)")
     parser.add_argument("--jobs", type=int, default=1, help="so many runs at a time (1)")
     parser.add_argument("--flood-bytes", type=int, default=1 << 30, metavar="N", help="(2**30)")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the folders of failed runs")
+    parser.add_argument("--launches", type=int, metavar="N", help="only launch N times in a row")
     parser.add_argument(
-        "--table",
-        type=Path,
-        metavar="FILE",
-        help="write a table in Markdown, between its marks if it has them",
+        "--table", type=Path, metavar="FILE", help="write the tables, in Markdown, between marks"
     )
-    return parser.parse_args()
+    options = parser.parse_args()
+    if unknown := {*options.what} - {*WHAT}:
+        parser.error(f"there is no {' and no '.join(sorted(unknown))}: {', '.join(WHAT)}")
+    options.backend = options.backend or list(BACKENDS)
+    return options
 
 
 if __name__ == "__main__":
