@@ -11,6 +11,7 @@ import functools
 import itertools
 import re
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -29,6 +30,8 @@ _Run = Callable[[Path], Outcome]
 def main() -> int:
     """Run the cells; returns the exit code."""
     options = _options()
+    # In the background of a shell it is ignored, and all that is started would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if options.launches:
         return _launch(options)
     until_s = time.monotonic() + options.hours * 3600

@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -58,7 +59,7 @@ def run(interrupt: Interrupt, folder: Path) -> Outcome:
     """Interrupt a run in an empty folder, and judge what comes of that."""
     trial = Trial(folder, "pass_by", "function")
     began_s = time.monotonic()
-    program = (str(REPOSITORY / "launch.py"),)
+    program = (sys.executable, "-S", str(REPOSITORY / "launch.py"))
     with trial.start(interrupt.backend, duration_s=_DURATION_S, program=program) as running:
         while time.monotonic() < began_s + interrupt.at_s and running.process.poll() is None:
             running.read(min(POLL_S, max(0.0, began_s + interrupt.at_s - time.monotonic())))

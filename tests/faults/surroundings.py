@@ -222,21 +222,25 @@ def _limited(limit: str) -> Callable[[Surrounding, str, Path], Outcome]:
     return run
 
 
-def _few_processes(self: Surrounding, backend: str, folder: Path) -> Outcome:
-    """Root has no such limit, so another user launches, who may read what root has installed."""
-    with _elsewhere() as other:
-        trial = Trial(other, "pass_by", "function")
-        for path in (other, trial.temporary):
-            os.chown(path, _NOBODY, _NOBODY)
-        user = ["setpriv", f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups"]
-        may_read = ["--inh-caps=+dac_override", "--ambient-caps=+dac_override"]
-        through = [*user, *may_read, "prlimit", "--nproc=8"]
-        environment = {"HOME": str(trial.temporary)}
-        with trial.start(
-            backend, duration_s=_DURATION_S, through=through, **environment
-        ) as running:
-            struck_s = trial.await_strike(running)
-            return _outcome(self, backend, trial, running, struck_s)
+def _as_another_user(*through: str) -> Callable[[Surrounding, str, Path], Outcome]:
+    """Another user launches, who has limits that root has not, but may read what root installed."""
+    user = ["setpriv", f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups"]
+    user += ["--inh-caps=+dac_override", "--ambient-caps=+dac_override"]
+
+    def run(self: Surrounding, backend: str, folder: Path) -> Outcome:
+        with _elsewhere() as other:
+            trial = Trial(other, "pass_by", "function")
+            home = other / "home"
+            home.mkdir()
+            for path in (other, trial.temporary, home):
+                os.chown(path, _NOBODY, _NOBODY)
+            with trial.start(
+                backend, duration_s=_DURATION_S, through=[*user, *through], HOME=str(home)
+            ) as running:
+                struck_s = trial.await_strike(running)
+                return _outcome(self, backend, trial, running, struck_s)
+
+    return run
 
 
 # ------------------------------------------------------------------ clock, and standing still
@@ -339,8 +343,9 @@ _SURROUNDINGS = (
     Surrounding(
         "8 processes and threads",
         Expected((1, 4), within_s=20.0, has_record=False, has_bag=False),
-        _few_processes,
+        _as_another_user("prlimit", "--nproc=8"),
     ),
+    Surrounding("lowest priority", _GOES_ON, _as_another_user("nice", "-n", "19")),
     Surrounding(
         "clock set back by an hour", Expected((1,), last_says="victim"), _stepped_clock(-_HOUR_S)
     ),

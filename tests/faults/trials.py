@@ -69,7 +69,7 @@ class Outcome:
 
     Attributes:
         said: the last line of the launcher, which names the cause.
-        took_s: from when the end was due to the end of the launcher.
+        took_s: from when the end was due to the end of the launcher, and of what it leaves behind.
         bag: ``complete``, ``repaired``, ``none``, or what is wrong with it.
         problems: where that is not what must be.
     """
@@ -182,6 +182,8 @@ class Trial:
         # Where the launcher was killed, its reaper has what is left of that time.
         until_s = time.monotonic() if expected.has_record else due_s + expected.within_s
         left = self._left(until_s, is_left)
+        if not expected.has_record:
+            took_s = time.monotonic() - due_s
         lines = [line for line in running.output.splitlines() if line.strip()]
         outcome = Outcome(
             place,
