@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import itertools
 import re
 import shutil
 import signal
@@ -21,7 +20,7 @@ from pathlib import Path
 
 from . import interrupts, launches, plugins, processes, surroundings
 from .cells import BACKENDS, all_cells
-from .trials import Outcome
+from .trials import Outcome, Place
 
 WHAT = ("plugins", "processes", "surroundings", "interrupts")
 _Run = Callable[[Path], Outcome]
@@ -36,15 +35,15 @@ def main() -> int:
         return _launch(options)
     until_s = time.monotonic() + options.hours * 3600
     outcomes: list[Outcome] = []
-    while True:
-        outcomes += _round(options)
-        if time.monotonic() >= until_s:
-            break
+    while not outcomes or time.monotonic() < until_s:
+        for outcome in _round(options):
+            outcomes.append(outcome)
+            print(outcome, flush=True)
+            if options.table:  # now: who interrupts a long row has what there is
+                text = options.table.read_text("utf-8") if options.table.exists() else ""
+                options.table.write_text(with_tables(text, [outcome]), "utf-8")
     failed = [outcome for outcome in outcomes if outcome.problems]
     print(f"{len(outcomes)} runs, {len(failed)} not as they must be")
-    if options.table:
-        text = options.table.read_text("utf-8") if options.table.exists() else ""
-        options.table.write_text(with_tables(text, outcomes), "utf-8")
     return 1 if failed else 0
 
 
@@ -64,54 +63,53 @@ def _launch(options: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
-def _round(options: argparse.Namespace) -> list[Outcome]:
+def _round(options: argparse.Namespace) -> Iterator[Outcome]:
     """Run each of the chosen cells once."""
-    outcomes = []
     with ThreadPoolExecutor(options.jobs) as executor:
-        for outcome in executor.map(lambda run: _in_folder(run, options), _chosen(options)):
-            outcomes.append(outcome)
-            print(outcome, flush=True)
+        yield from executor.map(
+            lambda cell: _in_folder(cell[0], cell[1], options), _chosen(options)
+        )
     if "interrupts" in options.what:
-        backends = options.backend
-        with ThreadPoolExecutor(options.jobs) as executor:
-            series = [executor.submit(_interrupted, each, options) for each in backends]
-            outcomes += itertools.chain.from_iterable(each.result() for each in series)
-    return outcomes
+        for backend in options.backend:
+            step_s = interrupts.STEP_S * (5 if backend == "docker" else 1)
+            yield from interrupts.interrupts(backend, _interrupt_in(options), step_s)
 
 
-def _chosen(options: argparse.Namespace) -> Iterator[_Run]:
+def _chosen(options: argparse.Namespace) -> Iterator[tuple[Place, _Run]]:
     """All cells that are chosen, but for interrupts, whose number depends on the machine."""
     is_chosen = re.compile(options.only).search
+    cells: list[tuple[Place, _Run]] = []
     if "plugins" in options.what:
         for cell in all_cells():
-            if cell.backend in options.backend and is_chosen(str(cell)):
-                yield functools.partial(plugins.run, cell, flood_bytes=options.flood_bytes)
+            of_plugin = functools.partial(plugins.run, cell, flood_bytes=options.flood_bytes)
+            cells.append((plugins.place_of(cell), of_plugin))
     if "processes" in options.what:
         for fault in processes.process_faults():
-            if fault.backend in options.backend and is_chosen(str(fault)):
-                yield functools.partial(processes.run, fault)
+            cells.append((fault.place, functools.partial(processes.run, fault)))
     if "surroundings" in options.what:
         for each in surroundings.surroundings():
-            if each.backend in options.backend and is_chosen(str(each)):
-                yield functools.partial(surroundings.run, each)
+            cells.append((each.place, functools.partial(surroundings.run, each)))
+    for place, run in cells:
+        is_of_backend = any(re.search(rf"(at|,) {each}\b", str(place)) for each in options.backend)
+        if is_of_backend and is_chosen(str(place)):
+            yield place, run
 
 
-def _interrupted(backend: str, options: argparse.Namespace) -> list[Outcome]:
+def _interrupt_in(options: argparse.Namespace) -> Callable[[interrupts.Interrupt], Outcome]:
     def run(interrupt: interrupts.Interrupt) -> Outcome:
-        return _in_folder(functools.partial(interrupts.run, interrupt), options)
+        return _in_folder(interrupt.place, functools.partial(interrupts.run, interrupt), options)
 
-    step_s = interrupts.STEP_S * (5 if backend == "docker" else 1)
-    outcomes = []
-    for outcome in interrupts.interrupts(backend, run, step_s):
-        outcomes.append(outcome)
-        print(outcome, flush=True)
-    return outcomes
+    return run
 
 
-def _in_folder(run: _Run, options: argparse.Namespace) -> Outcome:
+def _in_folder(place: Place, run: _Run, options: argparse.Namespace) -> Outcome:
     folder = Path(tempfile.mkdtemp(prefix="neuros-faults-"))
     try:
-        outcome = run(folder)
+        try:
+            outcome = run(folder)
+        except Exception as error:  # the others go on
+            text = f"{type(error).__name__}: {error}"
+            outcome = Outcome(place, -1, "", 0.0, "", text, {}, [text.partition("\n")[0]])
         if outcome.problems and options.keep:
             kept = options.keep / re.sub(r"\W+", "_", str(outcome.place))
             shutil.rmtree(kept, ignore_errors=True)

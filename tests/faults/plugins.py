@@ -16,6 +16,11 @@ DURATION_S = 1.5
 _LOOKS_FOR_S = 1.0
 
 
+def place_of(cell: Cell) -> Place:
+    """Where a cell stands in the tables."""
+    return Place(f"faults of plugins, {cell.backend}", cell.fault, cell.place)
+
+
 def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
     """Run a cell in an empty folder and judge it.
 
@@ -31,8 +36,7 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
             within_s=GIVES_UP_AFTER_S,
             has_traceback=_has_traceback(cell),
         )
-        place = Place(f"faults of plugins, {cell.backend}", cell.fault, cell.place)
-        outcome = trial.outcome(place, running, due_s, expected)
+        outcome = trial.outcome(place_of(cell), running, due_s, expected)
     if cell.ends_by_itself and outcome.record:
         # Both count from the first hook.
         outcome.took_s = outcome.record["wall_s"] - DURATION_S

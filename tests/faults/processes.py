@@ -16,7 +16,7 @@ from launching import Running
 from machines import Machine
 
 from .cells import BACKENDS
-from .trials import Expected, Outcome, Place, Trial, containers_of
+from .trials import POLL_S, Expected, Outcome, Place, Trial, containers_of
 
 SIGNALS = {
     "kill -9": signal.SIGKILL,
@@ -31,6 +31,7 @@ MOMENTS = {"starting": "import", "running": "function", "ending": "finalise"}
 _DURATION_S = 1.0
 _STOPPED_S = 2.0
 _CLEANED_UP_WITHIN_S = 15.0
+_COMES_UP_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,29 @@ def _strike(fault: ProcessFault, trial: Trial, running: Running, engine: OwnEngi
     elif fault.target == "launcher":
         pid = running.process.pid
     else:
-        pid = next(p.pid for p in trial.processes() if _is_target(p, fault.target))
+        pid = _pid_of(fault.target, trial)
     os.kill(pid, SIGNALS[fault.signal])
     if fault.signal == "stopped for 2 s":
         time.sleep(_STOPPED_S)
         os.kill(pid, signal.SIGCONT)
 
 
+def _pid_of(target: str, trial: Trial) -> int:
+    """The process that is, or is about to become, what it was started for."""
+    until_s = time.monotonic() + _COMES_UP_WITHIN_S
+    while time.monotonic() < until_s:
+        for process in trial.processes():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if _is_target(process, target):
+                    return int(process.pid)
+        time.sleep(POLL_S)
+    raise RuntimeError(f"no {target} has come up")
+
+
 def _is_target(process: psutil.Process, target: str) -> bool:
     if target == "reaper":
         return "NEUROS_GUARDED_RUN" in process.environ()
-    return process.cmdline()[1:4] == ["-m", "neuros.cli", target]
+    return [*process.cmdline()[1:4]] == ["-m", "neuros.cli", target]
 
 
 def _await_no_containers(folder: Path, engine: OwnEngine) -> None:
