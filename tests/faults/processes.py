@@ -28,7 +28,8 @@ TARGETS = ("launcher", "reaper", "recorder", "dashboard", "engine")
 MOMENTS = {"starting": "import", "running": "function", "ending": "finalise"}
 """Where the run stands, and the place of a plugin that it stands at then."""
 
-_DURATION_S = 1.0
+_DURATION_S = 2.0
+_LONG_S = 20.0
 _STOPPED_S = 2.0
 _CLEANED_UP_WITHIN_S = 15.0
 _COMES_UP_WITHIN_S = 5.0
@@ -59,6 +60,12 @@ class ProcessFault:
     def is_fatal(self) -> bool:
         """Whether its target dies of it at once."""
         return self.signal in ("kill -9", "SIGSEGV")
+
+    @property
+    def duration_s(self) -> float:
+        """Of the run: one that ends with the fault must not end before, on a busy machine."""
+        ends_it = self.target in ("launcher", "engine") and self.signal != "stopped for 2 s"
+        return _LONG_S if ends_it and self.moment == "running" else _DURATION_S
 
     @property
     def expected(self) -> Expected:
@@ -95,7 +102,9 @@ def run(fault: ProcessFault, folder: Path) -> Outcome:
         trial = Trial(folder, at, MOMENTS[fault.moment])
         address = {} if engine is None else {"DOCKER_HOST": engine.address}
         options = ["--dashboard"] if fault.target == "dashboard" else []
-        with trial.start(fault.backend, *options, duration_s=_DURATION_S, **address) as running:
+        with trial.start(
+            fault.backend, *options, duration_s=fault.duration_s, **address
+        ) as running:
             trial.await_strike(running)
             struck_s = time.monotonic()
             _strike(fault, trial, running, engine)
