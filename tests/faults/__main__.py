@@ -71,8 +71,7 @@ def _round(options: argparse.Namespace) -> Iterator[Outcome]:
         )
     if "interrupts" in options.what:
         for backend in options.backend:
-            step_s = interrupts.STEP_S * (5 if backend == "docker" else 1)
-            yield from interrupts.interrupts(backend, _interrupt_in(options), step_s)
+            yield from interrupts.interrupts(backend, _interrupt_in(options), options.step)
 
 
 def _chosen(options: argparse.Namespace) -> Iterator[tuple[Place, _Run]]:
@@ -160,6 +159,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--backend", action="append", choices=BACKENDS, help="repeatable (all)")
     parser.add_argument("--only", default="", metavar="REGEX", help="cells whose name has that")
     parser.add_argument("--hours", type=float, default=0.0, help="repeat for so long (once)")
+    parser.add_argument(
+        "--step", type=float, default=interrupts.STEP_S, help="seconds between interrupts (0.1)"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="so many runs at a time (1)")
     parser.add_argument("--flood-bytes", type=int, default=1 << 30, metavar="N", help="(2**30)")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the folders of failed runs")

@@ -42,7 +42,7 @@ class Interrupt:
 
 
 def interrupts(
-    backend: str, run: Callable[[Interrupt], Outcome], step_s: float = STEP_S
+    backend: str, run: Callable[[Interrupt], Outcome], step_s: float
 ) -> Iterator[Outcome]:
     """Run all moments of a run on a back end, until it has ended by itself before."""
     for count in COUNTS:
