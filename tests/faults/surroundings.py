@@ -164,7 +164,10 @@ def _full_shared_memory(self: Surrounding, backend: str, folder: Path) -> Outcom
 
 
 def _temporary(inodes: int) -> Callable[[Surrounding, str, Path], Outcome]:
-    """No room in the temporary folder, and so many inodes, three of which are in use."""
+    """No room in the temporary folder, and so many inodes, three of which are in use.
+
+    Domains are locked there: with its own network, this run meets no other all the same.
+    """
     full = (
         f"mount -t tmpfs -o size=4k,nr_inodes={inodes} tmpfs /tmp && echo >/tmp/1 && touch /tmp/2"
     )
@@ -179,9 +182,10 @@ def _temporary(inodes: int) -> Callable[[Surrounding, str, Path], Outcome]:
 def _apart(
     self: Surrounding, backend: str, folder: Path, prepare: str, **environment: str
 ) -> Outcome:
-    """Run with mounts of its own; they go with the last process of the run."""
+    """Run with mounts and a network of its own; they go with the last process of the run."""
     trial = Trial(folder, "pass_by", "function")
-    through = ["unshare", "--mount", "sh", "-c", f'{prepare} && exec "$@"', "sh"]
+    prepare = f'ip link set lo up && {prepare} && exec "$@"'
+    through = ["unshare", "--mount", "--net", "sh", "-c", prepare, "sh"]
     with trial.start(backend, duration_s=_DURATION_S, through=through, **environment) as running:
         struck_s = trial.await_strike(running)
         return _outcome(self, backend, trial, running, struck_s)

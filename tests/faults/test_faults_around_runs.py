@@ -65,7 +65,7 @@ def check_process(fault: ProcessFault, folder: Path) -> None:
 
 def check_surrounding(cell: SurroundingCell, folder: Path) -> None:
     require_machines()
-    require("gcc")
+    require("gcc", "ip")
     if cell.backend == "docker":
         require_containers()
     check(surroundings.run(cell, folder))
