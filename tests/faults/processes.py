@@ -80,8 +80,10 @@ class ProcessFault:
         if self.target == "launcher":
             return Expected((143,), last_says="ended by SIGTERM")
         if self.target == "engine":
-            says = "" if self.signal == "SIGTERM" else "the Docker engine went away"
-            return Expected((1, 4) if self.signal == "SIGTERM" else (4,), last_says=says)
+            codes = (1, 4) if self.signal == "SIGTERM" else (4,)  # it ends its containers first
+            says = "" if self.signal == "SIGTERM" else "the Docker engine "
+            is_up = self.moment != "starting"
+            return Expected(codes, last_says=says, has_record=is_up, has_bag=is_up)
         return Expected(within_s=_DURATION_S + 6.0)
 
 

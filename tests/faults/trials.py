@@ -146,14 +146,19 @@ class Trial:
         )
 
     def await_strike(self, running: Running) -> float:
-        """Wait for the fault; returns when it struck, on the monotonic clock, or the time now."""
+        """Wait for the fault; returns when it struck, on the monotonic clock.
+
+        Returns the time now if the run has ended before. Raises ``TimeoutError``.
+        """
         struck = self.run_folder / "victim" / "struck"
         deadline_s = time.monotonic() + _STRIKES_WITHIN_S
         while not struck.exists() or not struck.read_text():
             if not running.read(POLL_S):
-                if running.process.poll() is not None or time.monotonic() > deadline_s:
+                if running.process.poll() is not None:
                     return time.monotonic()
                 time.sleep(POLL_S)  # its output may be closed
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"no fault struck in {_STRIKES_WITHIN_S:g} s")
         return float(struck.read_text())
 
     def processes(self) -> Iterator[psutil.Process]:
