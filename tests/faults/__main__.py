@@ -112,7 +112,8 @@ def _in_folder(place: Place, run: _Run, options: argparse.Namespace) -> Outcome:
         if outcome.problems and options.keep:
             kept = options.keep / re.sub(r"\W+", "_", str(outcome.place))
             shutil.rmtree(kept, ignore_errors=True)
-            shutil.copytree(folder, kept, symlinks=True)
+            sockets = shutil.ignore_patterns("*.sock")
+            shutil.copytree(folder, kept, symlinks=True, ignore=sockets)
             (kept / "output.txt").write_text(outcome.output)
         return outcome
     finally:

@@ -291,19 +291,24 @@ def _suspended_at(strikes_at: str) -> Callable[[Surrounding, str, Path], Outcome
         duration_s = _DURATION_S + (0.0 if strikes_at == "finalise" else _SUSPENDED_S)
         with trial.start(backend, duration_s=duration_s) as running:
             trial.await_strike(running)
-            processes = list(trial.processes())
-            for process in processes:
-                process.suspend()
-            time.sleep(_SUSPENDED_S)
-            for process in processes:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(process.pid, signal.SIGCONT)
+            numbers = [process.pid for process in trial.processes()]
+            try:
+                _signal_all(numbers, signal.SIGSTOP)
+                time.sleep(_SUSPENDED_S)
+            finally:
+                _signal_all(numbers, signal.SIGCONT)
             outcome = _outcome(self, backend, trial, running, time.monotonic())
         warnings = [line for line in running.output.splitlines() if line.startswith("[WARN]")]
         outcome.problems += [f"warns: {line}" for line in warnings]
         return outcome
 
     return run
+
+
+def _signal_all(processes: Sequence[int], number: int) -> None:
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, number)
 
 
 def _outcome(
