@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import re
 import time
@@ -11,7 +10,7 @@ import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from endings import GONE_WITHIN_S, dead_shared_memory
+from endings import GONE_WITHIN_S, dead_shared_memory, is_stale
 from launching import Finished, Running, launch, start
 
 MARK = "NEUROS_TEST_ENDING"
@@ -139,7 +138,7 @@ class Bench:
         for socket in self.folder.rglob("control.sock"):
             return str(socket)
         for domain in re.findall(r"ROS domain (\d+) \(first free", "".join(self.outputs)):
-            if _is_stale(Path(f"/tmp/neuros-domain-{domain}.lock")):
+            if is_stale(Path(f"/tmp/neuros-domain-{domain}.lock")):
                 return f"the lock file of domain {domain}"
         return " ".join(dead_shared_memory(self.began_s))
 
@@ -155,14 +154,6 @@ def _processes() -> Iterator[tuple[int, list[str], str]]:
             command = (folder / "cmdline").read_bytes().decode(errors="replace")
             if environment != [""] or command:  # else it is a zombie
                 yield int(folder.name), environment, command.replace("\0", " ").strip()
-
-
-def _is_stale(lock: Path) -> bool:
-    """Whether a lock file is there that nobody holds."""
-    with contextlib.suppress(OSError), open(lock) as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
-    return False
 
 
 @contextlib.contextmanager

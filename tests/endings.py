@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 from pathlib import Path
 
 from neuros.backends.shared_memory import _dead_groups
@@ -24,3 +26,16 @@ def dead_shared_memory(since_s: float) -> list[str]:
     groups = _dead_groups(Path("/dev/shm"), since_s)
     names = [name for group in groups for name, _ in group.files]
     return [name for name in names if not name.startswith("lttng-")]
+
+
+def is_stale(lock: Path) -> bool:
+    """Whether the lock file of a domain is there, and nobody holds it."""
+    with contextlib.suppress(OSError), open(lock) as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    return False
+
+
+def stale_locks() -> list[str]:
+    """Lock files of domains that nobody holds."""
+    return [str(lock) for lock in Path("/tmp").glob("neuros-domain-*.lock") if is_stale(lock)]

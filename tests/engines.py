@@ -68,19 +68,36 @@ class OwnEngine:
         """A client, which the caller closes."""
         return connect({"DOCKER_HOST": self.address})
 
+    @property
+    def pid(self) -> int:
+        """Of the daemon."""
+        assert self._daemon is not None
+        return self._daemon.pid
+
     def kill(self) -> None:
         """End the daemon with SIGKILL; its containers run on."""
         assert self._daemon is not None
-        part = Path("/proc", (self._folder / "exec/containerd/containerd.pid").read_text())
         self._daemon.kill()
-        self._daemon.wait()
-        wait_until(lambda: not part.exists())  # it would be in the way of the next one
+        self.await_end()
+
+    def await_end(self) -> None:
+        """Wait until the daemon has ended, which was told to, and all that would be in the way."""
+        assert self._daemon is not None
+        self._daemon.wait(_SOON_S)
+        wait_until(lambda: not self._has_containerd())
 
     def stop(self) -> None:
         """End the daemon, and its containers with it."""
         if self._daemon is not None and self._daemon.poll() is None:
             self._daemon.terminate()
             self._daemon.wait(_SOON_S)
+
+    def _has_containerd(self) -> bool:
+        try:
+            pid = (self._folder / "exec/containerd/containerd.pid").read_text()
+        except FileNotFoundError:
+            return False
+        return Path("/proc", pid).exists()
 
     def _answers(self) -> bool:
         assert self._daemon is not None

@@ -25,7 +25,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXAMPLES = REPOSITORY / "examples"
@@ -145,19 +145,22 @@ def start(
     *arguments: str,
     cwd: Path,
     through: Sequence[str] = (),
+    program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "launch"),
+    stdin: int | IO[bytes] = subprocess.DEVNULL,
     **environment: str,
 ) -> Running:
     """Start ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd``; ``-o`` is relative to it.
 
-    ``through`` is a command that executes the one that follows it, with the same process id.
+    ``through`` is a command that executes the one that follows it, with the same process id;
+    ``program`` is what launches.
     """
     inherited = {key: value for key, value in os.environ.items() if key not in _UNWANTED}
     before = _run_folders(cwd)
     process = subprocess.Popen(
-        [*through, sys.executable, "-m", "neuros.cli", "launch", str(project), *arguments],
+        [*through, *program, str(project), *arguments],
         cwd=cwd,
         env={**inherited, **environment},
-        stdin=subprocess.DEVNULL,
+        stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,

@@ -61,6 +61,11 @@ class UnixListener:
             return self._socket.accept()[0]
         except BlockingIOError:
             return None
+        except OSError as error:
+            raise EnvironmentFault(
+                f"nodes cannot connect to their launcher ({error.strerror}): allow it more open"
+                " files (ulimit -n)"
+            ) from error
 
     def close(self) -> None:
         self._socket.close()

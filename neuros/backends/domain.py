@@ -152,8 +152,12 @@ def _open(path: Path) -> int | None:
         descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
     except FileExistsError:
         return _open(path)
-    except OSError:
+    except PermissionError:
         return None
+    except OSError as error:
+        raise EnvironmentFault(
+            f"{path}: the lock file of a ROS domain cannot be made ({error.strerror}): make room"
+        ) from error
     os.fchmod(descriptor, 0o666)  # whatever the umask: all users take part
     return descriptor
 

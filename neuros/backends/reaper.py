@@ -23,7 +23,6 @@ import os
 import select
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -55,7 +54,7 @@ class Reaper:
         self._run_id = run_id
         self._process = process
         self._pipe: int | None = pipe
-        self._orders = Orders(started_s=time.time())
+        self._orders = Orders()
 
     @classmethod
     def start(

@@ -31,14 +31,19 @@ _REMOVE_S = 5.0
 class Orders:
     """Orders of the launcher to the reaper so far."""
 
-    def __init__(self, started_s: float) -> None:
-        self.started_s = started_s
+    def __init__(self) -> None:
+        self._started_s, self._monotonic_s = time.time(), time.monotonic()
         self.grace_s = _GRACE_S
         self.sessions: list[int] = []
         self.paths: list[str] = []
         self.locks: list[tuple[int, str]] = []
         self.cleaners: list[tuple[str, str, str]] = []
         self.is_finished = False
+
+    @property
+    def started_s(self) -> float:
+        """When this began, in Unix time; the clock may have been set back since then."""
+        return min(self._started_s, time.time() - (time.monotonic() - self._monotonic_s))
 
     def take(self, order: str, value: object) -> None:
         if order == "session" and isinstance(value, int):
@@ -58,7 +63,7 @@ def main(run_id: str) -> None:
     """Wait for the pipe on standard input to close, clean up."""
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
         signal.signal(name, signal.SIG_IGN)
-    orders = Orders(started_s=time.time())
+    orders = Orders()
     processes = RunProcesses(run_id)
     os.write(1, READY)
     nowhere = os.open(os.devnull, os.O_WRONLY)

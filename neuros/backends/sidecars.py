@@ -58,7 +58,8 @@ def start_sidecar(
             )
     except OSError as error:
         raise EnvironmentFault(f"the {what} cannot be started: {error}") from error
-    os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+    with contextlib.suppress(OSError):  # it has a lower one already, which only root may raise
+        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
     return process
 
 

@@ -158,10 +158,11 @@ def _signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
     }
     previous[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None)
     waker = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py had them wait
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py had them wait
     try:
         yield noted, reader
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # all is said: they change nothing more
         signal.set_wakeup_fd(waker)
         for number, handler in previous.items():
             signal.signal(number, handler)

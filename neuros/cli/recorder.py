@@ -51,6 +51,8 @@ def _run_recorder(options: argparse.Namespace) -> int:
             f"the recording has stopped: {reason}; what is in the bag can be read, and"
             f" neuros bag repair {run} adds what is not"
         )
+        with contextlib.suppress(OSError):
+            counts = counts_of(run)
     print(json.dumps({"counts": counts, "problems": problems.texts}), flush=True)
     return 0
 

@@ -58,6 +58,10 @@ class Shutdown:
         """Whether something outlasts even SIGKILL; the reaper will try on for a while."""
         return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
 
+    def excuse(self, still_s: float) -> None:
+        """The run stood still for so long: what nodes have for their end begins where it was."""
+        self._deadline_s += still_s
+
     def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
         """Let packets under way arrive, and then end; only a run that is not ending already.
 

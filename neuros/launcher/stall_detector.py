@@ -100,6 +100,12 @@ class StallDetector:
         self._moved_s = now_s
         self._has_explained = False
 
+    def excuse(self, still_s: float) -> None:
+        """Nobody could be heard for so long: that is no silence and no standstill of a node."""
+        self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
+        self._moved_s += still_s
+        self._next_remark_s += still_s
+
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
         if any(self._executing(name) for name in self._reports):

@@ -33,6 +33,8 @@ _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
 _PARTED_S = 1.0
 """A process that has hung up ends within this time, or something has closed its descriptors."""
+_KEPT_STILL_S = 1.0
+"""Between two looks at the time there is a fifth of that, unless this process may not run."""
 
 
 class Supervisor:
@@ -118,6 +120,7 @@ class Supervisor:
         )
         self._signals = signals
         self._refused: set[ControlLink] = set()
+        self._looked_s = time.monotonic()
 
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
@@ -126,6 +129,7 @@ class Supervisor:
             if self._shutdown.phase is Phase.RUNNING:
                 self._processes.add(self._launcher.start(self._files, self._environment))
             has_shown = True
+            self._looked_s = time.monotonic()
             while self._processes and not self._shutdown.is_hopeless:
                 self._channels.wait(self._pause_s(has_shown))
                 self._shutdown.heed_signals()
@@ -266,6 +270,11 @@ class Supervisor:
 
     def _look_at_time(self) -> None:
         now_s = time.monotonic()
+        still_s, self._looked_s = now_s - self._looked_s, now_s
+        if still_s > _KEPT_STILL_S:  # then the nodes may have been stopped, too
+            self._detector.excuse(still_s)
+            self._backlog.begin_anew()
+            self._shutdown.excuse(still_s)
         self._shutdown.heed_peers()
         self._shutdown.look(now_s)
         self._keep_pause()

@@ -15,6 +15,7 @@ import pytest
 
 from neuros.backends.domain import choose_domain
 from neuros.backends.reaper import Reaper
+from neuros.backends.reaper_program import Orders
 from neuros.backends.run_processes import RUN_ID
 
 IGNORES_SIGTERM = """
@@ -45,6 +46,7 @@ LAUNCHER = """
 import os, subprocess, sys, time
 from pathlib import Path
 from neuros.backends.reaper import Reaper
+from neuros.backends.reaper_program import Orders
 from neuros.backends.node_command import process_environment
 reaper = Reaper.start(sys.argv[1])
 print(reaper.pid, flush=True)
@@ -276,3 +278,13 @@ def test_the_launcher_waits_for_no_import_that_only_removing_files_needs() -> No
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout == "\n"
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
+def test_what_a_run_has_left_is_told_by_its_age_though_the_clock_was_set(
+    step_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before_s, orders = time.time(), Orders()
+    clock = time.time
+    monkeypatch.setattr(time, "time", lambda: clock() + step_s)
+    assert before_s + min(step_s, 0.0) - 0.1 <= orders.started_s <= before_s + min(step_s, 0.0) + 1

@@ -16,6 +16,7 @@ from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
 from neuros.backends.registered import choose
+from neuros.cli.launch import _signals_noted
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
@@ -317,6 +318,45 @@ def test_ctrl_c_without_a_run_is_no_traceback(
 
     monkeypatch.setattr("neuros.cli.projects._validate", interrupted)
     assert main(["validate", "."]) == 130
+
+
+PRINTS = """
+import sys
+from neuros.cli.node import _leave_out_what_has_no_room
+for name in ("stdout", "stderr"):
+    _leave_out_what_has_no_room(name)
+    print("said on", name, file=getattr(sys, name))
+    getattr(sys, name).flush()
+"""
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(("log", "is_full"), [("/dev/full", True), ("log", False)])
+def test_where_the_disk_is_full_a_node_prints_into_the_void(
+    log: str, is_full: bool, unbuffered: str
+) -> None:
+    with open(log, "ab") as file:
+        process = subprocess.run(
+            [sys.executable, "-c", PRINTS],
+            stdout=file,
+            stderr=file,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            check=False,
+        )
+    assert process.returncode == 0
+    assert is_full or Path(log).read_text() == "said on stdout\nsaid on stderr\n"
+
+
+def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as launch.py does
+    try:
+        with _signals_noted() as (signals, _):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert signals == [signal.SIGINT]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert signal.sigwait([signal.SIGINT]) == signal.SIGINT, "it waits, and is never heeded"
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 # ------------------------------------------------------------------ parts

@@ -13,7 +13,7 @@ import pytest
 from containers import require_containers
 
 from .cells import BACKENDS, FAULTS, PLACES, Cell, all_cells
-from .running import run
+from .plugins import run
 
 _FLOOD_BYTES = 1 << 24
 _ROUND = tuple(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -145,3 +147,16 @@ def test_a_unix_socket_may_lie_deep(tmp_path: Path) -> None:
     accepted.close()
     link.close()
     listener.close()
+
+
+def test_a_launcher_without_free_file_descriptors_says_so(tmp_path: Path) -> None:
+    listener = UnixListener(tmp_path)
+    listener.open()
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with closing(listener), closing(connect(listener.address)):
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (0, limits[1]))
+            with pytest.raises(EnvironmentFault, match=r"Too many open files.*ulimit -n"):
+                listener.accept()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)

@@ -83,6 +83,15 @@ def test_a_packet_that_arrives_is_a_movement() -> None:
     assert detector.rested_s(4.0) == 1.0
 
 
+def test_while_the_launcher_itself_stood_still_nobody_rested_or_was_silent() -> None:
+    detector = detector_of("a")
+    detector.excuse(10.0)
+    assert not detector.has_just_stalled(14.9)
+    assert remarks(detector, 14.9) == []
+    assert detector.has_just_stalled(15.0)
+    assert len(remarks(detector, 15.0)) == 1, "a has not reported for 5 s"
+
+
 @given(st.lists(st.tuples(st.floats(0.01, 3.0), st.booleans()), max_size=30))
 def test_rest_is_the_time_since_the_last_movement(steps: list[tuple[float, bool]]) -> None:
     detector, now_s, moved_s, count = detector_of("a"), 0.0, 0.0, 0

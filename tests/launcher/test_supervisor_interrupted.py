@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -241,3 +242,25 @@ def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
     explains = "host.up(); host.tell('explanation', lines=['waits for `x` from b', 'and more']); "
     run(a=explains + "host.tell('shutdown', reason='', drain_s=5); host.serve()")
     assert "a waits for `x` from b; and more" in run.output.said
+
+
+def test_a_run_that_was_stopped_while_it_ended_has_its_time_afterwards(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neuros.launcher.shutdown.STOP_S", 1.0)
+
+    def stand_still() -> None:
+        time.sleep(1.5)  # as under SIGSTOP
+        (run.folder / "goes on").touch()
+
+    run.when_file_exists("told", stand_still)
+    waits = """
+import os, time
+host.up(); host.tell('shutdown', reason='', drain_s=5); host.wait_for('stop')
+open('told', 'w')
+while not os.path.exists('goes on'):
+    time.sleep(0.01)
+host.report(is_final=True)
+"""
+    outcome = run(a=waits)
+    assert (outcome.exit_code, outcome.failures) == (0, [])

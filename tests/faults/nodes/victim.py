@@ -30,6 +30,11 @@ def kill():
     signal.pause()
 
 
+def kill_later():
+    """While the test steps the clock."""
+    threading.Timer(0.5, kill).start()
+
+
 def stop_and_continue():
     """Stand still for a second; process 1 of a container cannot, and is stopped from outside."""
     if os.getpid() == 1:
@@ -99,6 +104,23 @@ def flood_output():
     line = b"x" * 1023 + b"\n"
     for _ in range(_SIZE // len(line)):
         os.write(1, line)
+
+
+def pass_by():
+    """No fault of the plugin's: the test does something to the run."""
+
+
+def dawdle():
+    """So that the run stays where it is, while the test does something to it."""
+    time.sleep(0.6)
+
+
+def print_much():
+    """As a plugin does: through Python, and through its logger."""
+    for _ in range(_SIZE // 1024):
+        print("x" * 1023)
+    sys.stdout.flush()
+    print("to standard error", file=sys.stderr)
 
 
 def binary_output():
