@@ -5,6 +5,7 @@ Each is started before the nodes or beside them, and ended after them.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess

@@ -416,11 +416,11 @@ def test_a_core_that_this_machine_lacks_is_named_with_its_place_and_the_ways_out
     project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     project.write_text(
-        project.read_text().replace('"name": "b"', '"affinity": [9999], "name": "b"')
+        project.read_text().replace('"name": "b"', '"affinity": [999], "name": "b"')
     )
     assert main(["launch", "."]) == 4
     assert re.search(
-        r"project\.json:1:\d+: /nodes/1/affinity: node 'b' asks for core 9999\n"
+        r"project\.json:1:\d+: /nodes/1/affinity: node 'b' asks for core 999\n"
         r"NeuROS may use cores? [\d, ]+ here: choose others with --set"
         r" nodes\.NAME\.affinity=\[\.\.\.\], or leave it to the kernel with --no-placement",
         capsys.readouterr().err,
