@@ -351,9 +351,9 @@ def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as launch.py does
     try:
         with _signals_noted() as (signals, _):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             assert signals == [signal.SIGINT]
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         assert signal.sigwait([signal.SIGINT]) == signal.SIGINT, "it waits, and is never heeded"
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
