@@ -55,6 +55,7 @@ BY_NAME = {
         "cli/test_command_line.py::test_what_could_not_be_started",
         "cli/test_validate_command.py",
         "doctor/test_checks.py::test_a_gpu_tool",
+        "faults/",
         "fuzz/",
         "simulators/test_mujoco_opengl.py::TestDoctor",
         "test_installation.py",
