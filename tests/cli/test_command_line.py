@@ -415,9 +415,7 @@ def test_more_processes_than_find_each_other_are_refused_and_the_ways_out_are_na
 def test_a_core_that_this_machine_lacks_is_named_with_its_place_and_the_ways_out(
     project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    project.write_text(
-        project.read_text().replace('"name": "b"', '"affinity": [999], "name": "b"')
-    )
+    project.write_text(project.read_text().replace('"name": "b"', '"affinity": [999], "name": "b"'))
     assert main(["launch", "."]) == 4
     assert re.search(
         r"project\.json:1:\d+: /nodes/1/affinity: node 'b' asks for core 999\n"
