@@ -14,13 +14,14 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.request import LaunchOptions, SweepOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.projects import add_project, load_with_messages
-from neuros.errors import NeurosError, UsageError
+from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
 
 if TYPE_CHECKING:
@@ -30,6 +31,16 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 SUBJECTS = {"--node-graph": "graph", "--visualisations": "packets"}
+
+# <linux/sched.h>, <linux/sockios.h>, <net/if.h>
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
+_SIOCSIFFLAGS, _IFF_UP = 0x8914, 1
+
+_REMEDY = (
+    "run it as root, allow user namespaces (sysctl kernel.unprivileged_userns_clone=1,"
+    " kernel.apparmor_restrict_unprivileged_userns=0, user.max_user_namespaces > 0), use"
+    " --backend docker, or leave --isolate out"
+)
 
 _SWEEP_EPILOG = """\
 exit codes:
@@ -83,7 +94,6 @@ def _launch(parsed: argparse.Namespace) -> int:
     with _signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
-        from neuros.backends.isolation import enter_own_network
         from neuros.cli.environments import make_shown_environments
 
         options = parsed_as(LaunchOptions, parsed)
@@ -96,9 +106,43 @@ def _launch(parsed: argparse.Namespace) -> int:
             return ended
         views = _views(options, plan.back_end)  # the dashboard listens where the browser is
         if options.isolate and not plan.back_end.has_own_network:
-            enter_own_network()
+            _enter_own_network()
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         return int(run.run()["exit_code"])
+
+
+def _enter_own_network() -> None:
+    """Leave the network of this machine, for good: ``--isolate``.
+
+    This process enters a Linux network namespace with loopback alone, and so does all that it
+    starts. An ordinary user gets one with a user namespace, in which everything still belongs to
+    that user; root needs none.
+
+    Raises:
+        EnvironmentFault: if that is not allowed here, or this process has threads already.
+    """
+    import ctypes
+    import fcntl
+    import struct
+
+    is_root = os.geteuid() == 0
+    user, group = os.geteuid(), os.getegid()
+    unshare = ctypes.CDLL(None, use_errno=True).unshare
+    if unshare(_NEW_NET if is_root else _CLONE_NEWUSER | _NEW_NET):
+        reason = os.strerror(ctypes.get_errno())
+        raise EnvironmentFault(f"--isolate: no network of its own here ({reason}): {_REMEDY}")
+    try:
+        if not is_root:
+            itself = Path("/proc/self")
+            (itself / "setgroups").write_text("deny")
+            (itself / "uid_map").write_text(f"{user} {user} 1")
+            (itself / "gid_map").write_text(f"{group} {group} 1")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", _IFF_UP))
+    except OSError as error:
+        raise EnvironmentFault(
+            f"--isolate: no network of its own here ({error.strerror}): {_REMEDY}"
+        ) from error
 
 
 def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:

@@ -1,4 +1,4 @@
-"""What a viewer is, which are registered, and the choice of those that show a run."""
+"""Viewers of a run: their interface, their registry, and the choice among them."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class Dashboard:
     """Serves one run until that is over.
 
     Args:
-        plan: what :func:`neuros.viewers.project_view.project_view` tells of the project.
+        plan: what :func:`neuros.viewers.web.project_view` tells of the project.
         pages: shared with ``run``.
     """
 

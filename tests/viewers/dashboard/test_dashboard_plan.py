@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from neuros.project.load import load_project
-from neuros.viewers.project_view import project_view
+from neuros.viewers.web import project_view
 
 BOOL = "std_msgs/msg/Bool"
 NODE = {
