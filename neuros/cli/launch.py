@@ -128,7 +128,7 @@ def _enter_own_network() -> None:
     is_root = os.geteuid() == 0
     user, group = os.geteuid(), os.getegid()
     unshare = ctypes.CDLL(None, use_errno=True).unshare
-    if unshare(_NEW_NET if is_root else _CLONE_NEWUSER | _NEW_NET):
+    if unshare(_CLONE_NEWNET if is_root else _CLONE_NEWUSER | _CLONE_NEWNET):
         reason = os.strerror(ctypes.get_errno())
         raise EnvironmentFault(f"--isolate: no network of its own here ({reason}): {_REMEDY}")
     try:
