@@ -65,6 +65,8 @@ BY_NAME = {
         "documentation/test_site_parts.py::TestReference",
         "examples/test_whiskeye_network.py",
         "examples/test_whiskeye_plugins.py",
+        "examples/test_whiskeye_room.py",
+        "examples/test_whiskeye_training.py",
         "project/test_project_split.py",
         "recording/test_bag.py",
         "simulators/convert/test_sdf_kinematics.py",
