@@ -40,13 +40,16 @@ class HeadDirectionNetwork:
 
     Args:
         seed: of the initial membrane potentials, the only randomness; 1 to 2**32 - 1.
+        beside: a network in whose kernel this one is created, with equal potentials. Settle and
+            step that one: both go on together, and only :meth:`correct` makes a difference.
 
     The heading starts at zero, which is what is decoded at the end of :meth:`settle`.
     Deterministic: the same seed and the same steps give the same headings, bit for bit.
     """
 
-    def __init__(self, seed: int = 1) -> None:
-        self._nest = nest = reset_kernel(seed, resolution_ms=RESOLUTION_MS)
+    def __init__(self, seed: int = 1, beside: HeadDirectionNetwork | None = None) -> None:
+        nest = beside._nest if beside else reset_kernel(seed, resolution_ms=RESOLUTION_MS)
+        self._nest = nest
         self._angles = 2.0 * np.pi * (np.arange(NEURONS_PER_RING) + 0.5) / NEURONS_PER_RING
         self._left, self._right = self._ring(), self._ring()
         for ring, rotation in ((self._left, ROTATION_RAD), (self._right, -ROTATION_RAD)):
@@ -54,7 +57,12 @@ class HeadDirectionNetwork:
         self._drive_left, self._drive_right = nest.Create("dc_generator", 2)
         nest.Connect(self._drive_left, self._left, syn_spec={"delay": DELAY_MS})
         nest.Connect(self._drive_right, self._right, syn_spec={"delay": DELAY_MS})
-        self._stepper = Stepper(strict=True)
+        self._stepper = beside._stepper if beside else Stepper(strict=True)
+        self._together = [self]
+        if beside:
+            beside._together.append(self)
+            self._left.V_m, self._right.V_m = beside._left.V_m, beside._right.V_m
+        self._correction: Any = None  # made when it is needed: it costs time
         self._reader = SpikeReader(self._left + self._right, self._stepper, DELAY_MS)
         self._population = PopulationVector(np.tile(self._angles, 2))
         self._raw_rad = self._zero_rad = self._heading_rad = 0.0
@@ -79,13 +87,15 @@ class HeadDirectionNetwork:
         windows = round(duration_s / SETTLE_WINDOW_S)
         if duration_s < 1.0:
             raise ValueError(f"settling for {duration_s!r} s is too short: the bump needs 1 s")
-        self._start_bump()
+        for network in self._together:
+            network._start_bump()
         decoded = []
         for _ in range(windows):
             self.step(0.0, SETTLE_WINDOW_S)
-            decoded.append(self._raw_rad)
-        self._zero_rad = float(np.angle(np.exp(1j * np.array(decoded[-25:])).sum()))
-        self._heading_rad = 0.0
+            decoded.append([network._raw_rad for network in self._together])
+        zeros_rad = np.angle(np.exp(1j * np.array(decoded[-25:])).sum(axis=0))
+        for network, zero_rad in zip(self._together, zeros_rad, strict=True):
+            network._zero_rad, network._heading_rad = float(zero_rad), 0.0
         return self._heading_rad
 
     def step(self, rate_rad_s: float, duration_s: float) -> float:
@@ -93,10 +103,27 @@ class HeadDirectionNetwork:
 
         Raises ``ValueError`` where the duration is not a whole number of :attr:`quantum_s`.
         """
-        self._set_drive(rate_rad_s)
+        for network in self._together:
+            network._set_drive(rate_rad_s)
         self._stepper.advance_s(duration_s)
-        self._decode(self._reader.read())
+        for network in self._together:
+            network._decode(network._reader.read())
         return self._heading_rad
+
+    def correct(self, heading_rad: float, peak_pa: float, width_rad: float) -> None:
+        """Pull the bump towards a heading, from here on: a Gaussian current into both rings.
+
+        A peak of 0 lets it go.
+        """
+        if self._correction is None:
+            if peak_pa == 0.0:
+                return
+            self._stepper.release()
+            self._correction = self._nest.Create("dc_generator", NEURONS_PER_RING)
+            for ring in (self._left, self._right):
+                self._nest.Connect(self._correction, ring, "one_to_one", {"delay": DELAY_MS})
+        away_rad = np.angle(np.exp(1j * (self._angles - self._zero_rad - heading_rad)))
+        self._correction.amplitude = peak_pa * np.exp(-0.5 * (away_rad / width_rad) ** 2)
 
     def _set_drive(self, rate_rad_s: float) -> None:
         if rate_rad_s != self._rate_rad_s:

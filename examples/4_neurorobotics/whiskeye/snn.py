@@ -24,20 +24,20 @@ class GyroIntegrator:
         self._bias_rad_s = bias_rad_s
         self._quantum_ns = round(network.quantum_s * 1e9)
         self._done_ns = 0  # the network was settled for the start of simulated time
-        self._bridged_rad = 0.0
+        self.bridged_rad = 0.0
 
     def integrate(self, stamp_ns, rate_rad_s):
         """Heading in radians at ``stamp_ns``, decoded over about the last 20 ms before."""
         rate_rad_s += self._bias_rad_s
         missed_ns = max(0, (stamp_ns - self._done_ns) // WINDOW_NS - 1) * WINDOW_NS
-        self._bridged_rad += rate_rad_s * missed_ns * 1e-9
+        self.bridged_rad += rate_rad_s * missed_ns * 1e-9
         self._done_ns += missed_ns
         quanta = (stamp_ns - self._done_ns) // self._quantum_ns  # the rest is for the next packet
         if quanta > 0:
             step_ns = quanta * self._quantum_ns
             self.network.step(rate_rad_s, step_ns * 1e-9)
             self._done_ns += step_ns
-        return math.remainder(self.network.heading_rad + self._bridged_rad, math.tau)
+        return math.remainder(self.network.heading_rad + self.bridged_rad, math.tau)
 
 
 @neuros_initialise()

@@ -1,0 +1,35 @@
+"""What the variants of the corrected network share: its start, and what it does with packets."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from correction import GATE, CorrectedIntegrator
+from views import stamp_ns
+
+
+def start_integrator(node: Any) -> None:
+    """Make the rings of SEED, GYRO_BIAS in rad/s, CORRECTION_PA and GATE of the node."""
+    node.set_user_data(
+        CorrectedIntegrator(
+            int(os.environ.get("SEED", "1")),
+            float(os.environ.get("GYRO_BIAS", "0")),
+            float(os.environ.get("CORRECTION_PA", "120")),
+            float(os.environ.get("GATE", str(GATE))),
+        )
+    )
+
+
+def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any]:
+    """The packets ``estimate`` and ``uncorrected``, with the stamp of the IMU's packet."""
+    integrator = node.get_user_data()
+    if odom_correction is not None:
+        seen = odom_correction.vector
+        integrator.vision.see(stamp_ns(odom_correction), seen.z, seen.x)
+    headings_rad = integrator.integrate(stamp_ns(imu), imu.angular_velocity.z)
+    packets = node.make_packet("estimate"), node.make_packet("uncorrected")
+    for packet, heading_rad in zip(packets, headings_rad, strict=True):
+        packet.header.stamp, packet.header.frame_id = imu.header.stamp, "world"
+        packet.vector.z = heading_rad
+    return packets

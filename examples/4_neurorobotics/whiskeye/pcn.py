@@ -1,0 +1,81 @@
+"""The predictive coding network that a run of ``training.json`` has trained, as a node.
+
+For each pair of pictures it sends ``odom_correction``: the heading in ``vector.z`` in radians, and
+in ``vector.x`` the mean squared error of the view that it predicts, by which the receiver judges
+whether to trust it; and ``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of
+view, first and second layer. For a pair without pixels the heading is NaN: nothing was seen.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+from predictive_coding import PredictiveCodingNetwork
+from views import heading_of, stamp_ns, view_of
+
+from neuros.errors import NodeError
+from neuros.hooks import Optional, neuros_function, neuros_initialise
+
+HOW = (
+    "train it with training.json, and name its file: "
+    "--set nodes.pcn.environment.WEIGHTS=<run folder>/trainer/weights.npz"
+)
+
+
+class Eyes:
+    """Pairs the pictures of both eyes by stamp: some may be lost on the way."""
+
+    def __init__(self):
+        self._waiting = {}  # {stamp in ns: (eye, picture)}
+
+    def pairs(self, left, right):
+        """All pairs that are complete now, oldest first."""
+        complete = []
+        for eye, picture in enumerate((left, right)):
+            stamp = stamp_ns(picture)
+            other = self._waiting.pop(stamp, None)
+            if other is None:
+                self._waiting[stamp] = (eye, picture)
+            else:
+                complete.append((other[1], picture) if eye else (picture, other[1]))
+        for stamp in sorted(self._waiting)[:-2]:  # what is older has lost its other half
+            del self._waiting[stamp]
+        return complete
+
+
+@neuros_initialise()
+def start(node):
+    named = os.environ.get("WEIGHTS", "")
+    try:
+        with np.load(Path(named)) as weights:
+            network = PredictiveCodingNetwork.of_weights(weights)
+    except (OSError, ValueError, KeyError) as error:
+        what = f"'{named}' cannot be read ({error})" if named else "is not set"
+        raise NodeError(f"WEIGHTS {what}: {HOW}") from error
+    node.set_user_data((network, Eyes()))
+
+
+@neuros_function(
+    inputs=["left_eye", "right_eye"],
+    outputs=[Optional("odom_correction"), Optional("prediction_error")],
+)
+def look(node, left, right):
+    network, eyes = node.get_user_data()
+    pairs = eyes.pairs(left, right)
+    if not pairs:
+        return None
+    left, right = pairs[-1]
+    correction = node.make_packet("odom_correction")
+    correction.header = left.header
+    if not left.height:
+        correction.vector.x, correction.vector.z = math.inf, math.nan
+        return correction, None
+    codes, errors = network.infer(view_of(left, right)[None])
+    correction.vector.x, correction.vector.z = float(errors[0, 0]), heading_of(codes[0])
+    error = node.make_packet("prediction_error")
+    error.header = left.header
+    error.vector.x, error.vector.y, error.vector.z = map(float, errors[0])
+    return correction, error

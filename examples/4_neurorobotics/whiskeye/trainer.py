@@ -1,0 +1,121 @@
+"""Gathers VIEWS views with their headings, trains the network on most of them, and tests it.
+
+Files in the node's folder of the run: ``weights.npz`` (what ``pcn.py`` takes) and ``training.json``
+(seeds, sizes and errors, those of the baselines too).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from time import perf_counter
+
+import numpy as np
+from baselines import linear_regression, nearest_neighbour
+from heading_error import yaw_of
+from held_out import split
+from predictive_coding import PredictiveCodingNetwork
+from views import CODES, PIXELS, code_of, heading_of, view_of
+
+from neuros.hooks import neuros_function, neuros_initialise
+from neuros.snn import derive_seed
+
+PROGRESS_S = 5.0
+
+
+class Examples:
+    """What has been gathered: views, headings in rad, positions in m."""
+
+    def __init__(self):
+        self.views, self.headings_rad, self.positions_m = [], [], []
+
+
+@neuros_initialise()
+def start(node):
+    node.set_user_data(Examples())
+
+
+@neuros_function(inputs=["left_eye", "right_eye", "label"])
+def gather(node, left, right, label):
+    examples, wanted = node.get_user_data(), int(os.environ.get("VIEWS", "2400"))
+    if len(examples.views) == wanted:  # on its way while the network learnt
+        return
+    q, position = label.pose.orientation, label.pose.position
+    examples.views.append(view_of(left, right))
+    examples.headings_rad.append(yaw_of(q.x, q.y, q.z, q.w))
+    examples.positions_m.append((position.x, position.y))
+    if len(examples.views) == wanted:
+        report(node, *train(node, examples))
+        node.shutdown(f"{wanted} views learnt")
+
+
+def train(node, examples):
+    """The network, and the figures that go with it."""
+    seed, epochs = int(os.environ.get("SEED", "1")), int(os.environ.get("EPOCHS", "20"))
+    views = np.array(examples.views, np.float32)
+    headings_rad = np.array(examples.headings_rad, np.float32)
+    parts = split(headings_rad, np.array(examples.positions_m))
+    learnt_views, learnt_rad = views[parts.learnt], headings_rad[parts.learnt]
+    codes = np.array([code_of(heading) for heading in learnt_rad])
+    network = PredictiveCodingNetwork(PIXELS, CODES, derive_seed(seed, node.name))
+    began_s = said_s = perf_counter()
+    for epoch, error in enumerate(network.learn(learnt_views, codes, epochs), 1):
+        if perf_counter() - said_s > PROGRESS_S or epoch == epochs:
+            said_s = perf_counter()
+            node.get_logger().info(
+                f"epoch {epoch} of {epochs}: view error {error:.3f}, {said_s - began_s:.0f} s"
+            )
+    figures = {"seed": seed, "epochs": epochs, "training_s": perf_counter() - began_s}
+    figures["views"] = {"learnt": int(parts.learnt.sum())}
+    for name in ("headings", "places"):
+        held = getattr(parts, name)
+        figures["views"][name] = int(held.sum())
+        found, errors = network.infer(views[held])
+        told = {
+            "network": np.array([heading_of(code) for code in found]),
+            "nearest_neighbour": nearest_neighbour(learnt_views, learnt_rad, views[held]),
+            "linear_regression": linear_regression(learnt_views, learnt_rad, views[held]),
+        }
+        figures[f"held_out_{name}"] = {
+            method: accuracy(answers, headings_rad[held]) for method, answers in told.items()
+        }
+        figures[f"held_out_{name}"]["view_error"] = {
+            "median": float(np.median(errors[:, 0])) if held.any() else None,
+            "p95": float(np.percentile(errors[:, 0], 95)) if held.any() else None,
+        }
+    return network, figures
+
+
+def accuracy(told_rad, true_rad):
+    """RMS, median and maximum of the absolute error, in degrees; of no views ``None``."""
+    if not len(true_rad):
+        return {"rms_deg": None, "median_deg": None, "max_deg": None}
+    off_deg = np.abs(np.degrees(np.angle(np.exp(1j * (told_rad - true_rad)))))
+    return {
+        "rms_deg": float(np.sqrt(np.mean(off_deg**2))),
+        "median_deg": float(np.median(off_deg)),
+        "max_deg": float(np.max(off_deg)),
+    }
+
+
+def report(node, network, figures):
+    """Write the files, and say how far the network and the baselines are off."""
+    np.savez(node.run_dir / "weights.npz", **network.weights)
+    (node.run_dir / "training.json").write_text(json.dumps(figures, indent=2) + "\n")
+    log, sizes = node.get_logger(), figures["views"]
+    log.info(f"learnt {sizes['learnt']} views in {figures['training_s']:.0f} s")
+    for held in ("headings", "places"):
+        found = figures[f"held_out_{held}"]
+        methods = {name: each for name, each in found.items() if name != "view_error"}
+        for name, each in methods.items():
+            node.set_result(f"{held}_{name}_rms_deg", each["rms_deg"])
+        rms = ", ".join(
+            f"{name.replace('_', ' ')} {shown(each['rms_deg'])}" for name, each in methods.items()
+        )
+        log.info(f"RMS error at {sizes[held]} views of held-out {held}: {rms}")
+    log.info(f"weights: {node.run_dir / 'weights.npz'}")
+
+
+def shown(value_deg):
+    """An error as text."""
+    return "unknown" if value_deg is None else f"{value_deg:.2f} deg"

@@ -1,0 +1,51 @@
+"""From the pictures of both eyes and a heading to what the network takes, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuros.snn import GaussianTuning, PopulationVector, evenly_spaced_angles
+
+Floats = NDArray[np.float32]
+
+WIDTH, HEIGHT = 16, 12
+PIXELS = 2 * WIDTH * HEIGHT * 3
+CODES = 180
+
+_PREFERRED_RAD = evenly_spaced_angles(CODES)
+_BUMP = GaussianTuning(_PREFERRED_RAD, math.radians(18), peak_hz=1.0, period=math.tau)
+_READ = PopulationVector(_PREFERRED_RAD)
+
+
+def view_of(left: Any, right: Any) -> Floats:
+    """Two ``sensor_msgs/msg/Image`` (``rgb8``), averaged to 16 x 12 each, whatever the light.
+
+    Mean 0 and standard deviation 1 over both, ``(1152,)``.
+    """
+    small = np.concatenate([_averaged(image) for image in (left, right)])
+    return ((small - small.mean()) / (small.std() + 1e-6)).astype(np.float32)
+
+
+def code_of(heading_rad: float) -> Floats:
+    """A bump of activity around the heading, ``(180,)``: head-direction cells."""
+    return _BUMP.rates_hz(heading_rad).astype(np.float32)
+
+
+def heading_of(code: Floats) -> float:
+    """The heading, in radians, that a predicted code stands for: squared, the peak counts most."""
+    return _READ.of_rates(np.maximum(code, 0.0) ** 2).angle_rad
+
+
+def stamp_ns(packet: Any) -> int:
+    """The stamp of a packet, in nanoseconds of simulated time."""
+    return packet.header.stamp.sec * 1_000_000_000 + packet.header.stamp.nanosec
+
+
+def _averaged(image: Any) -> NDArray[np.float64]:
+    pixels = np.frombuffer(image.data, dtype=np.uint8).reshape(image.height, image.width, 3)
+    blocks = pixels.reshape(HEIGHT, image.height // HEIGHT, WIDTH, image.width // WIDTH, 3)
+    return blocks.mean(axis=(1, 3)).ravel()

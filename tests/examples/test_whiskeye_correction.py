@@ -1,0 +1,223 @@
+"""How WhiskEye's ring is corrected by what its eyes see: target, gate, current, and the nodes."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
+from sensor_msgs.msg import Image
+
+from neuros.errors import NodeError
+from neuros.testing import PluginHarness
+
+EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
+PERIOD_NS = 20_000_000
+
+
+@pytest.fixture
+def load(monkeypatch):
+    """Import a module of the example as its node does, and forget all of them afterwards."""
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    before = set(sys.modules)
+    yield importlib.import_module
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(EXAMPLE)):
+            del sys.modules[name]
+
+
+class TestSeenHeading:
+    """The target of the correction."""
+
+    @pytest.fixture
+    def correction(self, load):
+        pytest.importorskip("nest")
+        return load("correction")
+
+    @pytest.fixture
+    def seen(self, correction):
+        """Ten periods after the start, at 0.5 rad/s."""
+        seen = correction.SeenHeading(gate=0.1)
+        for index in range(1, 11):
+            seen.turn(index * PERIOD_NS, 0.5)
+        return seen
+
+    def test_without_a_picture_there_is_no_target(self, seen):
+        assert seen.target_rad(0.5) is None
+
+    def test_what_was_seen_is_turned_with_the_gyroscope_and_ahead_of_the_ring(
+        self, correction, seen
+    ):
+        seen.see(5 * PERIOD_NS, 1.0, 0.05)
+        assert seen.target_rad(0.5) == pytest.approx(1.0 + 0.5 * (0.1 + correction.LEAD_S))
+
+    def test_between_two_pictures_the_last_one_counts(self, correction, seen):
+        seen.see(10 * PERIOD_NS, 1.0, 0.05)
+        seen.turn(11 * PERIOD_NS, 0.5)
+        seen.see(11 * PERIOD_NS, math.nan, math.inf)
+        assert seen.target_rad(0.5) == pytest.approx(1.01 + 0.5 * correction.LEAD_S)
+
+    def test_a_view_that_is_not_predicted_ends_the_correction(self, seen):
+        seen.see(9 * PERIOD_NS, 1.0, 0.05)
+        seen.see(10 * PERIOD_NS, 1.0, 0.11)
+        assert seen.target_rad(0.5) is None
+
+    def test_what_is_too_old_corrects_nothing(self, correction, seen):
+        seen.see(10 * PERIOD_NS, 1.0, 0.05)
+        periods = correction.HOLD_NS // PERIOD_NS
+        for index in range(11, 11 + periods):
+            seen.turn(index * PERIOD_NS, 0.0)
+        assert seen.target_rad(0.0) == pytest.approx(1.0)
+        seen.turn((11 + periods) * PERIOD_NS, 0.0)
+        assert seen.target_rad(0.0) is None
+
+
+class TestRings:
+    """Two rings in one kernel."""
+
+    @pytest.fixture
+    def head_direction(self, load):
+        pytest.importorskip("nest")
+        return load("head_direction")
+
+    @staticmethod
+    def pair(head_direction):
+        alone = head_direction.HeadDirectionNetwork(seed=1)
+        beside = head_direction.HeadDirectionNetwork(seed=1, beside=alone)
+        alone.settle()
+        return alone, beside
+
+    def test_uncorrected_both_are_what_one_is_by_itself_bit_for_bit(self, head_direction):
+        single = head_direction.HeadDirectionNetwork(seed=1)
+        single.settle()
+        expected = [single.step(1.0, 0.02) for _ in range(25)]
+        alone, beside = self.pair(head_direction)
+        told = []
+        for _ in range(25):
+            alone.step(1.0, 0.02)
+            told.append((alone.heading_rad, beside.heading_rad))
+        assert told == [(each, each) for each in expected]
+
+    def test_a_correction_pulls_the_bump_of_that_ring_alone(self, head_direction):
+        alone, beside = self.pair(head_direction)
+        beside.correct(math.radians(30), 120.0, math.radians(30))
+        for _ in range(50):
+            alone.step(0.0, 0.02)
+        assert math.degrees(alone.heading_rad) == pytest.approx(0, abs=6)
+        assert math.degrees(beside.heading_rad) == pytest.approx(30, abs=6)
+        beside.correct(0.0, 0.0, 1.0)
+        for _ in range(25):
+            alone.step(0.0, 0.02)
+        assert math.degrees(beside.heading_rad) == pytest.approx(30, abs=8)
+
+
+def test_a_biased_gyroscope_is_corrected_and_the_ring_alone_drifts(load):
+    pytest.importorskip("nest")
+    integrator = load("correction").CorrectedIntegrator(
+        seed=1, bias_rad_s=0.3, peak_pa=120.0, gate=0.3
+    )
+    for index in range(1, 151):
+        if index % 5 == 0:
+            integrator.vision.see(index * PERIOD_NS, 0.0, 0.01)
+        corrected, alone = integrator.integrate(index * PERIOD_NS, 0.0)
+    assert math.degrees(alone) == pytest.approx(math.degrees(0.9), abs=8)
+    assert abs(math.degrees(corrected)) < 15
+
+
+def picture(stamp: int, *, empty: bool = False) -> Image:
+    image = Image()
+    image.header.stamp.nanosec = stamp
+    if not empty:
+        pixels = np.random.default_rng(stamp).integers(0, 255, 60 * 80 * 3, dtype=np.uint8)
+        image.width, image.height, image.encoding, image.step = 80, 60, "rgb8", 240
+        image.data = pixels.tobytes()
+    return image
+
+
+@pytest.fixture
+def weights(load, tmp_path):
+    """Of a network that has learnt next to nothing."""
+    views = load("views")
+    rng = np.random.default_rng(1)
+    network = load("predictive_coding").PredictiveCodingNetwork(views.PIXELS, views.CODES, 1)
+    seen = rng.normal(size=(24, views.PIXELS)).astype(np.float32)
+    list(network.learn(seen, np.array([views.code_of(each) for each in range(24)]), 1))
+    np.savez(tmp_path / "weights.npz", **network.weights)
+    return str(tmp_path / "weights.npz")
+
+
+def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none(weights):
+    environment = {"WEIGHTS": weights}
+    with PluginHarness.from_project(
+        EXAMPLE / "prediction.json", "pcn", environment=environment
+    ) as pcn:
+        for stamp, empty in ((1, True), (2, False)):
+            for eye in ("left_eye", "right_eye"):
+                pcn.send(eye, picture(stamp, empty=empty))
+        pcn.run()
+        nothing, seen = pcn.received("odom_correction", "snn")
+        (error,) = pcn.received("prediction_error")
+    assert math.isnan(nothing.vector.z)
+    assert nothing.vector.x == math.inf
+    assert (nothing.header.stamp.nanosec, seen.header.stamp.nanosec) == (1, 2)
+    assert error.vector.x == seen.vector.x > 0
+    assert abs(seen.vector.z) <= math.pi
+
+
+def test_pictures_of_two_eyes_are_paired_where_some_are_lost(load):
+    eyes = load("pcn").Eyes()
+    left, right = ({n: picture(n) for n in range(1, 6)} for _ in range(2))
+    assert eyes.pairs(left[1], right[1]) == [(left[1], right[1])]
+    assert eyes.pairs(left[2], right[3]) == []
+    assert eyes.pairs(left[3], right[4]) == [(left[3], right[3])]
+    assert eyes.pairs(left[4], right[5]) == [(left[4], right[4])]
+
+
+@pytest.mark.parametrize("named", ["", "/nowhere/weights.npz"])
+def test_without_weights_it_says_how_to_get_them(named):
+    with (
+        PluginHarness.from_project(
+            EXAMPLE / "prediction.json", "pcn", environment={"WEIGHTS": named}
+        ) as pcn,
+        pytest.raises(NodeError, match=r"train it with training\.json"),
+    ):
+        pcn.run()
+
+
+def test_the_visualiser_tells_the_error_of_each_and_keeps_all_series(tmp_path):
+    with PluginHarness.from_project(
+        EXAMPLE / "prediction.json", "visualiser", run_folder=tmp_path
+    ) as visualiser:
+        for stamp in range(1, 4):
+            pose = PoseStamped()
+            pose.header.stamp.nanosec, pose.pose.orientation.w = stamp, 1.0
+            visualiser.send("truth", pose)
+            for name, off_deg in (("uncorrected", 20.0), ("vision", -3.0), ("corrected", 2.0)):
+                packet = Vector3Stamped()
+                packet.header.stamp.nanosec, packet.vector.z = stamp, math.radians(off_deg)
+                if (name, stamp) == ("vision", 2):
+                    packet.vector.z = math.nan
+                visualiser.send(name, packet)
+        visualiser.run()
+        visualiser.finalise()
+        folder = visualiser.run_dir
+    found = json.loads((folder / "correction.json").read_text())
+    assert {name: round(each["rms_deg"], 6) for name, each in found.items()} == {
+        "uncorrected": 20.0,
+        "vision": 3.0,
+        "corrected": 2.0,
+    }
+    assert found["vision"]["samples"] == 2
+    with (folder / "correction.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["vision_rad"] for row in rows] == [
+        repr(math.radians(-3.0)),
+        "",
+        rows[0]["vision_rad"],
+    ]
