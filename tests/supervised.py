@@ -104,12 +104,19 @@ class Run:
         self.output.when[beginning] = act
 
     def when_file_exists(self, name: str, act: Act) -> None:
-        """Do something once a stand-in has made a file in the run folder."""
+        """Do something once a stand-in has made a file in the run folder.
+
+        What it said before is heard by then: between two looks the supervisor listens.
+        """
+        was_there = False
 
         def look() -> None:
+            nonlocal was_there
             if look in self.output.polls and (self.folder / name).exists():
-                self.output.polls.remove(look)
-                act()
+                if was_there:
+                    self.output.polls.remove(look)
+                    act()
+                was_there = True
 
         self.output.polls.append(look)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from message_packages import write_package
+from needs import COMPILER
 
 NEUROS = Path(sys.executable).with_name("neuros")
 STRING = "std_msgs/msg/String"
@@ -87,12 +88,13 @@ def test_nothing_of_a_project_is_run_to_look_at_it(project: Path, command: list[
     assert not [*project.rglob("__pycache__")]
 
 
+@pytest.mark.needs(*COMPILER)
 def test_only_import_runs_plugins(project: Path) -> None:
     node: dict[str, Any] = {"name": "a", "container": "neuros_python", "plugin": "plugin.py"}
     node["outputs"] = [{"name": "x", "type": STRING}]
     (project / "project.json").write_text(json.dumps({"nodes": [node]}))
-    neuros(project, "validate", "--import", ".")
-    assert (project.parent / "was run").exists()
+    finished = neuros(project, "validate", "--import", ".")
+    assert (project.parent / "was run").exists(), finished.stdout + finished.stderr
 
 
 @pytest.mark.parametrize("kind", ["robot.urdf", "robot.sdf"])

@@ -89,7 +89,7 @@ class TestReference:
         assert "\n## neuros node\n" not in page, "what launchers start is no command for users"
 
     def test_every_key_of_the_schemas_has_a_row(self) -> None:
-        assert "\n| `discard_limit` | integer (≥ 0) |  |" in schema.page(ROOT, "node")
+        assert "\n| `discard_limit` | integer (≥ 0, ≤ 1000000000) |  |" in schema.page(ROOT, "node")
         assert "\n| `nodes` | array" in schema.page(ROOT, "project")
 
     def test_a_key_that_is_defined_elsewhere_has_its_type_and_meaning(self) -> None:

@@ -168,7 +168,7 @@ def test_a_page_is_told_of_every_node_of_one_process_and_of_the_end(tmp_path: Pa
 
 
 def test_a_paused_run_goes_on_when_its_dashboard_is_killed(tmp_path: Path) -> None:
-    with start_watched(tmp_path, "--duration", "1") as running:
+    with start_watched(tmp_path, "--duration", "5") as running:
         visitor = Visitor(address(running))
         assert visitor.post("/do/pause") == 204
         with visitor.events() as events:

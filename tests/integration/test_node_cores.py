@@ -130,10 +130,10 @@ def test_in_process_all_nodes_share_the_cores_that_some_ask_for(tmp_path: Path) 
 
 
 def test_a_core_that_this_machine_lacks_is_no_mistake_in_the_project(tmp_path: Path) -> None:
-    file = project(tmp_path, {"affinity": [9999]}, {})
+    file = project(tmp_path, {"affinity": [999]}, {})
     run = launch(file, cwd=tmp_path)
     assert run.exit_code == 4
-    assert "/nodes/0/affinity: node 'a' asks for core 9999\n" in run.output
+    assert "/nodes/0/affinity: node 'a' asks for core 999\n" in run.output
     assert f"NeuROS may use core{'s' if len(CORES) > 1 else ''} {CORES[0]}" in run.output
     assert run.run_folder is None, "nothing was started"
     assert launch(file, "--no-placement", cwd=tmp_path).exit_code == 0

@@ -80,4 +80,6 @@ def test_the_project_runs_and_carries_the_same_packets(
     assert finished.exit_code == 0, finished.output
     doubles = [2 * number for number in NUMBERS]
     assert finished.record["nodes"]["counter"]["results"] == {"doubles": doubles}
-    assert said(capsys, "verify", kept / "run", tmp_path / "again").startswith("identical: ")
+    # Before it there may be notes on the connection that may lose packets.
+    *_, verdict = said(capsys, "verify", kept / "run", tmp_path / "again").splitlines()
+    assert verdict.startswith("identical: ")
