@@ -72,6 +72,7 @@ def test_training_learns_the_same_weights_on_every_back_end_and_tells_the_figure
     assert "views learnt" in trained[BACKENDS[0]].output
 
 
+@pytest.mark.acceptance
 def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
     tables = []
     for backend in BACKENDS:
@@ -88,6 +89,7 @@ def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path)
     assert tables[0] == tables[1]
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_hybrid_loses_no_imu_packet(weights, tmp_path, backend):
     run = started(
@@ -97,6 +99,7 @@ def test_the_hybrid_loses_no_imu_packet(weights, tmp_path, backend):
     assert run.connection("pcn.odom_correction -> snn.odom_correction")["sent"] > 0
 
 
+@pytest.mark.acceptance
 def test_the_asynchronous_variant_ends_properly(weights, tmp_path):
     # Slowly: until the rings have settled, packets pass by.
     slowly = {"robot__DURATION": 2 * SECONDS, "robot__REAL_TIME_FACTOR": 0.2}
