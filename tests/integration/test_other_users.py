@@ -87,7 +87,8 @@ def test_another_user_can_open_nothing_of_a_run(everybodys: Path) -> None:
         os.umask(previous)
     with running:
         running.wait_for("stores in neuros_", 60.0)
-        found = [*(everybodys / "runs").rglob("*"), *({*Path("/dev/shm").glob("neuros_*")} - shared)]
+        found = [*(everybodys / "runs").rglob("*")]
+        found += {*Path("/dev/shm").glob("neuros_*")} - shared
         names = {path.name for path in found}
         assert {"control.sock", "node.json", "node.log", "project.json", "spool"} <= names
         assert any(name.startswith("neuros_") for name in names)
