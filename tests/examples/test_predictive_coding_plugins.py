@@ -9,7 +9,6 @@ import importlib
 import importlib.util
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +20,6 @@ from sensor_msgs.msg import Image
 from neuros.testing import PluginHarness
 
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/predictive_coding"
-
-
-@pytest.fixture
-def load(monkeypatch):
-    """Import a module of the example as its node does, and forget all of them afterwards."""
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(EXAMPLE)):
-            del sys.modules[name]
 
 
 @pytest.fixture

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,18 +12,6 @@ import pytest
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
 PERIOD_NS = 20_000_000
 SCATTER_RAD = math.radians(8)  # of what is decoded from the spikes of one window
-
-
-@pytest.fixture
-def load(monkeypatch):
-    """Import a module of the example as its node does, and forget all of them afterwards."""
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    monkeypatch.setenv("NEUROS_GUI", "0")
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(EXAMPLE)):
-            del sys.modules[name]
 
 
 def turning(rate_rad_s, packets):

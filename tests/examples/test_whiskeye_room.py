@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
-import sys
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -19,17 +17,6 @@ mujoco = pytest.importorskip("mujoco")
 
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
 PICTURE_BYTES = 80 * 60 * 3
-
-
-@pytest.fixture
-def load(monkeypatch):
-    """Import a module of the example as its node does, and forget all of them afterwards."""
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(EXAMPLE)):
-            del sys.modules[name]
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +15,6 @@ from neuros.testing import PluginHarness
 
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
 VIEWS = 120
-
-
-@pytest.fixture
-def load(monkeypatch):
-    """Import a module of the example as its node does, and forget all of them afterwards."""
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(EXAMPLE)):
-            del sys.modules[name]
 
 
 def picture(heading_rad: float, light: float = 1.0) -> Image:

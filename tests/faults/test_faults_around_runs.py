@@ -83,7 +83,6 @@ def test_surroundings_end_a_run_only_where_they_must(cell: SurroundingCell, tmp_
     check_surrounding(cell, tmp_path)
 
 
-@pytest.mark.acceptance  # the recorder may take its time where others keep both cores busy
 @pytest.mark.parametrize("interrupt", _INTERRUPTS, ids=str)
 def test_ctrl_c_ends_a_run_at_any_moment(interrupt: Interrupt, tmp_path: Path) -> None:
     check(interrupts.run(interrupt, tmp_path))

@@ -72,7 +72,6 @@ def test_training_learns_the_same_weights_on_every_back_end_and_tells_the_figure
     assert "views learnt" in trained[BACKENDS[0]].output
 
 
-@pytest.mark.acceptance
 def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
     tables = []
     for backend in BACKENDS:
