@@ -21,14 +21,15 @@ import contextlib
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
 from neuros.backends.domain import DomainLock
-from neuros.backends.reaper_program import KILL_DEADLINE_S, READY, Orders, clean_up
+from neuros.backends.reaper_program import IGNORED, KILL_DEADLINE_S, READY, Orders, clean_up
 from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault
 
@@ -74,16 +75,17 @@ class Reaper:
         root = str(Path(__file__).resolve().parents[2])
         read_end, write_end = os.pipe()
         try:
-            process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _PROGRAM, root, run_id],
-                stdin=read_end,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                cwd="/",
-                env={**inherited, **environment},
-                start_new_session=True,
-                pass_fds=() if descriptor is None else (descriptor,),
-            )
+            with _signals_held_up():
+                process = subprocess.Popen(
+                    [sys.executable, "-I", "-S", "-c", _PROGRAM, root, run_id],
+                    stdin=read_end,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    cwd="/",
+                    env={**inherited, **environment},
+                    start_new_session=True,
+                    pass_fds=() if descriptor is None else (descriptor,),
+                )
         except OSError as error:
             os.close(write_end)
             raise EnvironmentFault(f"the reaper process cannot be started: {error}") from error
@@ -165,3 +167,16 @@ class Reaper:
         if self._pipe is not None:
             os.close(self._pipe)
             self._pipe = None
+
+
+@contextlib.contextmanager
+def _signals_held_up() -> Iterator[None]:
+    """Block the signals that a reaper ignores, until this is over; its process starts with them so.
+
+    Ctrl+C would kill it otherwise between its fork and its own session, or before it ignores it.
+    """
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -19,6 +19,7 @@ from typing import Any
 from neuros.backends.run_processes import RunProcesses
 
 READY = b"ready\n"
+IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 KILL_DEADLINE_S = 20.0
 """A process in an uninterruptible system call outlasts even SIGKILL."""
 
@@ -61,8 +62,9 @@ class Orders:
 
 def main(run_id: str) -> None:
     """Wait for the pipe on standard input to close, clean up."""
-    for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
-        signal.signal(name, signal.SIG_IGN)
+    for number in IGNORED:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the launcher had them wait
     orders = Orders()
     processes = RunProcesses(run_id)
     os.write(1, READY)

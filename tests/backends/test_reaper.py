@@ -63,6 +63,19 @@ time.sleep(60)
 """
 
 
+STARTS_REAPERS_WHILE_CTRL_C_IS_HELD_DOWN = """
+import os, signal, subprocess, sys
+from neuros.backends.reaper import Reaper
+signal.signal(signal.SIGINT, lambda *_: None)
+keys = subprocess.Popen(["sh", "-c", "trap '' INT; while kill -INT 0; do :; done"])
+try:
+    for number in range(20):
+        Reaper.start(sys.argv[1]).finish()
+finally:
+    keys.kill()
+"""
+
+
 @pytest.fixture
 def run_id() -> Iterator[str]:
     run_id = secrets.token_hex(8)
@@ -222,6 +235,15 @@ def test_a_reaper_ignores_the_signals_of_terminals_and_service_managers(
     process = _start(run_id, IGNORES_SIGTERM)
     reaper.finish()
     assert _end(process) == -signal.SIGKILL
+
+
+def test_ctrl_c_does_not_reach_a_reaper_that_is_just_being_started(run_id: str) -> None:
+    subprocess.run(
+        [sys.executable, "-c", STARTS_REAPERS_WHILE_CTRL_C_IS_HELD_DOWN, run_id],
+        start_new_session=True,
+        check=True,
+        timeout=60,
+    )
 
 
 def test_the_launcher_does_the_work_of_a_reaper_that_was_killed(
