@@ -14,7 +14,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
-from neuros.project.validate import node_file_mistake
+from neuros.project.validate import mistake
 from neuros.recording.bag_reader import Bag, open_bag
 from neuros.recording.recording_plan import RecordingPlan, load_plan
 from neuros.recording.run_file import read_object
@@ -43,7 +43,7 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
     file = run_folder / name / "node.json"
     try:
         content = read_object(file)
-        if wrong := node_file_mistake(content):
+        if wrong := mistake(content, "node", "#/$defs/node_file"):
             raise EnvironmentFault(f"replay: {file} is damaged: {wrong}")
         return run, node_file_from_json(content)
     except (OSError, ValueError, TypeError, OverflowError) as error:

@@ -7,6 +7,7 @@ twice, connections that end nowhere) is in :mod:`neuros.project.checks`.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Collection, Iterator
 from functools import cache
@@ -45,16 +46,19 @@ def violations(parsed: ParsedProject) -> list[Problem]:
 
 
 def schema(name: str) -> dict[str, Any]:
-    """The schema of that name, ``"project"`` or ``"node"``."""
+    """The schema of that name: ``"project"``, ``"node"``, or ``"run"`` for ``run.json``."""
     content: dict[str, Any] = json.loads(
         (SCHEMA_FOLDER / f"{name}.schema.json").read_text(encoding="utf-8")
     )
     return content
 
 
-def node_file_mistake(content: Any) -> str:
-    """What is wrong with the content of a ``node.json``, empty if nothing is."""
-    error = next(_validator("node", "#/$defs/node_file").iter_errors(content), None)
+def mistake(content: Any, name: str, part: str = "") -> str:
+    """What is wrong with the content of a file that NeuROS has written, empty if nothing is.
+
+    ``part`` of the schema of that name is its form, as ``"#/$defs/node_file"``.
+    """
+    error = next(_validator(name, part).iter_errors(content), None)
     return "" if error is None else f"{error.json_path}: {_sentence(error)[0]}"
 
 
@@ -90,7 +94,8 @@ def _validator(name: str, part: str = "") -> Any:
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
     from jsonschema.validators import extend
-    from referencing import Registry, Resource
+    from referencing import Registry
+    from referencing.jsonschema import DRAFT202012
 
     def pattern(_: Any, expected: str, instance: Any, __: Any) -> Iterator[ValidationError]:
         # Python's '$' also matches before a final line feed, the one of JSON Schema does not.
@@ -105,13 +110,27 @@ def _validator(name: str, part: str = "") -> Any:
                 validator, wanted, instance, of
             )
 
-    schemas = {key: schema(key) for key in ("project", "node")}
+    def finite(_: Any, instance: Any) -> bool:
+        # JSON has no other numbers, but Python's reader takes NaN, with which nothing compares.
+        is_number = isinstance(instance, (int, float)) and not isinstance(instance, bool)
+        return is_number and (isinstance(instance, int) or math.isfinite(instance))
+
+    schemas = {key: schema(key) for key in ("project", "node", "run")}
+    for content in schemas.values():
+        del content["$schema"]  # where a reference leads to one, it would undo what is extended
     registry = Registry().with_resources(
-        (content["$id"], Resource.from_contents(content)) for content in schemas.values()
+        (content["$id"], DRAFT202012.create_resource(content)) for content in schemas.values()
     )
     own = {"pattern": pattern, "uniqueItems": unique}
     form = {"$ref": schemas[name]["$id"] + part}
-    return extend(Draft202012Validator, own)(form, registry=registry)
+
+    def whole(_: Any, instance: Any) -> bool:
+        return type(instance) is int
+
+    types = Draft202012Validator.TYPE_CHECKER.redefine("number", finite)
+    if name == "run":  # others are converted: in a project, 2.0 is a whole number
+        types = types.redefine("integer", whole)
+    return extend(Draft202012Validator, own, type_checker=types)(form, registry=registry)
 
 
 def _sentences(error: Any, root: Element) -> Iterator[Problem]:
@@ -152,11 +171,14 @@ def _sentence(error: Any) -> tuple[str, str]:
         return f"must be {listed(expected)}, but is {_shown(found)}", hint
     if error.validator == "oneOf":
         return "needs exactly one of " + listed(option["required"][0] for option in expected), ""
+    if error.validator == "required":
+        missing = next(key for key in expected if key not in found)
+        return f"the key '{missing}' is missing", ""
     numbers = {
         "minimum": f"must be at least {expected}, but is {found}",
         "exclusiveMinimum": f"must be more than {expected}, but is {found}",
         "minLength": "must not be empty",
-        "minItems": "must not be empty",
+        "minItems": "must not be empty" if expected == 1 else f"has less than {expected} items",
         "maximum": f"must be at most {expected}, but is {found}",
         "maxItems": f"has more than {expected} items",
         "maxLength": f"is longer than {expected} characters",
@@ -175,7 +197,9 @@ def _kind_of(value: Any) -> str:
     ):  # fmt: skip
         if isinstance(value, types):
             return _KINDS[kind]
-    return "null" if value is None else "a number with a fraction"
+    if value is None:
+        return "null"
+    return "a number with a fraction" if math.isfinite(value) else f"{value}"
 
 
 def _shown(value: Any) -> str:

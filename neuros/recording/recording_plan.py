@@ -6,6 +6,7 @@ The launcher makes the plan; as a file in the run folder it tells nodes and reco
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
@@ -18,7 +19,7 @@ from neuros.ports import Way
 from neuros.project.model import Connection, Node, Project
 from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import ASKED, DEPTH, OFFERED
-from neuros.recording.run_file import NODE_NAME, read_object
+from neuros.recording.run_file import read_object
 
 CLOCK = "/clock"
 PLAN_NAME = "recording.json"
@@ -27,6 +28,7 @@ LISTENER = ".listener"
 """Folder of the packets that no node sees; it is named like none can be."""
 
 _VERSION = 1
+_NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def load_plan(run: Path) -> RecordingPlan:
         plan = read_as(RecordingPlan, content)
         places = {place for each in plan.streams.values() for s in each for place in s.topics}
         if not places <= {*range(len(plan.topics))} or not all(
-            map(NODE_NAME.fullmatch, plan.streams)
+            map(_NODE_NAME.fullmatch, plan.streams)
         ):
             raise ControlError("its streams do not belong to its topics and nodes")
         return plan

@@ -38,17 +38,26 @@ def change(folder: Path, *keys: str | int, to: Any) -> None:
 @pytest.mark.parametrize(
     ("keys", "value", "said"),
     [
-        (("running_s",), "long", "/running_s must be a number"),
-        (("running_s",), float("nan"), "/running_s must be a number"),
-        (("wall_s",), 10**400, "/wall_s must be a number"),
-        (("connections", 0, "connection"), "../../x", "/connections/0/connection must be 'a.out"),
-        (("connections", 0, "index"), -1, "/connections/0/index must be a count"),
-        (("connections", 0, "latency_ms"), [], "/connections/0/latency_ms must be an object"),
-        (("nodes", "../b"), {}, "/nodes has the impossible name '../b'"),
-        (("nodes", "a", "accounting"), 5, "/nodes/a/accounting must be an object"),
-        (("nodes", "a", "hooks", "f"), {"ticks": {}}, "/nodes/a/hooks/f/ticks has no 'period_ms'"),
-        (("timeline",), {"a": [[1, 2, 3]]}, "/timeline/a/0 must be a list of 2"),
-        (("machine",), {"cores": "many"}, "/machine/cores must be a count"),
+        (("running_s",), "long", "$.running_s: must be a number or null, but is a text"),
+        (("running_s",), float("nan"), "$.running_s: must be a number or null, but is nan"),
+        (("wall_s",), 10**400, "$.wall_s: must be at most 9223372036854775807, but is 1000"),
+        (
+            ("connections", 0, "connection"),
+            "../../x",
+            "$.connections[0].connection: '../../x' is not allowed as ends of a connection",
+        ),
+        (("connections", 0, "index"), -1, "$.connections[0].index: must be at least 0, but is -1"),
+        (("connections", 0, "index"), 1.0, "$.connections[0].index: must be a whole number"),
+        (("connections", 0, "latency_ms"), [], "$.connections[0].latency_ms: must be an object"),
+        (("nodes", "../b"), {}, "$.nodes: '../b' is not allowed as name of a node"),
+        (("nodes", "a", "accounting"), 5, "$.nodes.a.accounting: must be an object or null"),
+        (
+            ("nodes", "a", "hooks", "f"),
+            {"ticks": {"period_ms": 1, "within": {}}},
+            "$.nodes.a.hooks.f.ticks: the key 'std_ms' is missing",
+        ),
+        (("timeline",), {"a": [[1, 2, 3]]}, "$.timeline.a[0]: has more than 2 items"),
+        (("machine",), {"cores": "many"}, "$.machine.cores: must be a whole number or null"),
     ],
 )
 def test_a_damaged_record_is_named_with_the_place(

@@ -74,6 +74,7 @@ def test_a_project_file_of_many_megabytes_is_not_read(tmp_path: Path) -> None:
         ('"resources": {"cpus": 1e400}', "the number is too large"),
         ('"resources": {"pids": 1' + 30 * "0" + "}", "must be at most 4194304"),
         ('"resources": {"memory": "1' + 30 * "0" + 'g"}', "is not allowed as memory"),
+        ('"resources": {"memory": "1g\\n"}', "is not allowed as memory"),
         ('"affinity": [1' + 30 * "0" + "]", "must be at most 4095"),
         ('"devices": [' + '"/dev/a", {}, ' * 1500 + '"/dev/b"]', "has more than 1000 items"),
     ],

@@ -44,10 +44,10 @@ def resolved(part: dict[str, Any]) -> dict[str, Any]:
     return part
 
 
-@pytest.mark.parametrize("name", SCHEMAS)
+@pytest.mark.parametrize("name", [*SCHEMAS, "run"])
 def test_it_is_a_schema_of_draft_2020_12_with_an_https_id(name: str) -> None:
-    Draft202012Validator.check_schema(SCHEMAS[name])
-    assert SCHEMAS[name]["$id"].startswith("https://")
+    Draft202012Validator.check_schema(schema(name))
+    assert schema(name)["$id"].startswith("https://")
 
 
 def test_every_key_is_explained() -> None:
@@ -81,4 +81,5 @@ def test_the_package_has_the_schemas_of_the_project() -> None:
     assert sorted(file.name for file in SCHEMA_FOLDER.glob("*.json")) == [
         "node.schema.json",
         "project.schema.json",
+        "run.schema.json",
     ]
