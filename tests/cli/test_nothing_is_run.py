@@ -41,7 +41,7 @@ def project(tmp_path: Path) -> Path:
         **dict.fromkeys(
             (
                 *("helper.py", "sitecustomize.py", "usercustomize.py", "conftest.py", "setup.py"),
-                *("json.py", "jsonschema.py", "mujoco.py", "plugin_msgs/__init__.py"),
+                *("json.py", "signal.py", "jsonschema.py", "mujoco.py", "plugin_msgs/__init__.py"),
                 *("workspace/things/setup.py", "workspace/things/things/__init__.py"),
                 "plugin_msgs/msg/__init__.py",
             ),
@@ -67,11 +67,23 @@ def project(tmp_path: Path) -> Path:
 
 
 def neuros(project: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return run([NEUROS], project, *arguments)
+
+
+def run(
+    program: list[str | Path], project: Path, *arguments: str
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [NEUROS, *arguments], cwd=project, capture_output=True, text=True, timeout=300, check=False
+        [*program, *arguments],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
 
 
+@pytest.mark.parametrize("program", [[NEUROS], [sys.executable, "-m", "neuros.cli"]])
 @pytest.mark.parametrize(
     "command",
     [
@@ -81,8 +93,10 @@ def neuros(project: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         ["graph", "--format", "svg"],
     ],
 )
-def test_nothing_of_a_project_is_run_to_look_at_it(project: Path, command: list[str]) -> None:
-    finished = neuros(project, *command, ".")
+def test_nothing_of_a_project_is_run_to_look_at_it(
+    project: Path, command: list[str], program: list[str | Path]
+) -> None:
+    finished = run(program, project, *command, ".")
     assert finished.returncode == 0, finished.stderr
     assert not (project.parent / "was run").exists()
     assert not [*project.rglob("__pycache__")]
