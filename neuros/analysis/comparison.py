@@ -33,6 +33,11 @@ def comparison_rows(runs: Sequence[PastRun]) -> tuple[list[str], list[list[str]]
     return ["", *labels_of(runs), *(["ratio"] if len(runs) == 2 else [])], rows
 
 
+def figures_of(runs: Sequence[PastRun]) -> dict[str, list[float | None]]:
+    """By name, the value in each run; ``None`` where a run does not have it."""
+    return {name: values for (name, _), values in _side_by_side(runs).items()}
+
+
 def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """The rows as text."""
     from tabulate import tabulate

@@ -154,6 +154,8 @@ class Execution:
                 outcome.fail(fault, EXIT_ENVIRONMENT)
             if self._views is not None:
                 self._views.finish()
+            if not reaper.is_on_duty:
+                self._console.log("WARN", "the reaper was killed: the launcher does its work")
             reaper.finish()
             # A user who has ended the run does not wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)

@@ -209,7 +209,9 @@ def _signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # all is said: they change nothing more
         signal.set_wakeup_fd(waker)
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            # Threads that libraries have started meanwhile (NumPy's) do not have them wait.
+            is_over = signal.SIGINT in mask and number in numbers
+            signal.signal(number, signal.SIG_IGN if is_over else handler)
         reader.close()
         writer.close()
 

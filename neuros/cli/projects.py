@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.api.request import ProjectOptions
+from neuros.cli.output import JSON, add_format, print_json
 from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.options import add_options, options_of
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from neuros.project.model import Project
 
 EXIT_NODE = 1
+EXIT_PROJECT = 3
 _GRAPH_SUFFIXES = {".svg": "svg", ".mmd": "mermaid", ".mermaid": "mermaid"}
 
 
@@ -80,10 +82,33 @@ def add_validate(validate: argparse.ArgumentParser) -> None:
         help="import the plugin of each node, too, as its process would: their code is run, but no"
         " hook",
     )
+    add_format(validate)
     validate.set_defaults(command=_validate)
 
 
 def _validate(parsed: argparse.Namespace) -> int:
+    if parsed.format == JSON:
+        return _validate_for_programs(parsed)
+    project = _validated(parsed)
+    print(
+        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
+        f" {_count(len(project.connections), 'connection')}"
+    )
+    return 0
+
+
+def _validate_for_programs(parsed: argparse.Namespace) -> int:
+    try:
+        _validated(parsed)
+    except ProjectError as error:
+        print_json({"is_valid": False, "problems": error.problems})
+        return EXIT_PROJECT
+    print_json({"is_valid": True, "problems": []})
+    return 0
+
+
+def _validated(parsed: argparse.Namespace) -> Project:
+    """The project, without a problem. Raises ``ProjectError``."""
     from neuros.api.validation import import_problems, model_problems
 
     project, messages = load_with_messages(parsed)
@@ -92,11 +117,7 @@ def _validate(parsed: argparse.Namespace) -> int:
         problems = import_problems(project, messages, project_path(parsed), parsed.set)
     if problems:
         raise ProjectError(problems)
-    print(
-        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
-        f" {_count(len(project.connections), 'connection')}"
-    )
-    return 0
+    return project
 
 
 def add_import_plugin(command: argparse.ArgumentParser) -> None:

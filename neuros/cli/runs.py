@@ -6,14 +6,17 @@ import argparse
 import pwd
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.backends.sessions import Session, sessions
 from neuros.backends.shared_memory import remove_dead_runs
+from neuros.cli.output import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
+from neuros.project.suggest import listed
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
@@ -26,6 +29,7 @@ _SHOWN = 8  # digits of a run's id
 _AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
 _GIVE_UP_S = 30.0
 _POLL_S = 0.05
+_FILTERS = ("run", "project", "node", "backend", "state")
 
 
 def add_ps(ps: argparse.ArgumentParser) -> None:
@@ -33,6 +37,17 @@ def add_ps(ps: argparse.ArgumentParser) -> None:
     ps.description = (
         "Show the nodes of all runs of this user on this machine; for root, of all users."
     )
+    ps.add_argument("-q", "--quiet", action="store_true", help="only the ids of runs")
+    ps.add_argument(
+        "-f",
+        "--filter",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="only nodes of which that is true; KEY is run, project, node, backend or state"
+        " (repeatable)",
+    )
+    add_format(ps)
     ps.set_defaults(command=_ps)
 
 
@@ -53,29 +68,75 @@ def add_stop(stop: argparse.ArgumentParser) -> None:
     stop.set_defaults(command=_stop)
 
 
-def _ps(_: argparse.Namespace) -> int:
-    found = sessions()
-    if not found:
-        print("nothing is running")
-        return 0
-    from tabulate import tabulate
+@dataclass(frozen=True)
+class _RunningNode:
+    """A row of ``neuros ps``."""
 
-    shows_users = not all(session.is_own for session in found)
-    users = ["user"] if shows_users else []
-    rows = [row for session in found for row in _rows(session, shows_users=shows_users)]
-    print(tabulate(rows, headers=["run", *users, "project", "node", "back end", "since", "state"]))
+    run: str
+    user: str
+    project: str
+    node: str
+    backend: str
+    since: float
+    state: str
+    folder: str
+
+
+def _ps(options: argparse.Namespace) -> int:
+    found = sessions()
+    wanted = [_filter(text) for text in options.filter]
+    rows = [
+        row
+        for session in found
+        for row in _rows(session)
+        if all(getattr(row, key).startswith(value) for key, value in wanted)
+    ]
+    if options.quiet:
+        for run in dict.fromkeys(row.run for row in rows):
+            print(run[:_SHOWN])
+    elif options.format == JSON:
+        print_json(rows)
+    elif not rows:
+        print("no running node is like that" if found else "nothing is running")
+    else:
+        print(_table(rows, shows_users=not all(session.is_own for session in found)))
     return 0
 
 
-def _rows(session: Session, *, shows_users: bool) -> list[list[str]]:
-    since = datetime.fromtimestamp(session.since).strftime("%Y-%m-%d %H:%M:%S")
-    users = [_user_name(session.user)] if shows_users else []
-    head = [session.run[:_SHOWN], *users, session.project]
+def _filter(text: str) -> tuple[str, str]:
+    key, separator, value = text.partition("=")
+    if not separator or key not in _FILTERS:
+        raise UsageError(f"ps: --filter {text}: it must be KEY=VALUE, with {listed(_FILTERS)}")
+    return key, value
+
+
+def _rows(session: Session) -> Iterator[_RunningNode]:
     prefix = f"{session.namespace}/" if session.namespace else ""
-    return [
-        [*head, prefix + node, session.backend, since, state]
-        for node, state in session.states().items()
-    ]
+    for node, state in session.states().items():
+        yield _RunningNode(
+            session.run,
+            _user_name(session.user),
+            session.project,
+            prefix + node,
+            session.backend,
+            session.since,
+            state,
+            session.folder,
+        )
+
+
+def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:
+    from tabulate import tabulate
+
+    cells = []
+    for row in rows:
+        since = datetime.fromtimestamp(row.since).strftime("%Y-%m-%d %H:%M:%S")
+        users = [row.user] if shows_users else []
+        head = [row.run[:_SHOWN], *users, row.project]
+        cells.append([*head, row.node, row.backend, since, row.state])
+    users = ["user"] if shows_users else []
+    header = ["run", *users, "project", "node", "back end", "since", "state"]
+    return str(tabulate(cells, headers=header))
 
 
 def _user_name(user: int) -> str:
@@ -158,6 +219,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
     compare.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write a page (HTML) as well"
     )
+    add_format(compare)
     compare.set_defaults(command=_compare)
 
 
@@ -194,17 +256,23 @@ def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from neuros.analysis.comparison import comparison_rows, comparison_table, labels_of
+    from neuros.analysis.comparison import comparison_rows, comparison_table, figures_of, labels_of
 
     runs, refused = _readable(options.runs)
     header, rows = comparison_rows(runs)
-    print(comparison_table(header, rows))
-    for run, label in zip(runs, labels_of(runs), strict=True):
-        for line in run.missing:
-            print(f"missing in {label}: {line}")
+    is_json = options.format == JSON
+    if is_json:
+        missing = [list(run.missing) for run in runs]
+        print_json({"runs": labels_of(runs), "figures": figures_of(runs), "missing": missing})
+    else:
+        print(comparison_table(header, rows))
+        for run, label in zip(runs, labels_of(runs), strict=True):
+            for line in run.missing:
+                print(f"missing in {label}: {line}")
     if options.output is not None:
         _write(options.output.parent, {options.output.name: _comparison(runs, header, rows)})
-        print(options.output)
+        if not is_json:
+            print(options.output)
     for error in refused:
         print(f"neuros: left out: {error}", file=sys.stderr)
     return EXIT_LEFT_OUT if refused else 0
@@ -271,6 +339,7 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
     verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
     verify.add_argument("run_b", metavar="RUN_B", type=Path, help="another one")
+    add_format(verify)
     verify.set_defaults(command=_verify)
 
 
@@ -281,16 +350,22 @@ def _verify(options: argparse.Namespace) -> int:
     a, b = open_run(options.run_a), open_run(options.run_b)
     recorded = RecordedPackets()
     verdict = compare(a, b, recorded)
-    for remark in (*recorded.remarks, *verdict.remarks):
-        print(f"note: {remark}")
+    remarks = [*recorded.remarks, *verdict.remarks]
+    result, exit_code = "identical", 0
     if verdict.difference is not None:
-        print(f"different: {verdict.difference}")
-        return EXIT_DIFFERENT
-    if not verdict.compared and verdict.remarks:
-        print("unknown: there is nothing to compare")
-        return EXIT_UNKNOWN
-    print(f"identical: {verdict.compared} packet{'' if verdict.compared == 1 else 's'}")
-    return 0
+        result, exit_code = "different", EXIT_DIFFERENT
+    elif not verdict.compared and verdict.remarks:
+        result, exit_code = "unknown", EXIT_UNKNOWN
+    if options.format == JSON:
+        found = {"packets": verdict.compared, "difference": verdict.difference, "notes": remarks}
+        print_json({"verdict": result, **found})
+        return exit_code
+    for remark in remarks:
+        print(f"note: {remark}")
+    packets = f"{verdict.compared} packet{'' if verdict.compared == 1 else 's'}"
+    why = {"different": verdict.difference, "unknown": "there is nothing to compare"}
+    print(f"{result}: {why.get(result, packets)}")
+    return exit_code
 
 
 def add_bag(bag: argparse.ArgumentParser) -> None:

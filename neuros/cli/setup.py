@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.backends.containers import OWN_FOLDER, STANDARD
+from neuros.cli.output import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
@@ -113,7 +114,9 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
         "--if-engine", action="store_true", help="where there is no engine, say so, and that is all"
     )
     build.set_defaults(command=_build_images)
-    actions.add_parser("list", help="show NeuROS's images").set_defaults(command=_list_images)
+    show = actions.add_parser("list", aliases=["ls"], help="show NeuROS's images")
+    add_format(show)
+    show.set_defaults(command=_list_images)
     remove = actions.add_parser("remove", help="remove images that NeuROS has built")
     remove.add_argument("names", nargs="*", metavar="NAME", help="of containers (default: all)")
     remove.set_defaults(command=_remove_images)
@@ -174,13 +177,18 @@ def _list_images(options: argparse.Namespace) -> int:
 
     with closing(connect()) as engine:
         images = inventory(engine)
+    missing = [
+        name for name in names_in(OWN_FOLDER) if all(image.container != name for image in images)
+    ]
+    if options.format == JSON:
+        print_json({"built": images, "not_built": missing})
+        return 0
     for image in images:
         state = "" if image.is_current else "  (its recipe has changed)"
         size = f"{image.size_bytes / 1e6:6.0f} MB"
         print(f"{image.container:20} {size}  Python {image.python}  {image.tags[0]}{state}")
-    for name in names_in(OWN_FOLDER):
-        if all(image.container != name for image in images):
-            print(f"{name:20} not built")
+    for name in missing:
+        print(f"{name:20} not built")
     return 0
 
 
@@ -265,6 +273,7 @@ def add_doctor(doctor: argparse.ArgumentParser) -> None:
     doctor.add_argument(
         "--no-delivery", action="store_true", help="only look: start no nodes and no containers"
     )
+    add_format(doctor)
     doctor.set_defaults(command=_doctor)
 
 
@@ -272,8 +281,11 @@ def _doctor(options: argparse.Namespace) -> int:
     from neuros.doctor.checks import findings
     from neuros.ports import State
 
-    is_well = True
+    found = []
     for finding in findings(os.environ, proves=not options.no_delivery):
-        print(finding, flush=True)  # the proofs take seconds
-        is_well &= finding.state is not State.BAD
-    return 0 if is_well else 4
+        found.append(finding)
+        if options.format != JSON:
+            print(finding, flush=True)  # the proofs take seconds
+    if options.format == JSON:
+        print_json(found)
+    return 4 if any(finding.state is State.BAD for finding in found) else 0

@@ -162,7 +162,7 @@ class Ros:
 
     def has(self, package: str) -> bool:
         """Whether a package is installed."""
-        return (self.share(package) / MANIFEST).is_file()
+        return os.path.isfile(self.share(package) / MANIFEST)  # a name may be too long for a file
 
     def messages(self, package: str) -> Collection[str] | None:
         """The names of the messages of a package, ``None`` if there is no such package."""
@@ -176,5 +176,4 @@ class Ros:
 
     def manifest(self, package: str) -> bytes:
         """The manifest, which tells versions of a package apart; empty if it is not installed."""
-        file = self.share(package) / MANIFEST
-        return file.read_bytes() if file.is_file() else b""
+        return (self.share(package) / MANIFEST).read_bytes() if self.has(package) else b""

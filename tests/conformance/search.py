@@ -1,8 +1,8 @@
 """Looks for projects that break a rule, makes them smaller, and keeps them.
 
-A rule that rests on times counts as broken if a second run breaks it, too: a machine may stand
-still for a moment. A project that stands still by itself is run once more for as long as it takes
-to be called a deadlock.
+A rule that rests on times counts as broken if a second run breaks it, too, while no other of these
+projects runs: a machine may stand still for a moment, or have too much to do. A project that stands
+still by itself is run once more for as long as it takes to be called a deadlock.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock, Semaphore
 from typing import TypeVar
 
 from .description import Connection, Hook, Node, Port, Project, tidied
@@ -51,17 +53,49 @@ class Verdict:
         return "\n  ".join([*lines, f"and {more} more"] if more > 0 else lines)
 
 
-def verdict_of(case: Case, meter: LoadMeter) -> Verdict:
+class Gate:
+    """Lets so many in at a time, or one alone, in the order in which they come."""
+
+    def __init__(self, places: int = 1) -> None:
+        self._places = places
+        self._free = Semaphore(places)
+        self._turn = Lock()
+
+    @contextmanager
+    def one_of_many(self) -> Iterator[None]:
+        with self._turn:
+            self._free.acquire()
+        try:
+            yield
+        finally:
+            self._free.release()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        with self._turn:
+            for _ in range(self._places):
+                self._free.acquire()
+            try:
+                yield
+            finally:
+                self._free.release(self._places)
+
+
+def verdict_of(case: Case, meter: LoadMeter, gate: Gate | None = None) -> Verdict:
     """Run a case, as often as it takes to be sure."""
-    violations, is_dead = _judged(case, meter)
+    gate = gate or Gate()
+    with gate.one_of_many():
+        violations, is_dead = _judged(case, meter)
     if not violations and is_dead:
         patient = replace(case, project=replace(case.project, end="duration"))
-        violations, _ = _judged(patient, meter, seconds=_DEADLOCK_S)
+        with gate.one_of_many():
+            violations, _ = _judged(patient, meter, seconds=_DEADLOCK_S)
     doubtful = {each.rule for each in violations if each.is_timed}
     if not doubtful or len(doubtful) < len({each.rule for each in violations}):
         return Verdict(case, violations)
     for _ in range(_MORE_RUNS):
-        again, _ = _judged(case, meter)
+        with gate.alone():
+            again, _ = _judged(case, meter)
         confirmed = doubtful & {each.rule for each in again}
         if confirmed or any(not each.is_timed for each in again):
             return Verdict(case, again)
@@ -77,8 +111,9 @@ def _judged(case: Case, meter: LoadMeter, seconds: float = 0.0) -> tuple[list[Vi
 
 def verdicts(cases: Iterable[Case], jobs: int) -> Iterator[Verdict]:
     """Of many cases, in their order, so many at a time."""
+    gate = Gate(jobs)
     with LoadMeter() as meter, ThreadPoolExecutor(jobs) as pool:
-        yield from pool.map(lambda case: verdict_of(case, meter), cases)
+        yield from pool.map(lambda case: verdict_of(case, meter, gate), cases)
 
 
 # ------------------------------------------------------------------ what is kept

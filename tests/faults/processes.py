@@ -88,7 +88,9 @@ class ProcessFault:
             says = "" if self.signal == "SIGTERM" else "the Docker engine "
             is_up = self.moment != "starting"
             return Expected(codes, last_says=says, has_record=is_up, has_bag=is_up)
-        return Expected(within_s=_DURATION_S + 6.0)
+        is_told = self.target == "reaper" and self.is_fatal
+        says = "the reaper was killed: the launcher does its work" if is_told else ""
+        return Expected(says=says, within_s=_DURATION_S + 6.0)
 
 
 def process_faults() -> Iterator[ProcessFault]:

@@ -150,16 +150,24 @@ class Trial:
 
         Returns the time now if the run has ended before. Raises ``TimeoutError``.
         """
-        struck = self.run_folder / "victim" / "struck"
         deadline_s = time.monotonic() + _STRIKES_WITHIN_S
-        while not struck.exists() or not struck.read_text():
+        while (struck_s := self.struck_s) is None:
             if not running.read(POLL_S):
                 if running.process.poll() is not None:
                     return time.monotonic()
                 time.sleep(POLL_S)  # its output may be closed
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"no fault struck in {_STRIKES_WITHIN_S:g} s")
-        return float(struck.read_text())
+        return struck_s
+
+    @property
+    def struck_s(self) -> float | None:
+        """When the fault struck, on the monotonic clock; ``None``: it has not."""
+        try:
+            text = (self.run_folder / "victim" / "struck").read_text()
+        except OSError:
+            return None
+        return float(text) if text else None
 
     def processes(self) -> Iterator[psutil.Process]:
         """All of the run, with its launcher."""

@@ -90,6 +90,34 @@ def test_ctrl_c_before_anything_is_imported_waits_and_leaves_no_traceback(
         assert output.rstrip().endswith(b"ended by Ctrl+C")
 
 
+@pytest.mark.parametrize("backend", ["process", "in-process"])
+def test_ctrl_c_after_the_last_word_changes_nothing(tmp_path: Path, backend: str) -> None:
+    with made_bench(tmp_path, backend) as bench:
+        bench.project("a.o -> b.x", a=SOURCE, b=SINK)
+        for number in range(3):
+            folder = bench.folder / f"run {number}"
+            options = ["--backend", backend, "--duration", "0.2", "-o", str(folder)]
+            process = subprocess.Popen(
+                [sys.executable, "launch.py", str(bench.folder), *options],
+                cwd=REPOSITORY,
+                env={**os.environ, MARK: bench.mark},
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+            try:
+                wait_until((folder / "run.json").exists, 30.0)
+                code = json.loads((folder / "run.json").read_text())["exit_code"]
+                deadline_s = time.monotonic() + 20.0
+                while process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+                    assert time.monotonic() < deadline_s
+            finally:
+                process.kill()
+                process.wait()
+            assert process.returncode == code == 0
+
+
 def _waits_with_ctrl_c(pid: int) -> bool:
     """Whether a process has blocked SIGINT."""
     (mask,) = re.findall(r"SigBlk:\s*([0-9a-f]+)", Path(f"/proc/{pid}/status").read_text())

@@ -127,7 +127,7 @@ def test_an_isolated_run_is_heard_by_nobody_outside(is_root: bool, everybodys: P
         arguments = ("--isolate", "-d", str(domain.id))
         with start(CLOCK, *arguments, cwd=everybodys, through=through) as running:
             running.wait_for("[display]: ", 60.0)
-            assert listen(domain.id, 4.0) == "silence"
+            assert listen(domain.id, 4.0, everybodys) == "silence"
             end(running)
 
 
@@ -138,7 +138,7 @@ def test_a_run_that_is_not_isolated_is_heard(everybodys: Path) -> None:
         start(CLOCK, "-d", str(domain.id), cwd=everybodys) as running,
     ):
         running.wait_for("[display]: ", 60.0)
-        assert listen(domain.id, 20.0) == ""
+        assert listen(domain.id, 20.0, everybodys) == ""
         end(running)
 
 
@@ -151,11 +151,11 @@ def test_where_no_network_can_be_had_it_is_said(everybodys: Path) -> None:
     assert "Traceback" not in run.output
 
 
-def listen(domain: int, seconds: float) -> str:
+def listen(domain: int, seconds: float, logs: Path) -> str:
     """What another user's ROS program complains of."""
     unwanted = (RANGE_VARIABLE, PROFILES_VARIABLE)
     environment = {key: value for key, value in os.environ.items() if key not in unwanted}
-    environment |= {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": "/tmp"}
+    environment |= {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
     done = subprocess.run(
         [*other_user(), sys.executable, "-c", LISTENER, str(seconds)],
         env=environment,

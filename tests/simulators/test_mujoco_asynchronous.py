@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 from simulated_node import DEADLINE_S, WORLD, SimulatedNode, imu, stamp_ns
@@ -354,6 +355,29 @@ def test_a_window_that_the_user_closes_lets_the_simulation_go_on(window):
         viewer.sync()
     assert events == ["closed"]
     assert not viewer.is_open
+
+
+def test_a_window_that_is_closed_while_it_opens_holds_up_nothing():
+    events, loaded, ended = [], threading.Event(), threading.Event()
+
+    def launch(*_, **__):
+        assert loaded.wait(DEADLINE_S)
+        return SimpleNamespace(close=ended.set)
+
+    viewer = Viewer(
+        launch,
+        None,
+        None,
+        toggle=lambda: None,
+        closed=lambda: events.append("closed"),
+        opens_within_s=0.05,
+    )
+    assert events == ["closed"]
+    assert not viewer.is_open
+    viewer.sync()
+    viewer.close()
+    loaded.set()
+    assert ended.wait(DEADLINE_S)
 
 
 def test_another_model_gets_another_window(window):

@@ -8,6 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, TimeoutError
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -305,7 +306,9 @@ class Viewer:
         toggle: Callable[[], None],
         closed: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
+        opens_within_s: float = 10.0,
     ) -> None:
+        self._opens_within_s = opens_within_s
         self._launch, self._toggle, self._closed, self._clock = launch, toggle, closed, clock
         self._next = 0.0
         self._handle: Any = None
@@ -320,10 +323,30 @@ class Viewer:
         """Open the window for another model."""
         self.close()
         others = set(threading.enumerate())
-        self._handle = self._launch(model, data, key_callback=self._on_key)
+        self._handle = self._opened(model, data)
+        if self._handle is None:
+            self._closed()
+            return
         fresh = set(threading.enumerate()) - others
         # launch_passive draws in a thread that is named after its function.
         self._threads = {thread for thread in fresh if "_launch_internal" in thread.name}
+
+    def _opened(self, model: Any, data: Any) -> Any:
+        """Its handle; ``None`` if the user closes it so early that launch_passive never returns."""
+        opening: Future[Any] = Future()
+
+        def launch() -> None:
+            try:
+                opening.set_result(self._launch(model, data, key_callback=self._on_key))
+            except BaseException as error:
+                opening.set_exception(error)
+
+        threading.Thread(target=launch, name="viewer", daemon=True).start()
+        try:
+            return opening.result(self._opens_within_s)
+        except TimeoutError:
+            opening.add_done_callback(lambda late: late.result().close())
+            return None
 
     def sync(self) -> None:
         """Show the present data, at most 60 times per wall second; not during a step."""

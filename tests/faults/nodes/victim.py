@@ -20,6 +20,7 @@ _SIZE = int(os.environ["FAULT_BYTES"])
 _AFTER = 5
 """Executions of a hook before the fault strikes in it."""
 
+_RUN_FOLDER = Path(os.environ["NEUROS_RUN_DIR"])
 _executions = {"tick": 0, "function": 0, "thread": 0}
 _is_due = threading.Event()
 
@@ -136,7 +137,7 @@ def _strike(place):
         _executions[place] += 1
         if _executions[place] != _AFTER:
             return
-    (Path(os.environ["NEUROS_RUN_DIR"]) / "struck").write_text(str(time.monotonic()))
+    (_RUN_FOLDER / "struck").write_text(str(time.monotonic()))
     globals()[_FAULT]()
 
 
