@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,7 @@ class DaskExecutor(SweepExecutor):
                     f"no Dask scheduler answers at {place} ({error}): give the address that it"
                     " printed, as tcp://10.0.0.7:8786, or its scheduler file"
                 ) from error
+            _check_versions(client)
             workers = client.scheduler_info(n_workers=-1)["workers"].values()
             resources = _resources_for(plan, [worker["resources"] for worker in workers])
             yield PoolJobs(client.get_executor(pure=False, resources=resources))
@@ -81,6 +83,20 @@ def _local_cluster(count: int | None) -> Iterator[Any]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     with cluster:
         yield cluster
+
+
+def _check_versions(client: Any) -> None:
+    """Check that each worker has the NeuROS of this process. Raises ``EnvironmentFault``."""
+    # A function of Python itself: what a worker cannot import would have it wait for ever.
+    found = client.run(version, "neuros", on_error="return")
+    here = version("neuros")
+    for worker, there in found.items():
+        if there != here:
+            has = "no NeuROS" if isinstance(there, Exception) else f"NeuROS {there}"
+            raise EnvironmentFault(
+                f"executor dask: the worker {worker} has {has}, and this machine {here}: install"
+                " the same there, in the Python that runs dask worker"
+            )
 
 
 def _resources_for(plan: SweepPlan, declared: Sequence[Mapping[str, float]]) -> dict[str, float]:
