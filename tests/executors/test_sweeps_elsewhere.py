@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import signal
@@ -14,6 +15,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from api_projects import COUNTER, ENDLESS, dice
 from slurm import slurm_cluster
@@ -102,46 +104,68 @@ def test_on_slurm_a_sweep_is_one_array_with_the_resources_of_the_project(tmp_pat
 
 
 @pytest.mark.usefixtures("on_slurm")
-def test_a_job_that_slurm_ends_is_a_row_and_is_retried(
+def test_a_job_that_is_killed_is_a_row_and_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("neuros.executors.slurm._ASK_S", 1.0)
     project = dice(tmp_path, ENDLESS)
     table = tmp_path / "table"
+    arguments: dict[str, Any] = {"backend": "in-process", "executor": "slurm", "output": table}
     killer = threading.Thread(target=_kill_when_running, args=[table], daemon=True)
     killer.start()
-    arguments: dict[str, Any] = {
-        "backend": "in-process",
-        "executor": "slurm",
-        "output": table,
-    }
     lost = neuros.sweep(project, **arguments).rows[0]
     killer.join()
     assert lost["exit_code"] is None
-    assert "ended without a result (CANCELLED" in lost["reason"] or "FAILED" in lost["reason"]
+    assert "ended without a result (FAILED)" in lost["reason"]
     (project / "counter.py").write_text(COUNTER)
     assert neuros.sweep(project, **arguments).rows[0]["exit_code"] == 0
 
 
 def _kill_when_running(table: Path) -> None:
-    """Kill the job's processes, as for memory, as soon as its run goes on."""
+    """Kill the process of the job, as a machine does that has no memory left."""
     while not [*table.glob("*/project.json")]:
         os.sched_yield()
-    for number in squeue("%A %T"):
-        if number.endswith("RUNNING"):
-            subprocess.run(["scancel", "--signal=KILL", number.split()[0]], check=True)
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            line = process.cmdline()
+            if "submitit.core._submit" in line and str(table) in line[-1]:
+                process.kill()
+
+
+@pytest.mark.usefixtures("on_slurm")
+def test_a_job_outlives_its_front_end_and_its_row_is_taken_by_the_next(tmp_path: Path) -> None:
+    go = tmp_path / "go"
+    waits = f"__import__('os').path.exists({str(go)!r})"
+    project = dice(tmp_path, COUNTER.replace("if len(seen) == 10", f"if {waits}"))
+    table = tmp_path / "table"
+    first = front_end(tmp_path, str(project), "-o", str(table))
+    while not [*table.glob("*/project.json")]:
+        assert first.poll() is None
+    first.kill()
+    first.wait()
+    begun = Path(next(table.glob("*/project.json"))).stat().st_ino
+    second = front_end(tmp_path, str(project), "-o", str(table))
+    while len([row for row in squeue("%T %j") if row.startswith("RUNNING neuros-dice")]) < 2:
+        assert second.poll() is None
+    go.touch()
+    assert second.wait(120) == 0
+    (made,) = table.glob("*/run.json")
+    assert (made.parent / "project.json").stat().st_ino == begun, "it was made once"
+
+
+def front_end(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
+    """`neuros sweep` on Slurm."""
+    program = folder / "program.py"
+    program.write_text(PROGRAM)
+    options = ["--backend", "in-process", "--executor", "slurm"]
+    return subprocess.Popen([sys.executable, str(program), "sweep", *arguments, *options])
 
 
 @pytest.mark.usefixtures("on_slurm")
 def test_ctrl_c_ends_the_jobs_and_the_sweep_goes_on_here(tmp_path: Path) -> None:
     project = dice(tmp_path, ENDLESS)
     table = tmp_path / "table"
-    program = tmp_path / "program.py"
-    program.write_text(PROGRAM)
-    arguments = ["sweep", str(project), "--backend", "in-process", "-o", str(table)]
-    process = subprocess.Popen(
-        [sys.executable, str(program), *arguments, "--executor", "slurm", "--seeds", "1,2,3"]
-    )
+    process = front_end(tmp_path, str(project), "-o", str(table), "--seeds", "1,2,3")
     while not [*table.glob("*/project.json")]:
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
