@@ -37,6 +37,7 @@ BY_NAME = {
     "ros": (
         "api/test_python_api.py",
         "api/test_sweep.py",
+        "executors/test_sweeps_elsewhere.py",
         "benchmarks/test_reproduce_runs.py",
         "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",
