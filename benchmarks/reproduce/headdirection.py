@@ -179,8 +179,8 @@ def _less(key: str, other: str) -> Callable[[Reading], float | None]:
     """One figure less another one."""
 
     def difference(reading: Reading) -> float | None:
-        values = reading.figures[key], reading.figures[other]
-        return None if None in values else values[0] - values[1]
+        first, second = reading.figures[key], reading.figures[other]
+        return None if first is None or second is None else first - second
 
     return difference
 
@@ -308,10 +308,10 @@ def show(readings: Readings, folder: Path) -> Sequence[Section]:
         table = LEARNING.fill({TRAINING: PARTS[TRAINING]}, readings)
         sections.append(Section("What vision has learnt", [_TRAINING_TEXT], table))
     simulated_s = [each.figures["simulated_s"] or 0.0 for name in ways for each in readings[name]]
-    text = _ACCEPTANCE_TEXT + (_SHORTER if min(simulated_s, default=0) < ACCEPTED_S - 0.1 else "")
+    judged = _ACCEPTANCE_TEXT + (_SHORTER if min(simulated_s, default=0) < ACCEPTED_S - 0.1 else "")
     headers = ["", "wanted", "here", "holds"]
     wanted = Table("acceptance", headers, [each.row(readings) for each in CRITERIA])
-    return [*sections, Section("What is wanted of it", [text], wanted)]
+    return [*sections, Section("What is wanted of it", [judged], wanted)]
 
 
 def _published() -> Readings:

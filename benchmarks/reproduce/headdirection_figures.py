@@ -8,12 +8,14 @@ from statistics import median
 from typing import Any
 
 from benchmarks.reproduce import published
-from benchmarks.reproduce.drawing import PUBLISHED, SERIES, THEIRS, TRUTH, bars, figure, panels
+from benchmarks.reproduce.drawing import PUBLISHED, SERIES, TRUTH, bars, figure, panels
 from benchmarks.reproduce.kinds import Readings
 from benchmarks.reproduce.tables import values_of
 
 Errors = Mapping[str, tuple[Any, Any]]
 """By what told the heading: times in s and errors in degrees, ``(n,)`` each."""
+
+_BESIDE = {"textcoords": "offset points", "fontsize": 8}
 
 
 def draw(
@@ -45,19 +47,23 @@ def _over_time(titles: Mapping[str, str], readings: Readings, file: Path) -> Pat
 def _sizes(
     titles: Mapping[str, str], readings: Readings, series: Mapping[str, str], file: Path
 ) -> Path:
-    """RMS errors; dashed: published."""
-    with figure(file, 10.0, 1.2 + 0.5 * len(titles)) as drawn:
+    """RMS errors; diamonds: published."""
+    names = [*titles, *published.HEAD_DIRECTION]
+    with figure(file, 10.0, 1.2 + 0.4 * len(names)) as drawn:
         axes = drawn.subplots()
         sizes = []
         for key, label in series.items():
-            found = [values_of(readings[name], f"{key}_rms_deg") for name in titles]
+            found = [values_of(readings.get(name, ()), f"{key}_rms_deg") for name in names]
             sizes.append((label, [median(values) if values else None for values in found]))
-        bars(axes, list(titles.values()), sizes)
-        for name, figures in published.HEAD_DIRECTION.items():
-            rms_deg = next(value for key, value in figures.items() if key.endswith("_rms_deg"))
-            axes.plot([rms_deg], [len(titles) - 0.5], **PUBLISHED, linestyle="", label=name)
-            axes.axvline(rms_deg, color=THEIRS, linewidth=1, linestyle="--")
+        bars(axes, [titles.get(name, name) for name in names], sizes)
+        for place, name in enumerate(names):
+            for (label, _), key in zip(sizes, series, strict=True):
+                rms_deg = published.HEAD_DIRECTION.get(name, {}).get(f"{key}_rms_deg")
+                if rms_deg is not None:
+                    axes.plot(rms_deg, place, **PUBLISHED, linestyle="")
+                    axes.annotate(label, (rms_deg, place), (8, 0), va="center", **_BESIDE)
         axes.set_xscale("log")
+        axes.set_xlim(left=0.5)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_xlabel("RMS error of the heading (deg)")
         drawn.legend(*axes.get_legend_handles_labels(), loc="outside upper right", ncols=3)
