@@ -41,7 +41,11 @@ class HeadDirectionNetwork:
     Args:
         seed: of the initial membrane potentials, the only randomness; 1 to 2**32 - 1.
         beside: a network in whose kernel this one is created, with equal potentials. Settle and
-            step that one: both go on together, and only :meth:`correct` makes a difference.
+            step that one: both go on together, and only :meth:`correct` and ``offset_rad_s`` make a
+            difference.
+
+    Attributes:
+        offset_rad_s: is added to each rate of :meth:`step`, for this network alone.
 
     The heading starts at zero, which is what is decoded at the end of :meth:`settle`.
     Deterministic: the same seed and the same steps give the same headings, bit for bit.
@@ -66,7 +70,7 @@ class HeadDirectionNetwork:
         self._reader = SpikeReader(self._left + self._right, self._stepper, DELAY_MS)
         self._population = PopulationVector(np.tile(self._angles, 2))
         self._raw_rad = self._zero_rad = self._heading_rad = 0.0
-        self._rate_rad_s = 0.0
+        self._rate_rad_s = self.offset_rad_s = 0.0
 
     @property
     def heading_rad(self) -> float:
@@ -104,7 +108,7 @@ class HeadDirectionNetwork:
         Raises ``ValueError`` where the duration is not a whole number of :attr:`quantum_s`.
         """
         for network in self._together:
-            network._set_drive(rate_rad_s)
+            network._set_drive(rate_rad_s + network.offset_rad_s)
         self._stepper.advance_s(duration_s)
         for network in self._together:
             network._decode(network._reader.read())
