@@ -43,7 +43,9 @@ class TestSeenHeading:
         seen.see(5 * PERIOD_NS, 1.0, 0.05, EXACT)
         assert seen.now() == pytest.approx((1.0 + 0.5 * 0.1, 1.0))
 
-    @pytest.mark.parametrize("deviations, weight", [(0.1, 1.0), (1.0, 1.0), (2.0, 0.25), (3, 1 / 9)])
+    @pytest.mark.parametrize(
+        ("deviations", "weight"), [(0.1, 1.0), (1.0, 1.0), (2.0, 0.25), (3, 1 / 9)]
+    )
     def test_it_counts_by_the_inverse_of_its_variance(self, seen, deviations, weight):
         seen.see(10 * PERIOD_NS, 1.0, 0.05, deviations * EXACT)
         assert seen.now() == pytest.approx((1.0, weight))

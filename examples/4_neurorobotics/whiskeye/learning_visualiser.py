@@ -1,6 +1,6 @@
 """What correction_visualiser.py draws, and the bias of the gyroscope that the ring has learnt."""
 
-from correction_visualiser import (  # noqa: F401: their hooks are those of this node, too
+from correction_visualiser import (
     Headings,
     report,
     show_corrected,
@@ -15,6 +15,18 @@ from neuros.hooks import neuros_function, neuros_initialise
 from neuros.visualise import VisualiseLines
 
 LEARNT = "learnt bias"
+
+# The hooks that are imported are those of this node, too.
+__all__ = [
+    "report",
+    "show_bias",
+    "show_corrected",
+    "show_prediction_error",
+    "show_truth",
+    "show_uncorrected",
+    "show_vision",
+    "start",
+]
 
 
 @neuros_initialise()

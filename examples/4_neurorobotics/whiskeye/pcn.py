@@ -1,10 +1,11 @@
 """The predictive coding network that a run of ``training.json`` has trained, as a node.
 
-For each pair of pictures it sends ``odom_correction``: the heading in ``vector.z`` in radians, and
-in ``vector.x`` the mean squared error of the view that it predicts, by which the receiver judges
-whether to trust it, and in ``vector.y`` how far the heading is off by that error, as one standard
-deviation in radians, which the training measured at views that it had held out; and ``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of
-view, first and second layer. For a pair without pixels the heading is NaN: nothing was seen.
+For each pair of pictures it sends ``odom_correction``: the heading in ``vector.z`` in radians; in
+``vector.x`` the mean squared error of the view that it predicts, by which the receiver judges
+whether to trust it; in ``vector.y`` how far the heading is off at such an error, as one standard
+deviation in radians, which the training measured at views that it had held out. And it sends
+``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of view, first and second
+layer. For a pair without pixels the heading is NaN: nothing was seen.
 """
 
 from __future__ import annotations
