@@ -15,7 +15,7 @@ def start_integrator(node: Any) -> None:
         CorrectedIntegrator(
             int(os.environ.get("SEED", "1")),
             float(os.environ.get("GYRO_BIAS", "0")),
-            float(os.environ.get("CORRECTION_PA", "250")),
+            float(os.environ.get("CORRECTION_PA", "300")),
             float(os.environ.get("GATE", str(GATE))),
             float(os.environ.get("LEARNING", "0")),
         )

@@ -18,7 +18,7 @@ from head_direction import HeadDirectionNetwork
 from snn import GyroIntegrator
 
 HOLD_NS = 300_000_000  # how long a heading that was seen is good for: three pictures
-LEAD_S = 0.07  # how late the ring follows
+LEAD_S = 0.06  # how late the ring follows: so far ahead a current holds the bump, no more
 WIDTH_RAD = math.radians(30.0)
 EXACT_RAD = math.radians(1.0)  # a heading as exact as this is pulled to with all of the gain
 GATE = 0.12  # see README.md
