@@ -138,5 +138,9 @@ def test_the_trainer_writes_weights_with_seeds_and_figures(load, tmp_path):
             assert 0 < figures[held][method]["rms_deg"] < 20
     with np.load(folder / "weights.npz") as weights:
         assert weights["mean"].shape == (1152,)
+        assert math.degrees(weights["rad_per_error"]) == pytest.approx(figures["deg_per_error"])
+        assert len(weights["old_views"]) == len(weights["old_rad"]) > 0
+        tested = figures["views"]["headings"] + figures["views"]["places"]
+        assert len(weights["test_views"]) == len(weights["test_rad"]) == tested
     results = json.loads((folder / "results.json").read_text())
     assert results["places_network_rms_deg"] == figures["held_out_places"]["network"]["rms_deg"]

@@ -25,7 +25,11 @@ class HeadDirectionNetwork(DoubleRing):
     Args:
         seed: of the initial membrane potentials, the only randomness; 1 to 2**32 - 1.
         beside: a network in whose kernel this one is created, with equal potentials. Settle and
-            step that one: both go on together, and only :meth:`correct` makes a difference.
+            step that one: both go on together, and only :meth:`correct` and ``offset_rad_s`` make a
+            difference.
+
+    Attributes:
+        offset_rad_s: is added to each rate of :meth:`step`, for this network alone.
 
     Deterministic: the same seed and the same steps give the same headings, bit for bit.
     """
@@ -47,7 +51,7 @@ class HeadDirectionNetwork(DoubleRing):
             self._left.V_m, self._right.V_m = beside._left.V_m, beside._right.V_m
         self._correction: Any = None  # made when it is needed: it costs time
         self._reader = SpikeReader(self._left + self._right, self._stepper, DELAY_MS)
-        self._rate_rad_s = 0.0
+        self._rate_rad_s = self.offset_rad_s = 0.0
 
     @property
     def quantum_s(self) -> float:
@@ -70,6 +74,7 @@ class HeadDirectionNetwork(DoubleRing):
         self._correction.amplitude = peak_pa * np.exp(-0.5 * (away_rad / width_rad) ** 2)
 
     def _set_drive(self, rate_rad_s: float) -> None:
+        rate_rad_s += self.offset_rad_s
         if rate_rad_s != self._rate_rad_s:
             self._drive_left.amplitude = DRIVE_PA_PER_RAD_S * rate_rad_s
             self._drive_right.amplitude = -DRIVE_PA_PER_RAD_S * rate_rad_s
