@@ -64,6 +64,7 @@ BY_NAME = {
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",
     ),
     "slow": (
+        "benchmarks/test_reproduce_headdirection.py",
         "benchmarks/test_reproduce_tables.py",
         "cli/test_report_command.py",
         "documentation/test_site_parts.py::TestReference",
