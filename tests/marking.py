@@ -69,6 +69,7 @@ BY_NAME = {
         "cli/test_report_command.py",
         "documentation/test_site_parts.py::TestReference",
         "examples/test_whiskeye_correction.py",
+        "examples/test_whiskeye_homing.py",
         "examples/test_whiskeye_network.py",
         "examples/test_whiskeye_plugins.py",
         "examples/test_whiskeye_room.py",

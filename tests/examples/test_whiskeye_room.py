@@ -30,12 +30,19 @@ def test_the_robot_in_the_room_is_that_of_whiskeye_xml_without_its_cues(room):
     assert np.array_equal(room.body_mass, alone.body_mass)
     assert np.array_equal(room.cam_quat, alone.cam_quat)
     assert room.opt.timestep == alone.opt.timestep
-    colliding = {
-        room.geom(index).name
-        for index in range(room.ngeom)
-        if room.geom_contype[index] or room.geom_conaffinity[index]
+
+
+def test_wheels_stand_on_the_floor_and_all_else_of_the_robot_touches_only_the_cues(room):
+    geoms = [room.geom(index) for index in range(room.ngeom)]
+    touching = {
+        (robot.name or "else", other.name or "cue")
+        for robot in geoms
+        for other in geoms
+        if robot.bodyid[0] and robot.contype[0] & other.conaffinity[0]
     }
-    assert colliding == {"ground", *(f"whiskeye/wheel_{wheel}" for wheel in (1, 2, 3))}
+    wheels = {f"whiskeye/wheel_{wheel}" for wheel in (1, 2, 3)}
+    on_wheels = {(wheel, other) for wheel in wheels for other in ("ground", *wheels)}
+    assert touching == {("else", "cue"), *on_wheels}
 
 
 def test_the_cues_are_irregular(room):

@@ -105,6 +105,11 @@ class PredictiveCodingNetwork:
         errors = np.stack([np.mean(np.square(e), axis=1) for e in self._errors(layers)], axis=1)
         return _readable(layers) @ self._read, errors
 
+    def predicted(self, views: Floats) -> Floats:
+        """What it expects to see for the causes that it infers of views ``(n, pixels)``; alike."""
+        layers = self._see(views - self._mean)
+        return _active(layers[1]) @ self._down[0] + self._mean
+
     def _drawn(self, causes: int, predicted: int) -> Floats:
         drawn = self._rng.normal(0.0, 1.0 / np.sqrt(causes), (causes, predicted))
         return drawn.astype(np.float32)
