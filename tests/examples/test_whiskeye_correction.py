@@ -161,10 +161,10 @@ def weights(load, tmp_path):
         tmp_path / "weights.npz",
         **network.weights,
         rad_per_error=0.5,
-        old_views=seen[::2].astype(np.float16),
-        old_rad=headings[::2].astype(np.float32),
-        test_views=seen[1::2].astype(np.float16),
-        test_rad=headings[1::2].astype(np.float32),
+        old_views=seen.astype(np.float16),
+        old_rad=headings.astype(np.float32),
+        test_views=seen.astype(np.float16),
+        test_rad=headings.astype(np.float32),
     )
     return str(tmp_path / "weights.npz")
 
@@ -190,7 +190,7 @@ def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none
 
 def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(weights):
     """The heading of a view comes with the next pictures, as in the project."""
-    environment = {"WEIGHTS": weights, "GATE": "0", "NEW_VIEWS": "8", "EPOCHS": "40"}
+    environment = {"WEIGHTS": weights, "GATE": "0", "NEW_VIEWS": "8", "EPOCHS": "12"}
     with PluginHarness.from_project(
         EXAMPLE / "learning.json", "pcn", environment=environment
     ) as pcn:
@@ -204,7 +204,7 @@ def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(we
         before, *_, after = (each.vector.x for each in pcn.received("prediction_error"))
         (found,) = json.loads((pcn.run_dir / "learning.json").read_text())
     assert found["learnt"] == 6
-    assert found["after"]["old"]["view_error"] < 1.5 * found["before"]["old"]["view_error"]
+    assert found["after"]["old"]["view_error"] < found["before"]["old"]["view_error"]
     assert found["after"] != found["before"]
     assert after != before
 

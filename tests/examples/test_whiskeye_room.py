@@ -123,3 +123,21 @@ def test_its_eyes_see_at_10_hz_and_the_body_camera_at_5():
     last = sent["pose"][-1].pose
     assert 2 * math.asin(last.orientation.z) == pytest.approx(0.4, abs=0.03)
     assert math.hypot(last.position.x, last.position.y) == pytest.approx(0.08, abs=0.02)
+
+
+@pytest.mark.needs("OpenGL")
+def test_the_room_changes_its_colours_once_and_the_way_goes_on():
+    seen, turned = [], []
+    for change_s in ("inf", "0.15"):
+        environment = {"DURATION": "0.3", "CHANGE_S": change_s}
+        with PluginHarness.from_project(
+            EXAMPLE / "learning.json", "robot", environment=environment
+        ) as robot:
+            robot.run()
+            pictures = [packet for packet in robot.received("left_eye") if packet.height]
+            seen.append([np.frombuffer(packet.data, np.uint8) for packet in pictures])
+            turned.append([packet.angular_velocity.z for packet in robot.received("imu")])
+    assert turned[0] == turned[1]
+    differing = [np.mean(same != other) for same, other in zip(*seen, strict=True)]
+    assert differing[0] == 0
+    assert min(differing[1:]) > 0.2

@@ -92,7 +92,8 @@ def train(node, examples):
     rad_per_error = float(np.sqrt(np.mean(squares))) if squares else math.inf
     figures["deg_per_error"] = math.degrees(rad_per_error)
     tested = parts.headings | parts.places
-    kept = np.linspace(0, len(learnt_views), REMEMBERED, endpoint=False).astype(int)
+    count = min(REMEMBERED, len(learnt_views))
+    kept = np.linspace(0, len(learnt_views), count, endpoint=False).astype(int)
     saved = {
         **network.weights,
         "rad_per_error": rad_per_error,
