@@ -3,13 +3,15 @@
 
 ::
 
-    .venv/bin/python docs/gallery.py
+    .venv/bin/python docs/gallery.py [--weights RUN/trainer/weights.npz]
 
-It needs what the examples need, and Matplotlib. Look at what it has made.
+It needs what the examples need, and Matplotlib; with the weights of a run of WhiskEye's
+``training.json`` it makes the film of that example, too. Look at what it has made.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 from pathlib import Path
 
@@ -56,5 +58,12 @@ def render_scenes() -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Make the pictures of the gallery.")
+    parser.add_argument("--weights", type=Path, help="of WhiskEye's training.json, for its film")
+    weights = parser.parse_args().weights
     draw_graphs()
     render_scenes()
+    if weights:
+        from whiskeye_film import make_film
+
+        make_film(weights, FIGURES / "whiskeye.webp", FIGURES / "whiskeye_views.png")

@@ -37,6 +37,7 @@ BY_NAME = {
     "ros": (
         "api/test_python_api.py",
         "api/test_sweep.py",
+        "executors/test_sweeps_elsewhere.py",
         "benchmarks/test_reproduce_runs.py",
         "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",
@@ -63,10 +64,12 @@ BY_NAME = {
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",
     ),
     "slow": (
+        "benchmarks/test_reproduce_headdirection.py",
         "benchmarks/test_reproduce_tables.py",
         "cli/test_report_command.py",
         "documentation/test_site_parts.py::TestReference",
         "examples/test_whiskeye_correction.py",
+        "examples/test_whiskeye_homing.py",
         "examples/test_whiskeye_network.py",
         "examples/test_whiskeye_plugins.py",
         "examples/test_whiskeye_room.py",

@@ -47,6 +47,11 @@ def _program(*names: str) -> Callable[[], bool]:
     return lambda: any(shutil.which(name) for name in names)
 
 
+def _daemon(name: str) -> Callable[[], bool]:
+    """Where an ordinary user's PATH does not lead."""
+    return lambda: shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin") is not None
+
+
 def _has_headers() -> bool:
     return Path(sysconfig.get_path("include"), "Python.h").is_file()
 
@@ -69,6 +74,10 @@ NEEDS = {
     "OSMesa": Need(_has_osmesa, ("libosmesa6",)),
     "Xvfb": Need(_program("Xvfb"), ("xvfb",)),
     "Chromium": Need(_program("chromium", "google-chrome"), ("chromium",)),
+    "munged": Need(_daemon("munged"), ("munge",)),
+    "slurmctld": Need(_daemon("slurmctld"), ("slurmctld",)),
+    "slurmd": Need(_daemon("slurmd"), ("slurmd",)),
+    "sbatch": Need(_program("sbatch"), ("slurm-client",)),
     "ip": Need(_program("ip"), ("iproute2",)),
     "iptables": Need(_program("iptables"), ("iptables",)),
 }

@@ -11,6 +11,7 @@ import pytest
 
 from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.executors.registered import EXECUTORS
 from neuros.ports import BackEnd
 from neuros.registry import OWN
 from neuros.simulators.registered import SIMULATORS
@@ -31,8 +32,8 @@ def test_our_back_ends_can_be_loaded_and_say_what_help_needs(name: str) -> None:
     assert back_end.place
 
 
-def test_our_transports_simulators_and_viewers_can_be_loaded() -> None:
-    for registry in (TRANSPORTS, SIMULATORS, VIEWERS):
+def test_our_transports_simulators_viewers_and_executors_can_be_loaded() -> None:
+    for registry in (TRANSPORTS, SIMULATORS, VIEWERS, EXECUTORS):
         assert [registry.load(name).name for name in registry] == [*registry]
 
 

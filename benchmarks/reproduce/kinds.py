@@ -28,6 +28,17 @@ class Reading:
     series: Any
 
 
+WEIGHTS = "weights.npz"
+"""In the folder of an experiment: weights that ``--weights`` has given."""
+
+ELSEWHERE = (
+    "Published numbers are the results in the published sources of NeuROS 1.0. They were measured"
+    " on other machines and with another simulator (Gazebo; the Neurorobotics Platform beside it),"
+    " and with other implementations of the network. They are here to show what was claimed and"
+    " in what shape; the difference between them and the figures of this page is not a measure of"
+    " NeuROS."
+)
+
 Readings = Mapping[str, Sequence[Reading]]
 """By the name of the part; at least one each."""
 
@@ -43,6 +54,8 @@ class Kind:
         show: draws figures into a folder; returns the sections of the page.
         shortest_s: what a run has to last at least.
         duration_s: how long it lasts unless somebody says otherwise.
+        elsewhere: where published numbers come from.
+        trains: the part whose weights the others need, and which ``--weights`` replaces.
     """
 
     title: str
@@ -53,3 +66,5 @@ class Kind:
     show: Callable[[Readings, Path], Sequence[Section]]
     shortest_s: float = 0.0
     duration_s: float = 20.0
+    elsewhere: str = ELSEWHERE
+    trains: str = ""

@@ -12,14 +12,6 @@ from benchmarks.reproduce.tables import write_runs
 from benchmarks.results import write_whole
 from neuros.errors import UsageError
 
-ELSEWHERE = (
-    "Published numbers are the results in the published sources of NeuROS 1.0. They were measured"
-    " on other machines and with another simulator (Gazebo; the Neurorobotics Platform beside it),"
-    " and with other implementations of the network. They are here to show what was claimed and"
-    " in what shape; the difference between them and the figures of this page is not a measure of"
-    " NeuROS."
-)
-
 
 def write_results(experiment: Experiment, kind: Kind) -> Path:
     """Write all of it into the folder of the experiment; returns ``index.md``.
@@ -82,7 +74,10 @@ def _beginning(experiment: Experiment, kind: Kind) -> Sequence[Section]:
             f" In the second before a run others kept {min(loads):.0%} to {max(loads):.0%} of the"
             " cores busy."
         )
-    sections = [Section("", [kind.introduction, ELSEWHERE, about]), Section("Measured on", [on])]
+    sections = [
+        Section("", [kind.introduction, kind.elsewhere, about]),
+        Section("Measured on", [on]),
+    ]
     failed = [entry for entry in experiment.runs if entry.failure]
     if failed:
         lines = [f"{entry.title}: {entry.failure.splitlines()[-1]}" for entry in failed]

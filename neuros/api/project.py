@@ -115,14 +115,14 @@ class Project:
         """
         return Project(self._path, {**self.settings, **settings})
 
-    def check_with(self, settings: Mapping[str, Any], seed: int | None = None) -> None:
-        """Check it as it would be run with these values, and do no more.
+    def check_with(self, settings: Mapping[str, Any], seed: int | None = None) -> Described:
+        """Check it as it would be run with these values, and do no more; returns its model.
 
         Raises:
             ProjectError: with every problem there is.
             UsageError: if there is a seed, and no node takes one.
         """
-        self._load_for_run(StartOptions(set=settings, seed=seed))
+        return self._load_for_run(StartOptions(set=settings, seed=seed))[0]
 
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""
@@ -173,6 +173,10 @@ class Project:
         live = self._prepared(options)
         live.begin()
         return live
+
+    def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
+        """As another machine, or a later time, has it: read again."""
+        return Project, (self._path, self.settings)
 
     def __repr__(self) -> str:
         counts = f"{len(self.nodes)} nodes, {len(self.connections)} connections"

@@ -16,6 +16,8 @@ from neuros.errors import UsageError
 from neuros.options import like, option, options_of, positive_number
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from neuros.recording.recording_plan import Request as RecordingRequest
 
 OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
@@ -33,6 +35,12 @@ def _viewers() -> Iterable[str]:
     from neuros.viewers.registered import VIEWERS
 
     return VIEWERS
+
+
+def _executors() -> Iterable[str]:
+    from neuros.executors.registered import EXECUTORS
+
+    return EXECUTORS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,12 +354,26 @@ class SweepOptions:
     repeat: int = option(
         "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"
     )
-    jobs: int = option(
+    executor: str | Executor = option(
+        "--executor",
+        default="local",
+        suggestions=_executors,
+        metavar="NAME",
+        page="python.md#sweeps-on-a-cluster",
+        help="make the runs on this machine (local), as an array of Slurm jobs (slurm, or"
+        " slurm=PARTITION), or on Dask workers (dask=ADDRESS; dask alone: on workers of this"
+        " machine); other distributions may add executors. From Python also any executor of"
+        " concurrent.futures",
+    )
+    jobs: int | None = option(
         "--jobs",
         parse=positive_number,
-        default=1,
         metavar="N",
+        default_help="1 with local, else as many as there is room for",
         help="runs at once, which take processors from each other: not for real-time factors",
+    )
+    retry: bool = option(
+        "--retry", default=False, help="make runs again that have failed in an earlier call"
     )
     backend: str | None = like(Request, "backend")
     duration: float | str | None = like(Request, "duration")

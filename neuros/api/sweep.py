@@ -12,30 +12,40 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
-from neuros.analysis.run_record import consumed_percent
-from neuros.api.live import LiveRun
-from neuros.api.project import Project, value_text
-from neuros.api.request import SweepOptions
+from neuros.api.project import Project, override_texts, value_text
+from neuros.api.request import Request, SweepOptions
 from neuros.api.run import Run, frame_of
+from neuros.api.sweep_job import (
+    SHARE,
+    SweepJob,
+    failed_row,
+    finished_run,
+    row_of,
+    set_aside,
+)
 from neuros.caching import locked
-from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
+from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
+from neuros.executors.registered import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
 from neuros.recording.run_file import RUN_FILE
 
-# A run that was interrupted, or could not write what it should, is made again.
-_FINISHED = (0, 1, 5)
-_LOOK_S = 0.05
 _PLAN_NAME = "sweep.json"
 _LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
+_STOP_NAME = ".sweep.stop"  # there from when a sweep was ended until it goes on
 CSV_NAME = "sweep.csv"
+_HEED_S = 1.0
+_PAUSE_PER_WRITING = 100.0  # so that a table of any length takes 1 % of a core
+_OF_EACH_RUN = ("backend", "duration", "record")
 _REASON_CHARACTERS = 50
 _COUNTS = (": sent", ": consumed")
-_SHARE = ": consumed / %"
 _MOST_CHARACTERS = 80
 # Columns of the table that are none of a value.
 _TAKEN = {
@@ -81,7 +91,8 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
 
     What has finished in ``output`` already is not run again, so that a sweep can be gone on with.
     A run that fails is a row like the others. ``KeyboardInterrupt`` ends the runs that go on;
-    what has finished is in the table on the disk.
+    what has finished is in the table on the disk. This process reads no run folder but those of an
+    earlier call: a job sends the row of its run.
 
     ``set`` has, by path as in ``--set``, a list of values or a single one. Runs have the other
     options of :meth:`~neuros.api.project.Project.run`.
@@ -96,13 +107,12 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
         project = Project.from_file(project)
     values = _values(options.set)
     points = points_of(values, [int(seed) for seed in options.seeds], options.repeat)
-    if options.jobs < 1:
+    if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
-    _check_all(project, points)
+    resources = _check_all(project, points)
     folder = _sweep_folder(project, options)
-    names = short_names(list(values))
     with _locked_folder(folder):
-        return _Sweeping(project, points, names, folder, options).run()
+        return _Sweeping(project, points, folder, options).run(resources)
 
 
 def _values(given: Mapping[str, Any] | Sequence[str] | None) -> dict[str, list[Any]]:
@@ -125,91 +135,117 @@ class _Sweeping:
         self,
         project: Project,
         points: Sequence[Point],
-        names: Mapping[str, str],
         folder: Path,
         options: SweepOptions,
     ) -> None:
-        self._project = project
-        self._names = names
+        names = short_names(list(points[0].settings))
+        self._name = project.name
         self._options = options
         self._sweep = Sweep(folder)
         self._points = {point.folder_name(names): point for point in points}
         self._rows: dict[str, dict[str, Any]] = {}
-        self._live: dict[str, LiveRun] = {}
+        self._next_save_s = 0.0
+        request = Request(backend=options.backend, duration=options.duration, record=options.record)
+        self._jobs = {
+            name: SweepJob(
+                project,
+                point.values(names),
+                {
+                    "set": override_texts(point.settings),
+                    "seed": point.seed,
+                    **{key: getattr(request, key) for key in _OF_EACH_RUN},
+                },
+                folder / name,
+                folder / _STOP_NAME,
+            )
+            for name, point in self._points.items()
+        }
 
-    def run(self) -> Sweep:
-        waiting = [name for name in self._points if not self._take_finished(name)]
+    def run(self, resources: JobResources) -> Sweep:
+        folder, options = self._sweep.folder, self._options
+        (folder / _STOP_NAME).unlink(missing_ok=True)
+        waiting = [name for name in self._jobs if not self._take_finished(name)]
         try:
-            while waiting or self._live:
-                while waiting and len(self._live) < self._options.jobs:
-                    self._start(waiting.pop(0))
-                self._collect()
-        except BaseException:
-            for live in self._live.values():
-                live.interrupt()
-            for live in self._live.values():
-                live.join()
-            raise
+            if waiting:
+                plan = SweepPlan(self._name, folder, options.jobs, resources)
+                with open_executor(options.executor, plan) as jobs:
+                    self._execute(jobs, waiting)
         finally:
             self._save()
         return self._sweep
 
+    def _execute(self, jobs: Jobs, waiting: Sequence[str]) -> None:
+        """Have the runs made, and note each as soon as it has ended."""
+        ended: SimpleQueue[str] = SimpleQueue()
+        futures: dict[str, Future[Any]] = {}
+        noted: set[str] = set()
+        try:
+            submitted = jobs.submit([self._jobs[name] for name in waiting])
+            futures |= zip(waiting, submitted, strict=True)
+            for name, future in futures.items():
+                future.add_done_callback(partial(_put, ended, name))
+            while len(noted) < len(futures):
+                # Python does not see a Ctrl+C that comes just before it waits, until it has waited.
+                with contextlib.suppress(Empty):
+                    name = ended.get(timeout=_HEED_S)
+                    noted.add(name)
+                    self._note(name, futures[name])
+        except BaseException:
+            # Wherever they are: jobs look for it.
+            (self._sweep.folder / _STOP_NAME).touch()
+            jobs.cancel()
+            wait(futures.values())
+            for name, future in futures.items():
+                self._take(name, future)
+            raise
+
     def _take_finished(self, name: str) -> bool:
-        """Whether this was run before; what is left of one that was cut off is set aside."""
-        folder = self._sweep.folder / name
-        if not folder.exists():
+        """Whether this was run before; what is to be made again is set aside."""
+        job = self._jobs[name]
+        # Without a record it may go on: its job sees to it.
+        if not (job.folder / RUN_FILE).exists():
             return False
-        try:
-            run = Run(folder)
-        except UsageError:
-            run = None
-        if run is None or run.exit_code not in _FINISHED:
-            _set_aside(folder)
+        run = finished_run(job.folder)
+        if run and (run.is_ok or not self._options.retry):
+            self._rows[name] = row_of(job.values, run)
+            return True
+        set_aside(job.folder, "failed" if run else "unfinished")
+        return False
+
+    def _take(self, name: str, future: Future[Any]) -> bool:
+        """Whether a job has brought a row."""
+        job = self._jobs[name]
+        if future.cancelled():
             return False
-        self._rows[name] = _row_of(self._points[name].values(self._names), run)
-        return True
+        error = future.exception()
+        row = future.result() if error is None else failed_row(job.values, error, job.folder)
+        if row is not None:
+            self._rows[name] = row
+        return row is not None
 
-    def _start(self, name: str) -> None:
-        point, folder = self._points[name], self._sweep.folder / name
-        try:
-            self._live[name] = self._project.start(
-                set=point.settings,
-                seed=point.seed,
-                output=folder,
-                backend=self._options.backend,
-                duration=self._options.duration,
-                record=self._options.record,
-            )
-        except EnvironmentFault as error:
-            self._note(name, _failed_row(point.values(self._names), error, folder))
-
-    def _collect(self) -> None:
-        """Take what has ended, after a moment."""
-        time.sleep(_LOOK_S if self._live else 0.0)
-        for name, live in tuple(self._live.items()):
-            if live.is_running:
-                continue
-            del self._live[name]
-            values = self._points[name].values(self._names)
-            try:
-                row = _row_of(values, live.wait())
-            except NeurosError as error:
-                row = _failed_row(values, error, live.folder)
-            self._note(name, row)
-
-    def _note(self, name: str, row: dict[str, Any]) -> None:
-        self._rows[name] = row
-        self._save()
+    def _note(self, name: str, future: Future[Any]) -> None:
+        if not self._take(name, future):
+            return
+        if time.monotonic() >= self._next_save_s:
+            self._save()
         if self._options.on_row is not None:
-            self._options.on_row(len(self._rows), len(self._points), row)
+            self._options.on_row(len(self._rows), len(self._points), self._rows[name])
 
     def _save(self) -> None:
+        """Write the table; how long that takes says how soon it may be written again."""
+        started_s = time.monotonic()
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
         try:
             _write_csv(self._sweep.rows, self._sweep.folder)
         except OSError as error:
             file = self._sweep.folder / CSV_NAME
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
+        now_s = time.monotonic()
+        self._next_save_s = now_s + _PAUSE_PER_WRITING * (now_s - started_s)
+
+
+def _put(ended: SimpleQueue[str], name: str, _: Future[Any]) -> None:
+    ended.put(name)
 
 
 def _as_list(given: Any) -> list[Any]:
@@ -217,16 +253,21 @@ def _as_list(given: Any) -> list[Any]:
     return [given] if is_one else list(given)
 
 
-def _check_all(project: Project, points: Sequence[Point]) -> None:
-    """Whether the project is valid with every point. Raises ``ProjectError`` with all problems."""
+def _check_all(project: Project, points: Sequence[Point]) -> JobResources:
+    """Check the project with every point; returns what is enough for each of its runs.
+
+    Raises ``ProjectError`` with all problems.
+    """
     problems: list[Problem] = []
+    needs: set[JobResources] = set()
     for point in points:
         try:
-            project.check_with(point.settings, point.seed)
+            needs.add(JobResources.of(project.check_with(point.settings, point.seed)))
         except ProjectError as error:
             problems += error.problems
     if problems:
         raise ProjectError(problems)
+    return JobResources.most(needs)
 
 
 def _sweep_folder(project: Project, options: SweepOptions) -> Path:
@@ -236,7 +277,7 @@ def _sweep_folder(project: Project, options: SweepOptions) -> Path:
     plan = {
         "project": str(project.file),
         "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
-        **{name: str(getattr(options, name)) for name in ("backend", "duration", "record")},
+        **{name: str(getattr(options, name)) for name in _OF_EACH_RUN},
     }
     file = folder / _PLAN_NAME
     try:
@@ -275,39 +316,6 @@ def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path)
                 f"{folder} holds a sweep that is not this one ({what} differ):"
                 " name another folder with -o"
             )
-
-
-def _set_aside(folder: Path) -> None:
-    """Rename what a run has left that was cut off."""
-    number = 1
-    while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
-        number += 1
-    folder.rename(aside)
-
-
-def _row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
-    """What came of a run, behind the values that it was made with."""
-    row = {
-        **values,
-        "exit_code": run.exit_code,
-        "reason": run.reason,
-        "wall_s": run.wall_s,
-        "sim_s": run.sim_s,
-        "real_time_factor": run.real_time_factor,
-    }
-    for name, connection in run.connections.items():
-        sent, consumed = connection["sent"], connection["consumed"]
-        row[f"{name}: sent"] = sent
-        row[f"{name}: consumed"] = consumed
-        row[f"{name}{_SHARE}"] = consumed_percent(connection)
-    for node, results in run.node_results.items():
-        row |= {f"{node}.{name}": value for name, value in results.items()}
-    return {**row, "folder": str(run.folder)}
-
-
-def _failed_row(values: Mapping[str, Any], error: Exception, folder: Path) -> dict[str, Any]:
-    """The row of a run that could not begin."""
-    return {**values, "exit_code": None, "reason": f"not started: {error}", "folder": str(folder)}
 
 
 def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -350,7 +358,7 @@ def _is_shown(value: Any) -> bool:
 def _cell(name: str, value: Any) -> str:
     if value is None or isinstance(value, (list, dict)):
         return ""
-    if name.endswith(_SHARE):
+    if name.endswith(SHARE):
         return f"{value:.1f}"
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
     if name == "reason" and len(text) > _REASON_CHARACTERS:

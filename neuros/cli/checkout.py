@@ -94,8 +94,9 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
     add = reproduce.add_argument
     add(
         "experiment",
-        choices=("whiskeye", "tick", "voting", "elevator"),
-        help="whiskeye: the robot in its seven orchestrations; tick: how regular ticks are, beside"
+        choices=("whiskeye", "headdirection", "tick", "voting", "elevator"),
+        help="whiskeye: the robot in its seven orchestrations; headdirection:"
+        " what its eyes see corrects its heading; tick: how regular ticks are, beside"
         " a timer of rclpy; voting: what is added to three tasks of 5 s at once; elevator: how fast"
         " a simulation is in three orchestrations",
     )
@@ -105,15 +106,21 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NAME",
         help="only these parts: tick_20ms, tick_60ms, tick_100ms, the same with _1ms behind it,"
-        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); neuros, rclpy (tick); strict,"
-        " no_discard_limit, asynchronous (elevator)",
+        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); training, left, right,"
+        " left_biased, right_biased, left_biased_down (headdirection); neuros, rclpy (tick);"
+        " strict, no_discard_limit, asynchronous (elevator)",
     )
     add(
         "--duration",
         type=_seconds,
         metavar="SECONDS",
-        help="of a run: simulated seconds of whiskeye, else wall seconds (default: 20 for whiskeye"
-        " and elevator, 60 for tick and voting)",
+        help="of a run: simulated seconds of whiskeye and headdirection, else wall seconds"
+        " (default: 20 for whiskeye and elevator, 60 for the others)",
+    )
+    add(
+        "--weights",
+        metavar="FILE",
+        help="of an earlier training run, instead of training (headdirection)",
     )
     add_options(reproduce, [each for each in options_of(Request) if each.name == "backend"])
     add(
@@ -133,7 +140,8 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    given = (options.repeat, options.only, options.duration, options.backend, options.output)
+    names = ("repeat", "only", "duration", "weights", "backend", "output")
+    given = [getattr(options, name) for name in names]
     if options.source is not None and any(each is not None for each in given):
         raise UsageError("--from runs nothing: no other option goes with it")
     return int(checkout_command("benchmarks.reproduce.command").run(options))

@@ -492,6 +492,7 @@ def unread_variables(
         yield Problem(f"--set {text}", 1, 1, "", complaint, hint)
 
 
+@cache
 def _is_read_by_neuros(key: str) -> bool:
     package = Path(__file__).resolve().parents[1]
     quoted = f'"{key}"'

@@ -93,3 +93,21 @@ def test_all_seven_orchestrations_come_out_and_lossless_ones_repeat(tmp_path: Pa
     assert len(again) == 4
     both = [found["strict-1"], found["hybrid-1"], *again.values()]
     assert len({row["estimates_digest"] for row in both}) == 1
+
+
+@pytest.mark.needs("OpenGL")
+def test_a_network_is_trained_and_its_weights_correct_the_ring(tmp_path: Path) -> None:
+    command = ["reproduce", "headdirection", "--duration", "1.5", "--backend", "process"]
+    parts = ["--only", "training", "left_biased"]
+    assert main([*command, *parts, "-o", str(tmp_path)]) == 0
+    found = rows(tmp_path)
+    assert [*found] == ["training-1", "left_biased-1"]
+    assert 20 < float(found["training-1"]["learnt"]) < 60
+    biased = found["left_biased-1"]
+    assert float(biased["simulated_s"]) == pytest.approx(1.5)
+    assert float(biased["uncorrected_samples"]) == 75
+    assert float(biased["vision_samples"]) == 15
+    assert float(biased["uncorrected_max_deg"]) > 4, "a bias of 0.1 rad/s makes 8.6 degrees"
+    page = (tmp_path / "index.md").read_text()
+    assert "figures/correction_error.png" in page
+    assert "Some runs here were shorter" in page

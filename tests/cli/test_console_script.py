@@ -86,3 +86,14 @@ def test_completion_costs_nothing_where_no_shell_asks() -> None:
         "import sys, neuros.cli.main as m; m.parser(); assert 'argcomplete' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, timeout=60, check=True)
+
+
+def test_processes_of_multiprocessing_read_it_for_the_packages_alone(tmp_path: Path) -> None:
+    """Those of Dask's workers, which Python starts as the script was started: without packages."""
+    program = (
+        f"import runpy; runpy.run_path({str(SCRIPT)!r}, run_name='__mp_main__')\nimport neuros"
+    )
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", program], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, b""), done.stderr

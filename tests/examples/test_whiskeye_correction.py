@@ -17,10 +17,11 @@ from neuros.testing import PluginHarness
 
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
 PERIOD_NS = 20_000_000
+EXACT = math.radians(1.0)  # a heading as exact as this counts fully
 
 
 class TestSeenHeading:
-    """The target of the correction."""
+    """The heading that the correction pulls to, and how much it counts."""
 
     @pytest.fixture
     def correction(self, load):
@@ -36,33 +37,38 @@ class TestSeenHeading:
         return seen
 
     def test_without_a_picture_there_is_no_target(self, seen):
-        assert seen.target_rad(0.5) is None
+        assert seen.now() is None
 
-    def test_what_was_seen_is_turned_with_the_gyroscope_and_ahead_of_the_ring(
-        self, correction, seen
-    ):
-        seen.see(5 * PERIOD_NS, 1.0, 0.05)
-        assert seen.target_rad(0.5) == pytest.approx(1.0 + 0.5 * (0.1 + correction.LEAD_S))
+    def test_what_was_seen_is_turned_with_the_gyroscope(self, seen):
+        seen.see(5 * PERIOD_NS, 1.0, 0.05, EXACT)
+        assert seen.now() == pytest.approx((1.0 + 0.5 * 0.1, 1.0))
 
-    def test_between_two_pictures_the_last_one_counts(self, correction, seen):
-        seen.see(10 * PERIOD_NS, 1.0, 0.05)
+    @pytest.mark.parametrize(
+        ("deviations", "weight"), [(0.1, 1.0), (1.0, 1.0), (2.0, 0.25), (3, 1 / 9)]
+    )
+    def test_it_counts_by_the_inverse_of_its_variance(self, seen, deviations, weight):
+        seen.see(10 * PERIOD_NS, 1.0, 0.05, deviations * EXACT)
+        assert seen.now() == pytest.approx((1.0, weight))
+
+    def test_between_two_pictures_the_last_one_counts(self, seen):
+        seen.see(10 * PERIOD_NS, 1.0, 0.05, EXACT)
         seen.turn(11 * PERIOD_NS, 0.5)
-        seen.see(11 * PERIOD_NS, math.nan, math.inf)
-        assert seen.target_rad(0.5) == pytest.approx(1.01 + 0.5 * correction.LEAD_S)
+        seen.see(11 * PERIOD_NS, math.nan, math.inf, 0.0)
+        assert seen.now() == pytest.approx((1.01, 1.0))
 
     def test_a_view_that_is_not_predicted_ends_the_correction(self, seen):
-        seen.see(9 * PERIOD_NS, 1.0, 0.05)
-        seen.see(10 * PERIOD_NS, 1.0, 0.11)
-        assert seen.target_rad(0.5) is None
+        seen.see(9 * PERIOD_NS, 1.0, 0.05, EXACT)
+        seen.see(10 * PERIOD_NS, 1.0, 0.11, EXACT)
+        assert seen.now() is None
 
     def test_what_is_too_old_corrects_nothing(self, correction, seen):
-        seen.see(10 * PERIOD_NS, 1.0, 0.05)
+        seen.see(10 * PERIOD_NS, 1.0, 0.05, EXACT)
         periods = correction.HOLD_NS // PERIOD_NS
         for index in range(11, 11 + periods):
             seen.turn(index * PERIOD_NS, 0.0)
-        assert seen.target_rad(0.0) == pytest.approx(1.0)
+        assert seen.now() == pytest.approx((1.0, 1.0))
         seen.turn((11 + periods) * PERIOD_NS, 0.0)
-        assert seen.target_rad(0.0) is None
+        assert seen.now() is None
 
 
 class TestRings:
@@ -107,14 +113,29 @@ class TestRings:
 def test_a_biased_gyroscope_is_corrected_and_the_ring_alone_drifts(load):
     pytest.importorskip("nest")
     integrator = load("correction").CorrectedIntegrator(
-        seed=1, bias_rad_s=0.3, peak_pa=120.0, gate=0.3
+        seed=1, bias_rad_s=0.3, peak_pa=300.0, gate=0.3
     )
-    for index in range(1, 151):
-        if index % 5 == 0:
-            integrator.vision.see(index * PERIOD_NS, 0.0, 0.01)
-        corrected, alone = integrator.integrate(index * PERIOD_NS, 0.0)
+    corrected, alone = look_ahead(integrator, seconds=3)
     assert math.degrees(alone) == pytest.approx(math.degrees(0.9), abs=8)
     assert abs(math.degrees(corrected)) < 15
+
+
+def look_ahead(integrator, seconds):
+    """Stand still, and see it exactly at 10 Hz; the last headings."""
+    for index in range(1, 50 * seconds + 1):
+        if index % 5 == 0:
+            integrator.vision.see(index * PERIOD_NS, 0.0, 0.01, EXACT)
+        headings = integrator.integrate(index * PERIOD_NS, 0.0)
+    return headings
+
+
+def test_the_bias_of_the_gyroscope_is_learnt_from_what_vision_and_ring_differ_by(load):
+    pytest.importorskip("nest")
+    integrator = load("correction").CorrectedIntegrator(1, -0.1, 300.0, 0.3, learning_per_s2=1.0)
+    corrected, alone = look_ahead(integrator, seconds=15)
+    assert integrator.learnt_rad_s == pytest.approx(-0.1, rel=0.1)
+    assert abs(math.degrees(corrected)) < 6
+    assert math.degrees(alone) < -60
 
 
 def picture(stamp: int, *, empty: bool = False) -> Image:
@@ -135,7 +156,16 @@ def weights(load, tmp_path):
     network = load("predictive_coding").PredictiveCodingNetwork(views.PIXELS, views.CODES, 1)
     seen = rng.normal(size=(24, views.PIXELS)).astype(np.float32)
     list(network.learn(seen, np.array([views.code_of(each) for each in range(24)]), 1))
-    np.savez(tmp_path / "weights.npz", **network.weights)
+    headings = rng.uniform(-3, 3, 24)
+    np.savez(
+        tmp_path / "weights.npz",
+        **network.weights,
+        rad_per_error=0.5,
+        old_views=seen.astype(np.float16),
+        old_rad=headings.astype(np.float32),
+        test_views=seen.astype(np.float16),
+        test_rad=headings.astype(np.float32),
+    )
     return str(tmp_path / "weights.npz")
 
 
@@ -154,7 +184,29 @@ def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none
     assert nothing.vector.x == math.inf
     assert (nothing.header.stamp.nanosec, seen.header.stamp.nanosec) == (1, 2)
     assert error.vector.x == seen.vector.x > 0
+    assert seen.vector.y == pytest.approx(0.5 * seen.vector.x)
     assert abs(seen.vector.z) <= math.pi
+
+
+def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(weights):
+    """The heading of a view comes with the next pictures, as in the project."""
+    environment = {"WEIGHTS": weights, "GATE": "0", "NEW_VIEWS": "8", "EPOCHS": "12"}
+    with PluginHarness.from_project(
+        EXAMPLE / "learning.json", "pcn", environment=environment
+    ) as pcn:
+        for stamp in range(1, 11):
+            for eye in ("left_eye", "right_eye"):
+                pcn.send(eye, picture(stamp))
+            heading = Vector3Stamped()
+            heading.header.stamp.nanosec, heading.vector.z = stamp - 1, 0.3 * (stamp - 1)
+            pcn.send("heading", heading)
+        pcn.run()
+        before, *_, after = (each.vector.x for each in pcn.received("prediction_error"))
+        (found,) = json.loads((pcn.run_dir / "learning.json").read_text())
+    assert found["learnt"] == 6
+    assert found["after"]["old"]["view_error"] < found["before"]["old"]["view_error"]
+    assert found["after"] != found["before"]
+    assert after != before
 
 
 def test_pictures_of_two_eyes_are_paired_where_some_are_lost(load):

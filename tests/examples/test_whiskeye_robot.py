@@ -53,7 +53,9 @@ def test_it_has_24_whiskers_three_cameras_and_six_controllers(model):
 
 def test_only_the_wheels_and_the_floor_collide_and_without_friction(model):
     geoms = [model.geom(index) for index in range(model.ngeom)]
-    colliding = [geom for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
+    sought = {geom.conaffinity[0] for geom in geoms} - {0}
+    assert sought == {1}
+    colliding = [geom for geom in geoms if geom.contype[0] & 1 or geom.conaffinity[0]]
     assert {geom.name for geom in colliding} == {"floor", "wheel_1", "wheel_2", "wheel_3"}
     assert all(geom.condim[0] == 1 for geom in colliding)
 

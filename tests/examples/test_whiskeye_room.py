@@ -30,12 +30,19 @@ def test_the_robot_in_the_room_is_that_of_whiskeye_xml_without_its_cues(room):
     assert np.array_equal(room.body_mass, alone.body_mass)
     assert np.array_equal(room.cam_quat, alone.cam_quat)
     assert room.opt.timestep == alone.opt.timestep
-    colliding = {
-        room.geom(index).name
-        for index in range(room.ngeom)
-        if room.geom_contype[index] or room.geom_conaffinity[index]
+
+
+def test_wheels_stand_on_the_floor_and_all_else_of_the_robot_touches_only_the_cues(room):
+    geoms = [room.geom(index) for index in range(room.ngeom)]
+    touching = {
+        (robot.name or "else", other.name or "cue")
+        for robot in geoms
+        for other in geoms
+        if robot.bodyid[0] and robot.contype[0] & other.conaffinity[0]
     }
-    assert colliding == {"ground", *(f"whiskeye/wheel_{wheel}" for wheel in (1, 2, 3))}
+    wheels = {f"whiskeye/wheel_{wheel}" for wheel in (1, 2, 3)}
+    on_wheels = {(wheel, other) for wheel in wheels for other in ("ground", *wheels)}
+    assert touching == {("else", "cue"), *on_wheels}
 
 
 def test_the_cues_are_irregular(room):
@@ -116,3 +123,21 @@ def test_its_eyes_see_at_10_hz_and_the_body_camera_at_5():
     last = sent["pose"][-1].pose
     assert 2 * math.asin(last.orientation.z) == pytest.approx(0.4, abs=0.03)
     assert math.hypot(last.position.x, last.position.y) == pytest.approx(0.08, abs=0.02)
+
+
+@pytest.mark.needs("OpenGL")
+def test_the_room_changes_its_colours_once_and_the_way_goes_on():
+    seen, turned = [], []
+    for change_s in ("inf", "0.15"):
+        environment = {"DURATION": "0.3", "CHANGE_S": change_s}
+        with PluginHarness.from_project(
+            EXAMPLE / "learning.json", "robot", environment=environment
+        ) as robot:
+            robot.run()
+            pictures = [packet for packet in robot.received("left_eye") if packet.height]
+            seen.append([np.frombuffer(packet.data, np.uint8) for packet in pictures])
+            turned.append([packet.angular_velocity.z for packet in robot.received("imu")])
+    assert turned[0] == turned[1]
+    differing = [np.mean(same != other) for same, other in zip(*seen, strict=True)]
+    assert differing[0] == 0
+    assert min(differing[1:]) > 0.2

@@ -66,6 +66,8 @@ def test_the_network_tells_headings_that_it_has_not_learnt_and_knows_what_it_has
     errors = list(network.learn(seen[learnt], codes[learnt], 30))
     assert errors[-1] < errors[0] / 5
     told, error = network.infer(seen[~learnt])
+    missed = seen[~learnt] - network.predicted(seen[~learnt])
+    assert np.allclose(np.mean(np.square(missed), axis=1), error[:, 0], atol=1e-6)
     heading_of = load("views").heading_of
     assert off_deg([heading_of(each) for each in told], headings[~learnt]).max() < 10
     noise = np.random.default_rng(1).normal(size=seen[:5].shape).astype(np.float32)
@@ -138,5 +140,9 @@ def test_the_trainer_writes_weights_with_seeds_and_figures(load, tmp_path):
             assert 0 < figures[held][method]["rms_deg"] < 20
     with np.load(folder / "weights.npz") as weights:
         assert weights["mean"].shape == (1152,)
+        assert math.degrees(weights["rad_per_error"]) == pytest.approx(figures["deg_per_error"])
+        assert len(weights["old_views"]) == len(weights["old_rad"]) > 0
+        tested = figures["views"]["headings"] + figures["views"]["places"]
+        assert len(weights["test_views"]) == len(weights["test_rad"]) == tested
     results = json.loads((folder / "results.json").read_text())
     assert results["places_network_rms_deg"] == figures["held_out_places"]["network"]["rms_deg"]

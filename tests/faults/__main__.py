@@ -133,7 +133,7 @@ def with_tables(text: str, outcomes: Sequence[Outcome]) -> str:
         begin, end = f"<!-- generated: {name} -->\n", "<!-- generated: end -->"
         before, mark, rest = text.partition(begin)
         old, _, after = rest.partition(end)
-        made = table(name, of_table, old)
+        made = table(name, of_table, "" if of_table[0].place.begins else old)
         text = f"{before}{begin}\n{made}\n{end}{after if mark else chr(10)}"
     return text
 

@@ -35,7 +35,9 @@ class Interrupt:
     @property
     def place(self) -> Place:
         """Where it stands in the tables."""
-        return Place(f"Ctrl+C, {self.backend}", f"{self.at_s:.1f} s", f"{self.count} x")
+        is_first = self.count == COUNTS[0] and self.at_s == 0
+        table = f"Ctrl+C, {self.backend}"
+        return Place(table, f"{self.at_s:.1f} s", f"{self.count} x", begins=is_first)
 
     def __str__(self) -> str:
         return str(self.place)

@@ -105,8 +105,10 @@ def test_every_surrounding(cell: SurroundingCell, tmp_path: Path) -> None:
 
 
 def test_a_table_that_is_made_in_part_keeps_its_other_cells() -> None:
-    def outcome(row: str, column: str, exit_code: int, *problems: str) -> Outcome:
-        place = Place("faults, process", row, column)
+    def outcome(
+        row: str, column: str, exit_code: int, *problems: str, begins: bool = False
+    ) -> Outcome:
+        place = Place("faults, process", row, column, begins)
         return Outcome(place, exit_code, "", 0.5, "complete", "", {}, list(problems))
 
     marks = "before\n<!-- generated: faults, process -->\n<!-- generated: end -->\nafter\n"
@@ -118,3 +120,6 @@ def test_a_table_that_is_made_in_part_keeps_its_other_cells() -> None:
     )
     assert part.startswith("before\n")
     assert part.endswith("after\n")
+    anew = with_tables(part, [outcome("c", "one", 0, begins=True)])
+    assert "| `c` | 0, 0.5 s |" in anew
+    assert "`a`" not in anew

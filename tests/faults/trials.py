@@ -30,11 +30,15 @@ _CONTAINER_LABEL = "neuros.run_folder"
 
 @dataclass(frozen=True)
 class Place:
-    """Where the outcome of a trial stands in the tables."""
+    """Where the outcome of a trial stands in the tables.
+
+    ``begins``: its table is made anew from here on.
+    """
 
     table: str
     row: str
     column: str
+    begins: bool = False
 
     def __str__(self) -> str:
         return f"{self.row} at {self.column}, {self.table}"

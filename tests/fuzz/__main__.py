@@ -165,6 +165,7 @@ def _child(options: argparse.Namespace) -> int:
             (corpus / str(place)).write_bytes(data)
         limits = [f"-max_total_time={max(1, int(options.hours * 3600))}", "-rss_limit_mb=0"]
         limits += ["-max_len=262144", "-timeout=0", f"-seed={options.seed}", "-verbosity=0"]
+        limits += [f"-artifact_prefix={folder}/"]
         atheris.Setup([sys.argv[0], *limits, str(corpus)], one, custom_mutator=mutate)
         with contextlib.suppress(SystemExit):
             atheris.Fuzz()

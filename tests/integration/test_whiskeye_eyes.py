@@ -106,3 +106,18 @@ def test_the_asynchronous_variant_ends_properly(weights, tmp_path):
     run = started("prediction_asynchronous", BACKENDS[0], tmp_path, **settings)
     assert run.connection("robot.imu -> snn.imu")["consumed"] > 0
     assert (run.run_folder / "visualiser/correction.json").exists()
+
+
+def test_learning_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
+    found = []
+    for backend in BACKENDS:
+        (tmp_path / backend).mkdir()
+        settings = {"robot__DURATION": SECONDS, "pcn__WEIGHTS": weights}
+        settings |= {"pcn__GATE": 0, "pcn__NEW_VIEWS": 8, "pcn__EPOCHS": 2, "snn__GATE": 9}
+        run = started("learning", backend, tmp_path / backend, **settings)
+        learnt = json.loads((run.run_folder / "snn/results.json").read_text())
+        assert learnt["learnt_bias_rad_s"] != 0
+        (once,) = json.loads((run.run_folder / "pcn/learning.json").read_text())
+        assert once["learnt"] == 6
+        found.append((run.run_folder / "visualiser/correction.csv").read_bytes())
+    assert found[0] == found[1]

@@ -10,13 +10,14 @@ from views import stamp_ns
 
 
 def start_integrator(node: Any) -> None:
-    """Make the rings of SEED, GYRO_BIAS in rad/s, CORRECTION_PA and GATE of the node."""
+    """Make the rings of SEED, GYRO_BIAS in rad/s, CORRECTION_PA, GATE and LEARNING of the node."""
     node.set_user_data(
         CorrectedIntegrator(
             int(os.environ.get("SEED", "1")),
             float(os.environ.get("GYRO_BIAS", "0")),
-            float(os.environ.get("CORRECTION_PA", "120")),
+            float(os.environ.get("CORRECTION_PA", "300")),
             float(os.environ.get("GATE", str(GATE))),
+            float(os.environ.get("LEARNING", "0")),
         )
     )
 
@@ -26,7 +27,7 @@ def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any]:
     integrator = node.get_user_data()
     if odom_correction is not None:
         seen = odom_correction.vector
-        integrator.vision.see(stamp_ns(odom_correction), seen.z, seen.x)
+        integrator.vision.see(stamp_ns(odom_correction), seen.z, seen.x, seen.y)
     headings_rad = integrator.integrate(stamp_ns(imu), imu.angular_velocity.z)
     packets = node.make_packet("estimate"), node.make_packet("uncorrected")
     for packet, heading_rad in zip(packets, headings_rad, strict=True):

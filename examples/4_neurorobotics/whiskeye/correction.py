@@ -3,6 +3,10 @@
 A heading that was seen is some time old when it arrives. It is turned with the gyroscope up to now,
 and a little further, for the ring follows its input late; that is where the current pulls the bump.
 Held still between two pictures, it would drag the bump back by some 10 degrees at 1 rad/s.
+
+How hard it pulls depends on how exact the heading is: by the inverse of its variance, as a Kalman
+filter weighs what it measures. Else the ring would follow the worst views as closely as the best,
+and one whose gyroscope is right would lose by what it sees.
 """
 
 from __future__ import annotations
@@ -14,13 +18,14 @@ from head_direction import HeadDirectionNetwork
 from snn import GyroIntegrator
 
 HOLD_NS = 300_000_000  # how long a heading that was seen is good for: three pictures
-LEAD_S = 0.06  # how late the ring follows
+LEAD_S = 0.06  # how late the ring follows: so far ahead a current holds the bump, no more
 WIDTH_RAD = math.radians(30.0)
+EXACT_RAD = math.radians(1.0)  # a heading as exact as this is pulled to with all of the gain
 GATE = 0.12  # see README.md
 
 
 class SeenHeading:
-    """Where vision says the head points: turned on with the gyroscope, and gated.
+    """Where vision says the head points: turned on with the gyroscope, weighed and gated.
 
     Args:
         gate: mean squared error of the predicted view, above which a heading is not believed.
@@ -29,7 +34,7 @@ class SeenHeading:
     def __init__(self, gate: float = GATE) -> None:
         self._gate = gate
         self._turned = deque([(0, 0.0)])  # (stamp in ns, what the gyroscope has turned until then)
-        self._seen: tuple[int, float] | None = None
+        self._seen: tuple[int, float, float] | None = None
 
     def turn(self, stamp_ns: int, rate_rad_s: float) -> None:
         """The gyroscope said so, for the time since the stamp before."""
@@ -38,19 +43,25 @@ class SeenHeading:
         while self._turned[0][0] < stamp_ns - 2 * HOLD_NS:
             self._turned.popleft()
 
-    def see(self, stamp_ns: int, heading_rad: float, error: float) -> None:
-        """Vision said so, of a picture of that stamp. NaN: there was no picture."""
-        if not math.isnan(heading_rad):
-            self._seen = (stamp_ns, heading_rad) if error <= self._gate else None
+    def see(self, stamp_ns: int, heading_rad: float, error: float, deviation_rad: float) -> None:
+        """Vision said so, of a picture of that stamp. NaN: there was no picture.
 
-    def target_rad(self, rate_rad_s: float) -> float | None:
-        """The heading to pull to now; ``None`` without one that is new enough and believed."""
+        Args:
+            error: of the predicted view, mean squared.
+            deviation_rad: how far the heading is off, as one standard deviation.
+        """
+        if not math.isnan(heading_rad):
+            weight = (EXACT_RAD / max(deviation_rad, EXACT_RAD)) ** 2
+            self._seen = (stamp_ns, heading_rad, weight) if error <= self._gate else None
+
+    def now(self) -> tuple[float, float] | None:
+        """Heading and its weight, 0 to 1; ``None`` without one that is new enough and believed."""
         now_ns, turned_rad = self._turned[-1]
         if self._seen is None or now_ns - self._seen[0] > HOLD_NS:
             return None
-        stamp_ns, heading_rad = self._seen
+        stamp_ns, heading_rad, weight = self._seen
         then_rad = next((rad for ns, rad in self._turned if ns >= stamp_ns), turned_rad)
-        return heading_rad + turned_rad - then_rad + rate_rad_s * LEAD_S
+        return heading_rad + turned_rad - then_rad, weight
 
 
 class CorrectedIntegrator:
@@ -61,27 +72,51 @@ class CorrectedIntegrator:
         bias_rad_s: is added to the gyroscope.
         peak_pa: the gain: highest current of the correction, in pA; 0 corrects nothing.
         gate: see :class:`SeenHeading`.
+        learning_per_s2: how fast the gyroscope's bias is learnt from what vision and the corrected
+            ring differ by, in rad/s per rad and second; 0: it is not.
+
+    Attributes:
+        learnt_rad_s: the bias that has been learnt; the corrected ring is driven without it.
     """
 
-    def __init__(self, seed: int, bias_rad_s: float, peak_pa: float, gate: float) -> None:
+    def __init__(
+        self,
+        seed: int,
+        bias_rad_s: float,
+        peak_pa: float,
+        gate: float,
+        learning_per_s2: float = 0.0,
+    ) -> None:
         self.alone = HeadDirectionNetwork(seed)
         self.corrected = HeadDirectionNetwork(seed, beside=self.alone)
         self.alone.settle()
         self.vision = SeenHeading(gate)
         self._integrator = GyroIntegrator(self.alone, bias_rad_s)
         self._bias_rad_s, self._peak_pa = bias_rad_s, peak_pa
+        self._learning_per_s2 = learning_per_s2
+        self.learnt_rad_s = 0.0
+        self._bridged_rad, self._done_ns = 0.0, 0
 
     def integrate(self, stamp_ns: int, rate_rad_s: float) -> tuple[float, float]:
         """Headings in rad at this stamp: of the ring that is corrected, and of the ring alone."""
-        biased_rad_s = rate_rad_s + self._bias_rad_s
-        self.vision.turn(stamp_ns, biased_rad_s)
-        target_rad = self.vision.target_rad(biased_rad_s)
-        if target_rad is None:
+        corrected_rad_s = rate_rad_s + self._bias_rad_s - self.learnt_rad_s
+        self.vision.turn(stamp_ns, corrected_rad_s)
+        seen = self.vision.now()
+        if seen is None:
             self.corrected.correct(0.0, 0.0, WIDTH_RAD)
         else:
             # The rings have not simulated what was bridged: they are behind by as much.
-            seen_rad = target_rad - self._integrator.bridged_rad
-            self.corrected.correct(seen_rad, self._peak_pa, WIDTH_RAD)
+            target_rad = seen[0] + corrected_rad_s * LEAD_S - self._bridged_rad
+            self.corrected.correct(target_rad, self._peak_pa * seen[1], WIDTH_RAD)
+        self.corrected.offset_rad_s = -self.learnt_rad_s
+        bridged_rad, bridged_s = self._integrator.bridged_rad, self._integrator.bridged_s
         alone_rad = self._integrator.integrate(stamp_ns, rate_rad_s)
-        corrected_rad = self.corrected.heading_rad + self._integrator.bridged_rad
-        return math.remainder(corrected_rad, math.tau), alone_rad
+        self._bridged_rad += self._integrator.bridged_rad - bridged_rad
+        self._bridged_rad -= self.learnt_rad_s * (self._integrator.bridged_s - bridged_s)
+        heading_rad = math.remainder(self.corrected.heading_rad + self._bridged_rad, math.tau)
+        if seen is not None:
+            ahead_rad = math.remainder(heading_rad - seen[0], math.tau)
+            passed_s = (stamp_ns - self._done_ns) * 1e-9
+            self.learnt_rad_s += self._learning_per_s2 * passed_s * seen[1] * ahead_rad
+        self._done_ns = stamp_ns
+        return heading_rad, alone_rad

@@ -1,9 +1,11 @@
 """The predictive coding network that a run of ``training.json`` has trained, as a node.
 
-For each pair of pictures it sends ``odom_correction``: the heading in ``vector.z`` in radians, and
-in ``vector.x`` the mean squared error of the view that it predicts, by which the receiver judges
-whether to trust it; and ``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of
-view, first and second layer. For a pair without pixels the heading is NaN: nothing was seen.
+For each pair of pictures it sends ``odom_correction``: the heading in ``vector.z`` in radians; in
+``vector.x`` the mean squared error of the view that it predicts, by which the receiver judges
+whether to trust it; in ``vector.y`` how far the heading is off at such an error, as one standard
+deviation in radians, which the training measured at views that it had held out. And it sends
+``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of view, first and second
+layer. For a pair without pixels the heading is NaN: nothing was seen.
 """
 
 from __future__ import annotations
@@ -46,16 +48,39 @@ class Eyes:
         return complete
 
 
+class Predictor:
+    """The network of ``WEIGHTS``, and how far a heading is off per prediction error of its view."""
+
+    def __init__(self):
+        named = os.environ.get("WEIGHTS", "")
+        try:
+            with np.load(Path(named)) as weights:
+                self.weights = dict(weights)
+            self.network = PredictiveCodingNetwork.of_weights(self.weights)
+            self._rad_per_error = float(self.weights["rad_per_error"])
+        except (OSError, ValueError, KeyError) as error:
+            what = f"'{named}' cannot be read ({error})" if named else "is not set"
+            raise NodeError(f"WEIGHTS {what}: {HOW}") from error
+
+    def packets(self, node, header, view):
+        """``odom_correction`` and ``prediction_error`` for a view; ``None``: there was none."""
+        correction = node.make_packet("odom_correction")
+        correction.header = header
+        if view is None:
+            correction.vector.x, correction.vector.z = math.inf, math.nan
+            return correction, None
+        codes, errors = self.network.infer(view[None])
+        correction.vector.x, correction.vector.z = float(errors[0, 0]), heading_of(codes[0])
+        correction.vector.y = self._rad_per_error * correction.vector.x
+        error = node.make_packet("prediction_error")
+        error.header = header
+        error.vector.x, error.vector.y, error.vector.z = map(float, errors[0])
+        return correction, error
+
+
 @neuros_initialise()
 def start(node):
-    named = os.environ.get("WEIGHTS", "")
-    try:
-        with np.load(Path(named)) as weights:
-            network = PredictiveCodingNetwork.of_weights(weights)
-    except (OSError, ValueError, KeyError) as error:
-        what = f"'{named}' cannot be read ({error})" if named else "is not set"
-        raise NodeError(f"WEIGHTS {what}: {HOW}") from error
-    node.set_user_data((network, Eyes()))
+    node.set_user_data((Predictor(), Eyes()))
 
 
 @neuros_function(
@@ -63,19 +88,9 @@ def start(node):
     outputs=[Optional("odom_correction"), Optional("prediction_error")],
 )
 def look(node, left, right):
-    network, eyes = node.get_user_data()
+    predictor, eyes = node.get_user_data()
     pairs = eyes.pairs(left, right)
     if not pairs:
         return None
     left, right = pairs[-1]
-    correction = node.make_packet("odom_correction")
-    correction.header = left.header
-    if not left.height:
-        correction.vector.x, correction.vector.z = math.inf, math.nan
-        return correction, None
-    codes, errors = network.infer(view_of(left, right)[None])
-    correction.vector.x, correction.vector.z = float(errors[0, 0]), heading_of(codes[0])
-    error = node.make_packet("prediction_error")
-    error.header = left.header
-    error.vector.x, error.vector.y, error.vector.z = map(float, errors[0])
-    return correction, error
+    return predictor.packets(node, left.header, view_of(left, right) if left.height else None)

@@ -71,12 +71,22 @@ class PredictiveCodingNetwork:
         down = {f"down{layer}": weights for layer, weights in enumerate(self._down)}
         return {**down, "code": self._code, "read": self._read, "mean": self._mean}
 
-    def learn(self, views: Floats, codes: Floats, epochs: int) -> Iterator[float]:
-        """Learn ``(n, pixels)`` and ``(n, codes)``; yields each epoch's mean squared view error."""
+    def learn(
+        self,
+        views: Floats,
+        codes: Floats,
+        epochs: int,
+        rates: tuple[float, float] = LEARNING_RATES,
+    ) -> Iterator[float]:
+        """Learn ``(n, pixels)`` and ``(n, codes)``; yields each epoch's mean squared view error.
+
+        It starts from what has been learnt before, but nothing of that is protected: what is not
+        among the views is forgotten.
+        """
         self._mean = views.mean(axis=0)
         views = views - self._mean
         adam = _Adam([*self._down, self._code])
-        first, last = LEARNING_RATES
+        first, last = rates
         for epoch in range(epochs):
             rate = first * (last / first) ** (epoch / max(1, epochs - 1))
             order = self._rng.permutation(len(views))
@@ -94,6 +104,11 @@ class PredictiveCodingNetwork:
         layers = self._see(views - self._mean)
         errors = np.stack([np.mean(np.square(e), axis=1) for e in self._errors(layers)], axis=1)
         return _readable(layers) @ self._read, errors
+
+    def predicted(self, views: Floats) -> Floats:
+        """What it expects to see for the causes that it infers of views ``(n, pixels)``; alike."""
+        layers = self._see(views - self._mean)
+        return _active(layers[1]) @ self._down[0] + self._mean
 
     def _drawn(self, causes: int, predicted: int) -> Floats:
         drawn = self._rng.normal(0.0, 1.0 / np.sqrt(causes), (causes, predicted))

@@ -24,12 +24,13 @@ class GyroIntegrator:
         self._bias_rad_s = bias_rad_s
         self._quantum_ns = round(network.quantum_s * 1e9)
         self._done_ns = 0  # the network was settled for the start of simulated time
-        self.bridged_rad = 0.0
+        self.bridged_rad = self.bridged_s = 0.0
 
     def integrate(self, stamp_ns, rate_rad_s):
         """Heading in radians at ``stamp_ns``, decoded over about the last 20 ms before."""
         rate_rad_s += self._bias_rad_s
         missed_ns = max(0, (stamp_ns - self._done_ns) // WINDOW_NS - 1) * WINDOW_NS
+        self.bridged_s += missed_ns * 1e-9
         self.bridged_rad += rate_rad_s * missed_ns * 1e-9
         self._done_ns += missed_ns
         quanta = (stamp_ns - self._done_ns) // self._quantum_ns  # the rest is for the next packet

@@ -1,12 +1,14 @@
 """Gathers VIEWS views with their headings, trains the network on most of them, and tests it.
 
 Files in the node's folder of the run: ``weights.npz`` (what ``pcn.py`` takes) and ``training.json``
-(seeds, sizes and errors, those of the baselines too).
+(seeds, sizes and errors, those of the baselines too). Beside the weights, ``weights.npz`` tells how
+much to trust them (``rad_per_error``) and keeps some of the views, for ``learning_pcn.py``.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 from time import perf_counter
 
@@ -21,6 +23,7 @@ from neuros.hooks import neuros_function, neuros_initialise
 from neuros.snn import derive_seed
 
 PROGRESS_S = 5.0
+REMEMBERED = 400  # views of those learnt, kept to be learnt again beside new ones
 
 
 class Examples:
@@ -50,7 +53,7 @@ def gather(node, left, right, label):
 
 
 def train(node, examples):
-    """The network, and the figures that go with it."""
+    """What goes into ``weights.npz``, and the figures that go with it."""
     seed, epochs = int(os.environ.get("SEED", "1")), int(os.environ.get("EPOCHS", "20"))
     views = np.array(examples.views, np.float32)
     headings_rad = np.array(examples.headings_rad, np.float32)
@@ -67,6 +70,7 @@ def train(node, examples):
             )
     figures = {"seed": seed, "epochs": epochs, "training_s": perf_counter() - began_s}
     figures["views"] = {"learnt": int(parts.learnt.sum())}
+    squares = []
     for name in ("headings", "places"):
         held = getattr(parts, name)
         figures["views"][name] = int(held.sum())
@@ -83,14 +87,34 @@ def train(node, examples):
             "median": float(np.median(errors[:, 0])) if held.any() else None,
             "p95": float(np.percentile(errors[:, 0], 95)) if held.any() else None,
         }
-    return network, figures
+        squares.extend((off_rad(told["network"], headings_rad[held]) / errors[:, 0]) ** 2)
+    # How far a heading is off grows with the prediction error of its view: see README.md.
+    rad_per_error = float(np.sqrt(np.mean(squares))) if squares else math.inf
+    figures["deg_per_error"] = math.degrees(rad_per_error)
+    tested = parts.headings | parts.places
+    count = min(REMEMBERED, len(learnt_views))
+    kept = np.linspace(0, len(learnt_views), count, endpoint=False).astype(int)
+    saved = {
+        **network.weights,
+        "rad_per_error": rad_per_error,
+        "old_views": learnt_views[kept].astype(np.float16),
+        "old_rad": learnt_rad[kept],
+        "test_views": views[tested].astype(np.float16),
+        "test_rad": headings_rad[tested],
+    }
+    return saved, figures
+
+
+def off_rad(told_rad, true_rad):
+    """Errors in rad, wrapped."""
+    return np.angle(np.exp(1j * (told_rad - true_rad)))
 
 
 def accuracy(told_rad, true_rad):
     """RMS, median and maximum of the absolute error, in degrees; of no views ``None``."""
     if not len(true_rad):
         return {"rms_deg": None, "median_deg": None, "max_deg": None}
-    off_deg = np.abs(np.degrees(np.angle(np.exp(1j * (told_rad - true_rad)))))
+    off_deg = np.abs(np.degrees(off_rad(told_rad, true_rad)))
     return {
         "rms_deg": float(np.sqrt(np.mean(off_deg**2))),
         "median_deg": float(np.median(off_deg)),
@@ -98,9 +122,9 @@ def accuracy(told_rad, true_rad):
     }
 
 
-def report(node, network, figures):
+def report(node, saved, figures):
     """Write the files, and say how far the network and the baselines are off."""
-    np.savez(node.run_dir / "weights.npz", **network.weights)
+    np.savez(node.run_dir / "weights.npz", **saved)
     (node.run_dir / "training.json").write_text(json.dumps(figures, indent=2) + "\n")
     log, sizes = node.get_logger(), figures["views"]
     log.info(f"learnt {sizes['learnt']} views in {figures['training_s']:.0f} s")

@@ -6,6 +6,7 @@ import math
 import os
 from typing import Any
 
+import numpy as np
 from wandering import Wanderer
 
 from neuros.simulators.mujoco import MuJoCo
@@ -16,7 +17,10 @@ ROBOT = "whiskeye/"  # as room.xml attaches it
 
 
 class WanderingRobot:
-    """WhiskEye in ``room.xml``: RATE, SPEED, SEED and NEUROS_RANDOMISE_DIRECTION of the node."""
+    """WhiskEye in ``room.xml``: RATE, SPEED, SEED and NEUROS_RANDOMISE_DIRECTION of the node.
+
+    After CHANGE_S simulated seconds each cue of the room has the colour of the one before it.
+    """
 
     def __init__(self, node: Any) -> None:
         self.sim = MuJoCo(node, "room.xml")
@@ -27,6 +31,7 @@ class WanderingRobot:
             speed_m_s=float(os.environ.get("SPEED", "0.2")),
             seed=derive_seed(int(os.environ.get("SEED", "1")), node.name),
         )
+        self._change_s = float(os.environ.get("CHANGE_S", "inf"))
         self.steer()
 
     def steer(self) -> None:
@@ -35,3 +40,8 @@ class WanderingRobot:
         velocities = self._wanderer.velocities(self.sim.sim_time, *place)
         for axis, velocity in zip(("x", "y", "theta"), velocities, strict=True):
             self.sim.actuate(f"{ROBOT}pose_{axis}", velocity)
+        if self.sim.sim_time >= self._change_s:
+            self._change_s = math.inf
+            cues = (self.sim.model.geom_bodyid == 0) & (self.sim.model.geom_matid < 0)
+            colours = self.sim.model.geom_rgba
+            colours[cues] = np.roll(colours[cues], 1, axis=0)

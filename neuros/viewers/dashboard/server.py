@@ -135,7 +135,7 @@ class Dashboard:
 
     def app(self, token: str, run: str) -> Starlette:
         """The ASGI application."""
-        return Starlette(
+        app = Starlette(
             routes=[
                 Route("/", self._index),
                 Route("/events", self._events),
@@ -145,6 +145,9 @@ class Dashboard:
             ],
             middleware=[Middleware(Access, token=token, run=run)],
         )
+        # To redirect from a path with a slash too many, Starlette would decode the query as UTF-8.
+        app.router.redirect_slashes = False
+        return app
 
     # ------------------------------------------------------------------ requests
 

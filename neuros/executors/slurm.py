@@ -1,0 +1,210 @@
+"""Runs of a sweep as jobs of Slurm: one array, submitted with submitit.
+
+submitit leaves a file with what a job has returned. Whether a job has ended without one is asked of
+``squeue``, and not of ``sacct`` as submitit does, which needs an accounting database.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from neuros.errors import EnvironmentFault
+from neuros.executors.registered import Job, Jobs, SweepExecutor, SweepPlan, not_installed
+
+FOLDER = ".slurm"
+"""Logs, jobs and results, in the folder of the sweep."""
+
+_MOST_IN_ARRAY = 1000  # MaxArraySize is 1001 where a cluster does not set it
+_LOOK_S, _ASK_S = 2.0, 15.0
+_MEBIBYTE = 1 << 20
+_TIMEOUT_S = 60.0
+_UNKNOWN = "unknown to squeue"
+_OVER = {
+    *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL"),
+    *("OUT_OF_MEMORY", "PREEMPTED", "TIMEOUT"),
+}
+
+
+class SlurmExecutor(SweepExecutor):
+    """Runs as jobs of a Slurm cluster that this machine submits to.
+
+    What else ``sbatch`` is to know it reads from its environment: ``SBATCH_TIMELIMIT``,
+    ``SBATCH_ACCOUNT``, ``SBATCH_QOS``.
+    """
+
+    name = "slurm"
+    place = "PARTITION"
+
+    @contextmanager
+    def open(self, place: str | None, plan: SweepPlan) -> Iterator[Jobs]:
+        try:
+            import submitit
+        except ImportError as error:
+            raise not_installed("submitit", self.name) from error
+        missing = [name for name in ("sbatch", "squeue", "scancel") if not shutil.which(name)]
+        if missing:
+            raise EnvironmentFault(
+                f"executor slurm: {', '.join(missing)} is not on PATH: run it on a machine that"
+                " submits to the cluster (on Debian: apt-get install slurm-client)"
+            )
+        executor = submitit.SlurmExecutor(plan.folder / FOLDER)
+        name = _job_name(plan)
+        executor.update_parameters(job_name=name, **_parameters(place, plan))
+        # What an earlier call has left waiting is submitted again. What it has left running goes
+        # on: the job of the same run waits for it and takes its result.
+        _slurm("scancel", "--quiet", "--state=PENDING", f"--name={name}")
+        jobs = _SlurmJobs(executor, name, plan.count)
+        try:
+            yield jobs
+        finally:
+            jobs.close()
+
+
+def _job_name(plan: SweepPlan) -> str:
+    """A name for the jobs of this sweep, and of no other."""
+    project = re.sub(r"[^A-Za-z0-9_-]", "-", plan.name)
+    return f"neuros-{project}-{hashlib.sha256(str(plan.folder).encode()).hexdigest()[:8]}"
+
+
+def _parameters(partition: str | None, plan: SweepPlan) -> dict[str, Any]:
+    """What ``sbatch`` gets; ``None`` for what the cluster decides."""
+    needs = plan.resources
+    cpus = ["--cpus-per-task", str(needs.cpus)] if needs.cpus else []
+    return {
+        "partition": partition,
+        "time": None,  # submitit would say 5 minutes
+        "cpus_per_task": needs.cpus,
+        "srun_args": cpus,  # from 22.05 on, srun does not take it from its job
+        "additional_parameters": {
+            **({"mem": f"{-(-needs.mem_bytes // _MEBIBYTE)}M"} if needs.mem_bytes else {}),
+            **({"gpus-per-node": needs.gpus} if needs.gpus else {}),
+        },
+    }
+
+
+class _SlurmJobs:
+    """The jobs of one sweep, and a thread that sees them end."""
+
+    def __init__(self, executor: Any, name: str, count: int | None) -> None:
+        self._executor = executor
+        self._name = name
+        self._count = count
+        self._open: dict[str, tuple[Any, Future[Any]]] = {}
+        self._missed: set[str] = set()
+        self._wake = threading.Event()
+        self._is_cancelled = self._is_closed = False
+        self._watcher = threading.Thread(target=self._watch, name="neuros-slurm", daemon=True)
+
+    def submit(self, jobs: Sequence[Job]) -> list[Future[Any]]:
+        parts = [jobs[i : i + _MOST_IN_ARRAY] for i in range(0, len(jobs), _MOST_IN_ARRAY)]
+        futures: list[Future[Any]] = []
+        for part in parts:
+            at_once = max(1, self._count // len(parts)) if self._count else len(part)
+            self._executor.update_parameters(array_parallelism=at_once)
+            try:
+                submitted = self._executor.map_array(_run_in_job, part)
+            except Exception as error:  # submitit has a class for each version
+                cause = getattr(error, "stderr", None) or error
+                self.cancel()
+                raise EnvironmentFault(f"sbatch refuses the jobs of the sweep: {cause}") from error
+            for job in submitted:
+                future: Future[Any] = Future()
+                self._open[job.job_id] = (job, future)
+                futures.append(future)
+        self._watcher.start()
+        return futures
+
+    def cancel(self) -> None:
+        self._is_cancelled = True
+        _slurm("scancel", "--quiet", f"--name={self._name}")
+        self._wake.set()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._is_closed = True
+        self._wake.set()
+        if self._watcher.ident is not None:
+            self._watcher.join()
+
+    def _watch(self) -> None:
+        asked_s = time.monotonic()
+        while self._open and not self._is_closed:
+            self._wake.wait(_LOOK_S)
+            self._wake.clear()
+            self._take_results()
+            if self._is_cancelled or time.monotonic() - asked_s >= _ASK_S:
+                self._give_up_lost()
+                asked_s = time.monotonic()
+
+    def _take_results(self) -> None:
+        """Look once into the folder, whatever the number of jobs."""
+        names = {file.name for file in Path(self._executor.folder).iterdir()}
+        for number, (job, future) in tuple(self._open.items()):
+            if job.paths.result_pickle.name not in names:
+                continue
+            del self._open[number]
+            try:
+                future.set_result(job.result())
+            except Exception as error:  # what the job raised, or the file is broken
+                future.set_exception(error)
+
+    def _give_up_lost(self) -> None:
+        """Give up jobs without a result that Slurm does not know as going on, twice in a row."""
+        said = _slurm(
+            *("squeue", "--array", "--noheader", "--states=all"),
+            *(f"--name={self._name}", "--format=%i %T"),
+        )
+        if said is None:  # it does not answer
+            return
+        states = dict(line.split(maxsplit=1) for line in said.splitlines() if line.strip())
+        lost = {n for n in self._open if states.get(n, _UNKNOWN) in {*_OVER, _UNKNOWN}}
+        for number in lost & self._missed:
+            job, future = self._open.pop(number)
+            state = states.get(number, _UNKNOWN)
+            future.set_exception(
+                EnvironmentFault(
+                    f"its Slurm job {number} ended without a result ({state}): {job.paths.stderr}"
+                )
+            )
+        self._missed = lost
+
+
+def _slurm(*command: str) -> str | None:
+    """What a command of Slurm says; ``None`` if it fails."""
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired:
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+def _run_in_job(job: Job) -> Any:
+    """Execute a job where Slurm has started it, which says with signals that it is to end.
+
+    They come with ``scancel``, and some time before the time limit: in place of submitit, which
+    would ignore them or submit the job again, the run is ended as by Ctrl+C.
+    """
+    for number in (signal.SIGTERM, signal.SIGUSR2):
+        signal.signal(number, _interrupt)
+    return job()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt(signal.Signals(number).name)
+
+
+SLURM = SlurmExecutor()
