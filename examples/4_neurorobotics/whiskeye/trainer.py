@@ -23,7 +23,6 @@ from neuros.hooks import neuros_function, neuros_initialise
 from neuros.snn import derive_seed
 
 PROGRESS_S = 5.0
-REMEMBERED = 400  # views of those learnt, kept to be learnt again beside new ones
 
 
 class Examples:
@@ -92,13 +91,11 @@ def train(node, examples):
     rad_per_error = float(np.sqrt(np.mean(squares))) if squares else math.inf
     figures["deg_per_error"] = math.degrees(rad_per_error)
     tested = parts.headings | parts.places
-    count = min(REMEMBERED, len(learnt_views))
-    kept = np.linspace(0, len(learnt_views), count, endpoint=False).astype(int)
     saved = {
         **network.weights,
         "rad_per_error": rad_per_error,
-        "old_views": learnt_views[kept].astype(np.float16),
-        "old_rad": learnt_rad[kept],
+        "old_views": learnt_views.astype(np.float16),
+        "old_rad": learnt_rad,
         "test_views": views[tested].astype(np.float16),
         "test_rad": headings_rad[tested],
     }

@@ -127,9 +127,8 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
         wanted, extra = pending.pop()
         if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
             continue
-        try:
-            installed = importlib.metadata.distribution(wanted.name)
-        except importlib.metadata.PackageNotFoundError:
+        installed = _installed(wanted.name)
+        if installed is None:
             if not line.is_constraint:
                 yield f"{_without_marker(wanted)} (not installed)"
             continue
@@ -141,6 +140,15 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             seen.add(name)
             needs = [Requirement(need) for need in installed.requires or () if "extra" in need]
             pending += [(need, name) for need in needs]
+
+
+def _installed(name: str) -> importlib.metadata.Distribution | None:
+    """A package of this environment; ``None`` also for what an interrupted pip has left of one."""
+    try:
+        found = importlib.metadata.distribution(name)
+        return found if found.version else None
+    except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
+        return None
 
 
 def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
