@@ -348,6 +348,8 @@ def test_where_the_disk_is_full_a_node_prints_into_the_void(
 
 
 def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
+    heeded = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = [signal.getsignal(number) for number in heeded]
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as launch.py does
     try:
         with _signals_noted() as (signals, _):
@@ -355,7 +357,11 @@ def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
             assert signals == [signal.SIGINT]
         signal.raise_signal(signal.SIGINT)
         assert signal.sigwait([signal.SIGINT]) == signal.SIGINT, "it waits, and is never heeded"
+        ends = [signal.getsignal(number) for number in heeded]
+        assert ends == [signal.SIG_IGN] * len(heeded), "in threads that do not have it wait"
     finally:
+        for number, handler in zip(heeded, handlers, strict=True):
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
