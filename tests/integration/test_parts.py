@@ -64,6 +64,7 @@ def test_the_duration_of_one_part_ends_all(parts: Parts) -> None:
 def test_a_node_that_is_killed_ends_all_and_its_own_launcher_says_how(parts: Parts) -> None:
     with parts.start("sink", *ENDLESS) as sink, parts.start("source", *ENDLESS) as source:
         sink.wait_for("the first image is here", FOUND_S)
+        sink.wait_for("found elsewhere: source", FOUND_S)  # else it waits for one that may come
         (child,) = children(source.process.pid, "source/node.json")
         child.kill()
         assert source.finish().exit_code == sink.finish().exit_code == 1

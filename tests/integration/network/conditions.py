@@ -110,8 +110,9 @@ def stream(
 
 
 def _pull(cable: Cable, sink: Running, out_s: float) -> None:
-    """Once the stream flows, pull the cable for so long."""
+    """Once the stream flows, and the launchers know each other, pull the cable for so long."""
     sink.wait_for("the first image is here", FOUND_S)
+    sink.wait_for("found elsewhere: source", FOUND_S)
     cable.is_out = True
     back_s = time.monotonic() + out_s
     while (left_s := back_s - time.monotonic()) > 0:

@@ -151,9 +151,16 @@ def assert_ends_soon(running: Running, exit_code: int, reason: str) -> None:
     assert reason in finished.said("neuros")[-1]
 
 
+def await_each_other(source: Running, sink: Running) -> None:
+    """The stream flows, and neither side is one that the other has never heard of."""
+    sink.wait_for("the first image is here", FOUND_S)
+    sink.wait_for("found elsewhere: source", FOUND_S)
+    source.wait_for("found elsewhere: sink", FOUND_S)
+
+
 def test_ctrl_c_on_one_side_ends_the_other(pair: tuple[Running, Running]) -> None:
     with pair[0] as source, pair[1] as sink:
-        sink.wait_for("the first image is here", FOUND_S)
+        await_each_other(source, sink)
         source.signal(signal.SIGINT)
         assert_ends_soon(sink, 130, "the project ended elsewhere (left): ended by Ctrl+C")
         assert source.finish().exit_code == 130
@@ -171,7 +178,7 @@ def test_a_failure_on_one_side_ends_the_other_as_failed(start: Start) -> None:
 
 def test_a_launcher_that_is_killed_ends_the_other_side(pair: tuple[Running, Running]) -> None:
     with pair[0] as source, pair[1] as sink:
-        sink.wait_for("the first image is here", FOUND_S)
+        await_each_other(source, sink)
         source.signal(signal.SIGKILL)
         assert_ends_soon(sink, 1, "node 'source' on left is gone")
 
@@ -180,7 +187,7 @@ def test_a_cable_that_is_pulled_ends_both(
     machines: TwoMachines, pair: tuple[Running, Running]
 ) -> None:
     with pair[0] as source, pair[1] as sink:
-        sink.wait_for("the first image is here", FOUND_S)
+        await_each_other(source, sink)
         machines.unplug()
         assert_ends_soon(sink, 1, "node 'source' on left is gone")
         assert_ends_soon(source, 1, "node 'sink' on right is gone")
