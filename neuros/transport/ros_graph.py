@@ -34,6 +34,7 @@ from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
 _QOS_LOOK_S = 0.3
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 _MOST_QOS_LOOKS = 20
 """The graph lists an endpoint a moment after DDS reports it, or seconds later under load."""
 
@@ -244,15 +245,16 @@ class QosCheck:
         def look() -> None:
             nonlocal looks
             looks += 1
-            self._look(is_input=is_input)
-            if len(self._named) >= total or looks == _MOST_QOS_LOOKS:
+            is_last = looks == _MOST_QOS_LOOKS
+            self._look(is_input=is_input, is_last=is_last)
+            if len(self._named) >= total or is_last:
                 self._ros_node.destroy_timer(timer)
                 if not self._named:
                     self._warn_of_unknown("input" if is_input else "output", policy)
 
         timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
 
-    def _look(self, *, is_input: bool) -> None:
+    def _look(self, *, is_input: bool, is_last: bool) -> None:
         if is_input:
             side, list_others = "input", self._ros_node.get_publishers_info_by_topic
         else:
@@ -262,7 +264,8 @@ class QosCheck:
                 (other.qos_profile, self._own) if is_input else (self._own, other.qos_profile)
             )
             lacking = list(qos_differences(offered, asked))
-            if lacking:
+            # The name of its node may come later than what it offers.
+            if lacking and (is_last or other.node_name != _UNKNOWN_NODE):
                 self._warn(side, other, lacking)
 
     def _warn_of_unknown(self, side: str, policy: str) -> None:
