@@ -98,6 +98,8 @@ THIRD_PARTY: dict[str, set[str]] = {
     "messages.generation": GENERATORS,
     "messages.compilation": {"numpy"},
     "cli.main": {"argcomplete"},
+    "cli.template": {"std_msgs"},
+    "cli.live": {"tabulate"},
     "cli.runs": {"tabulate"},
     "replay.debugging": {"debugpy"},
     "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},

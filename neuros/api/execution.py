@@ -133,6 +133,7 @@ class Execution:
         recording = None
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
+            self._console.log("INFO", self._how_to_look())
             for severity, notice in self._plan.notices:
                 self._console.log(severity, notice)
             recording = self._recording(reaper)
@@ -188,6 +189,13 @@ class Execution:
         is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return record
+
+    def _how_to_look(self) -> str:
+        """The commands that show the topics of the run, to be copied."""
+        own = f"to look into it: neuros topic list {self._run_id[:8]}"
+        if self._plan.back_end.is_one_process or self._plan.request.isolate:
+            return own
+        return f"{own}, or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
 
     def _recording(self, reaper: Reaper) -> Recording | None:
         if self._recording_plan is None:

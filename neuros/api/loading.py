@@ -14,6 +14,7 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
+from neuros.project.modules import why_not
 from neuros.project.scanner import display_name, place_of
 
 _LONG_BYTES = 1 << 20
@@ -50,7 +51,7 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces))
+    doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces), *_unknown_plugins(loaded))
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
 
@@ -76,6 +77,20 @@ def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
                     pointer = f"{node.pointer}/{side}/{index}/type"
                     place = place_of(node.file, pointer)
                     yield Problem(display_name(node.file), *place, pointer, *unknown)
+
+
+def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
+    """Modules that are not installed here, nor named in the folder of the node's container."""
+    for node in loaded.project.nodes:
+        container = find_container(node.container, loaded.project.folder)
+        if node.module and node.plugin == Path() and container and not container.is_own:
+            package = node.module.partition(".")[0]
+            if not _names_package(container.folder, package):
+                pointer = f"{node.pointer}/plugin"
+                text, _ = why_not(node.module)
+                hint = f"nothing in {container.folder} names '{package}'"
+                place = place_of(node.file, pointer)
+                yield Problem(display_name(node.file), *place, pointer, text, hint)
 
 
 def _names_package(folder: Path, package: str) -> bool:

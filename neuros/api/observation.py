@@ -24,8 +24,7 @@ def check_observation(*, monitors_load: bool) -> None:
     """Whether what is asked for is installed. Raises ``EnvironmentFault``."""
     if monitors_load and find_spec("psutil") is None:
         raise EnvironmentFault(
-            "--monitor-system-load needs the package psutil: run install.py again, or pip install"
-            " psutil"
+            "--monitor-system-load needs the package psutil, which is missing: pip install psutil"
         )
 
 

@@ -18,6 +18,7 @@ from neuros.backends.placement import place, usable_cores
 from neuros.backends.reaper import Reaper
 from neuros.backends.registered import AUTO, Chosen, choose
 from neuros.backends.run_processes import RUN_ID
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
@@ -229,8 +230,8 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     """
     if find_spec("rclpy") is None:
         raise EnvironmentFault(
-            f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
-            " install.py"
+            f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}:"
+            f" {install_command()}"
         )
     if plan.request.placement:
         _check_cores(plan)

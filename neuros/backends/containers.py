@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-FOLDER = "containers"
-PACKAGE = Path(__file__).resolve().parents[1]
-"""The folder of the Python package ``neuros``."""
+from neuros.distribution import CONTAINERS
 
-OWN_FOLDER = PACKAGE.parent / FOLDER
-"""NeuROS's own; they are part of the source checkout."""
+FOLDER = "containers"
+OWN_FOLDER = CONTAINERS
+"""NeuROS's own."""
+
 
 STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
 """Those that the examples need."""

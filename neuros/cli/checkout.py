@@ -39,8 +39,8 @@ def checkout_command(name: str) -> Any:
     """
     if not ROOT.joinpath(*name.split(".")).with_suffix(".py").is_file():
         raise EnvironmentFault(
-            f"there are no benchmarks in {ROOT}: they are part of the source checkout;"
-            " clone it, run ./install.py there, and use its .venv/bin/neuros"
+            f"there are no benchmarks in {ROOT}: they are part of the source checkout and not of"
+            " the package; clone it, run ./install.py there, and use its .venv/bin/neuros"
         )
     if str(ROOT) not in sys.path:
         sys.path.insert(0, str(ROOT))

@@ -14,12 +14,14 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from neuros.api.request import LaunchOptions, SweepOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
+from neuros.cli.output import JSON, add_format, print_json
 from neuros.cli.projects import add_project, load_with_messages
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
@@ -227,6 +229,7 @@ def add_sweep(command: argparse.ArgumentParser) -> None:
         "project", metavar="PROJECT", help="a file, or a folder with a project.json"
     )
     add_options(command, options_of(SweepOptions))
+    add_format(command)
     command.set_defaults(command=_sweep)
 
 
@@ -237,8 +240,13 @@ def _sweep(parsed: argparse.Namespace) -> int:
         warnings.simplefilter("default", UserWarning)
         warnings.showwarning = _warn
         options = values_of(options_of(SweepOptions), parsed)
-        made = sweep(parsed.project, **options, on_row=_say_row)
-    print(f"\n{made}\n\n{made.folder / CSV_NAME}")
+        is_json = parsed.format == JSON
+        say = partial(_say_row, sys.stderr if is_json else sys.stdout)
+        made = sweep(parsed.project, **options, on_row=say)
+    if is_json:
+        print_json({"folder": made.folder, "rows": made.rows})
+    else:
+        print(f"\n{made}\n\n{made.folder / CSV_NAME}")
     return 0 if all(row["exit_code"] == 0 for row in made.rows) else EXIT_FAILED
 
 
@@ -247,8 +255,8 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
 
-def _say_row(number: int, count: int, row: Mapping[str, Any]) -> None:
+def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) -> None:
     """One line when a run has ended."""
     values = list(row)[: list(row).index("exit_code")]
     what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
-    print(f"[{number}/{count}] {what}: {row['reason']}", flush=True)
+    print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)

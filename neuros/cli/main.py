@@ -46,12 +46,16 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
+    "new": Command("copies", "make a small project to begin from"),
+    "example": Command("copies", "list the examples, or copy one"),
     "launch": Command("launch", "run a project"),
     "validate": Command("projects", "check a project without running it"),
     "graph": Command("projects", "show the nodes and connections of a project"),
     "build": Command("setup", "build message packages"),
     "ps": Command("runs", "show the runs of this user"),
     "stop": Command("runs", "stop a run, as Ctrl+C does"),
+    "topic": Command("live", "show the topics and packets of a run that goes on"),
+    "logs": Command("live", "show what the nodes of a run have logged"),
     "sweep": Command("launch", "run a project with many values and seeds, and make one table"),
     "verify": Command("runs", "compare the packets of two runs"),
     "report": Command("runs", "say what limited a run, and draw figures of it"),

@@ -170,7 +170,7 @@ def _replay_node(options: argparse.Namespace) -> int:
     run, file = recorded_node(Path(options.run).absolute(), options.node)
     file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
     require_messages(file)
-    if not file.node.plugin.is_file():
+    if not (file.node.module or file.node.plugin.is_file()):
         raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
     RecordedNode(run, file)
     python, ended = _python(run, file)

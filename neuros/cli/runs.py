@@ -148,7 +148,7 @@ def _user_name(user: int) -> str:
 
 def _stop(options: argparse.Namespace) -> int:
     found = sessions()
-    chosen = _chosen(options.runs, found, is_all=options.all)
+    chosen = chosen_runs(options.runs, found, is_all=options.all)
     if not chosen:
         print("no run of yours goes on" if found else "nothing is running")
     for session in chosen:
@@ -161,7 +161,14 @@ def _stop(options: argparse.Namespace) -> int:
     return 0
 
 
-def _chosen(names: Sequence[str], found: Sequence[Session], *, is_all: bool) -> Sequence[Session]:
+def chosen_runs(
+    names: Sequence[str], found: Sequence[Session], *, is_all: bool
+) -> Sequence[Session]:
+    """The runs that are named, among those that there are; without a name, the only one.
+
+    Raises:
+        UsageError: if there is none of a name, or several and no name.
+    """
     own = [session for session in found if session.is_own]
     if is_all or (not names and len(own) <= 1):
         return own

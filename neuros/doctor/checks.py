@@ -21,6 +21,7 @@ from neuros.api.loading import load_with_messages
 from neuros.backends.domain import choose_domain
 from neuros.backends.placement import usable_cores
 from neuros.backends.registered import BACK_ENDS
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine
 from neuros.ports import Finding, State
@@ -82,9 +83,9 @@ def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     """All findings about this machine, one after another."""
     yield _python()
-    ros = installed("ROS 2", "ros-jazzy-rclpy", "run ./install.py")
+    ros = installed("ROS 2", "ros-jazzy-rclpy", f"run {install_command()}")
     yield ros if ros.state is State.GOOD else replace(ros, state=State.BAD)
-    yield installed("Matplotlib", "matplotlib", "./install.py --extras plot")
+    yield installed("Matplotlib", "matplotlib", install_command("plot"))
     yield Finding.good("cores", f"{len(usable_cores())} usable")
     yield _shared_memory(SHARED_MEMORY)
     yield _domain(environ)

@@ -78,7 +78,7 @@ class ContextSwitch:
     def make_context(
         self,
         environment: Mapping[str, str],
-        plugin: Path,
+        plugin: Path | None,
         project: Path,
         log_file: Path | None = None,
     ) -> Context:
@@ -86,7 +86,8 @@ class ContextSwitch:
 
         Args:
             environment: variables of this node, on top of those of the process.
-            plugin: its file; the folder of that is searched first by ``import``.
+            plugin: its file; the folder of that is searched first by ``import``. ``None`` for one
+                of an installed package, which is found as it is.
             project: modules from below this folder are private to the node.
             log_file: where its standard output and error go, ``None`` to leave them.
         """
@@ -96,7 +97,7 @@ class ContextSwitch:
         return Context(
             environment,
             environ,
-            [str(plugin.parent), *self._process.path],
+            [*([str(plugin.parent)] if plugin else []), *self._process.path],
             str(project) + os.sep,
             None if log_file is None else _open_log(log_file),
         )

@@ -11,7 +11,7 @@ from types import CodeType
 from typing import Any
 
 from neuros.errors import CallbackError, NeurosError, NodeError, PluginError, printable
-from neuros.node.plugin import describe, plugin_traceback
+from neuros.node.plugin import PREFIX, describe, plugin_traceback
 from neuros.ports import Logger
 
 # What a plugin calls, and what calls it: a callback is neither.
@@ -84,8 +84,11 @@ def _code_of(callback: Any) -> CodeType | None:
         callback = callback.func
     if not inspect.isroutine(callback):
         callback = getattr(callback, "__call__", None)  # noqa: B004 (its code, not whether)
-    code = getattr(inspect.unwrap(callback), "__code__", None) if callback else None
-    return code if isinstance(code, CodeType) and not _is_library(code.co_filename) else None
+    function = inspect.unwrap(callback) if callback else None
+    code = getattr(function, "__code__", None)
+    if not isinstance(code, CodeType):
+        return None
+    return None if _is_library(code, getattr(function, "__module__", "")) else code
 
 
 def _outermost_code(error: BaseException) -> CodeType | None:
@@ -93,11 +96,15 @@ def _outermost_code(error: BaseException) -> CodeType | None:
     trace = error.__traceback__
     while trace is not None:
         code = trace.tb_frame.f_code
-        if not _is_library(code.co_filename):
+        if not _is_library(code, trace.tb_frame.f_globals.get("__name__", "")):
             return code
         trace = trace.tb_next
     return None
 
 
-def _is_library(file: str) -> bool:
+def _is_library(code: CodeType, module: object) -> bool:
+    """Whether code is of none of the plugins, which may be installed as libraries are."""
+    if PREFIX in str(module):
+        return False
+    file = code.co_filename
     return file.startswith(("<", *_NOT_OF_PLUGINS)) or "site-packages" in file

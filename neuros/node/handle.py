@@ -239,7 +239,9 @@ class NodeHandle:
         for place in places:
             if place.exists():
                 built = (python.parent for python in self._file.messages)
-                roots = (folders.project, folders.workspace, folders.run, *built)
+                roots = [folders.project, folders.workspace, folders.run, *built]
+                if node.module:
+                    roots.append(node.plugin.parent)  # a package brings its data along
                 if not any(place.resolve().is_relative_to(root.resolve()) for root in roots):
                     raise ModelError(
                         f"'{path}' leaves the project's folder: files may be in the folder of the"

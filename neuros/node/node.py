@@ -76,9 +76,8 @@ class NodeRuntime:
         self._tell = tell
         self._contexts = contexts
         environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
-        self._context = contexts.make_context(
-            environment, file.node.plugin, file.folders.project, log_file
-        )
+        plugin = None if file.node.module else file.node.plugin
+        self._context = contexts.make_context(environment, plugin, file.folders.project, log_file)
         self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
@@ -156,7 +155,7 @@ class NodeRuntime:
         self._transport.open(self)
         self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
         node = self.file.node
-        self.specs = load_plugin(node.plugin, self.name)
+        self.specs = load_plugin(node.plugin, self.name, node.module)
         types = {port.name: self._packet_type(port) for port in node.outputs}
         specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
         self.engine = self._services.engine = self._make_engine(

@@ -6,6 +6,7 @@ NEST 2.x vs NEST 3.0", and what 3.10 has removed.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import re
@@ -18,30 +19,47 @@ from typing import TypeGuard
 from neuros.errors import NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
 
+PREFIX = "neuros_plugin_"
+"""Of the last word in the module name of each plugin."""
+
 _GONE_MODULES = {
     "neuros.gazebo": "MuJoCo stands in for Gazebo, and reads its SDF files: use MuJoCo(node, path)"
     " of neuros.simulators.mujoco in its place",
 }
 
 
-def load_plugin(path: Path, node_name: str) -> Sequence[HookSpec]:
+def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[HookSpec]:
     """Import a plugin under a name of its node's own, and return its hooks in order.
+
+    One of an installed package (``module_name``) is imported anew, too, within its package; what it
+    imports itself is shared with the other nodes of the process.
 
     Raises:
         PluginError: if it cannot be imported (with the traceback from the plugin on), or
             declares no hooks.
         HookError: if one of its hooks is declared wrongly.
     """
-    name = f"neuros_plugin_{node_name}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    package, name = module_name.rpartition(".")[0], f"{PREFIX}{node_name}"
+    if module_name and path == Path():
+        raise PluginError(
+            f"there is no module {module_name} for {sys.executable}: its package goes into the"
+            " requirements.txt of the node's container: docs/plugins.md"
+        )
+    full_name = f"{package}.{name}" if package else name
+    folders = [str(path.parent)] if path.name == "__init__.py" and module_name else None
+    spec = importlib.util.spec_from_file_location(
+        full_name, path, submodule_search_locations=folders
+    )
     if spec is None or spec.loader is None:
         raise PluginError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[full_name] = module
     # NEST has all libraries after it share their symbols. Then of two ROS messages with one name
     # (KeyValue, GoalStatus) the second is taken for the first.
     flags = sys.getdlopenflags()
     try:
+        if package:
+            importlib.import_module(package)
         spec.loader.exec_module(module)
     except NeurosError:
         raise

@@ -120,7 +120,7 @@ class NodeReports:
         """Why nothing moves here. Any thread."""
         engine = self._engine
         if engine is None:
-            return [f"imports its plugin {self._file.node.plugin.name}"]
+            return [f"imports its plugin {self._file.node.plugin_name}"]
         return explain(engine, self._clock())
 
 

@@ -14,6 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
 from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node
@@ -480,7 +481,8 @@ def unread_variables(
         node = next((node for node in nodes if node.name == steps[0]), None)
         if node is None or key.startswith(_KNOWN_PREFIXES) or _is_read_by_neuros(key):
             continue
-        plugin, sources = read_plugin(node.plugin), _sources(node, parsed.roots.project)
+        plugin = read_plugin(node.plugin)
+        sources = _sources(node, parsed.roots.project) if plugin else None
         if plugin is None or sources is None:
             continue
         word = re.compile(rf"(?<!\w){re.escape(key)}(?!\w)", re.IGNORECASE)
@@ -494,16 +496,17 @@ def unread_variables(
 
 @cache
 def _is_read_by_neuros(key: str) -> bool:
-    package = Path(__file__).resolve().parents[1]
     quoted = f'"{key}"'
-    return any(quoted in file.read_text("utf-8") for file in package.rglob("*.py"))
+    files = (file for file in PACKAGE.rglob("*.py") if not file.is_relative_to(EXAMPLES))
+    return any(quoted in file.read_text("utf-8") for file in files)
 
 
 def _sources(node: Node, project: Path) -> list[str] | None:
     """The programs of a project; ``None`` where there are too many files to look at."""
     seen = 0
     files = {node.plugin, *([node.script] if node.script else [])}
-    for folder in {project, node.plugin.parent}:
+    is_alone = node.module and "." not in node.module  # its folder has all that is installed
+    for folder in {project} if is_alone else {project, node.plugin.parent}:
         for here, folders, names in os.walk(folder):
             if "pyvenv.cfg" in names or "run.json" in names:
                 folders.clear()

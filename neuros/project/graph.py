@@ -73,7 +73,7 @@ def guarantee(connection: Connection) -> str:
 
 
 def _node_lines(project: Project, node: Node) -> Iterator[str]:
-    yield f"{node.name}  ({node.container}, {node.plugin.name})"
+    yield f"{node.name}  ({node.container}, {node.plugin_name})"
     ports = [*((port, "in ") for port in node.inputs), *((port, "out") for port in node.outputs)]
     width = max((len(port.name) for port, _ in ports), default=0)
     for port, side in ports:

@@ -18,6 +18,7 @@ from neuros.project.checks import (
 )
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
 from neuros.project.model import Budgets, Connection, Node, Port, Project, parameters_of
+from neuros.project.modules import find_module, is_module_name, why_not
 from neuros.project.parsed import (
     ParsedProject,
     apply_namespace,
@@ -76,10 +77,11 @@ class _Builder:
                 if is_path:
                     paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
+        module, plugin = self._plugin(element)
         return Node(
             name=element.string("name") or "",
             container=container_in_place_of(element.string("container") or ""),
-            plugin=self._file(element, "plugin") or Path(),
+            plugin=plugin,
             script=self._file(element, "script"),
             inputs=self._ports(element, "inputs"),
             outputs=self._ports(element, "outputs"),
@@ -91,7 +93,27 @@ class _Builder:
             resources=_if_valid(lambda: resources_of(keys), Resources()),
             access=_if_valid(lambda: access_of(keys), Access()),
             parameters=_if_valid(lambda: parameters_of(keys.get("parameters", {})), {}),
+            module=module,
         )
+
+    def _plugin(self, element: Element) -> tuple[str, Path]:
+        """The plugin's module, empty where a file is named, and its file; a file comes first."""
+        member, name = element.member("plugin"), element.string("plugin") or ""
+        if member is None or not is_module_name(name):
+            return "", self._file(element, "plugin") or Path()
+        try:
+            return "", self._roots.find(name, member.source.folder)
+        except PathError as error:
+            text, hint = why_not(name)
+            path = find_module(name)
+            if path is None and self._is_like_this_machine(element):
+                self.problems.append(member.problem(text, error.hint or hint))
+        return name, path or Path()
+
+    def _is_like_this_machine(self, node: Element) -> bool:
+        """Whether the node's container has what this machine has."""
+        container = container_in_place_of(node.string("container") or "")
+        return container.partition(":")[0] in STANDARD_CONTAINERS
 
     def _file(self, element: Element, key: str) -> Path | None:
         member = element.member(key)
@@ -121,8 +143,7 @@ class _Builder:
         return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
 
     def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
-        container = container_in_place_of(node.string("container") or "").partition(":")[0]
-        must_be_here = container in STANDARD_CONTAINERS
+        must_be_here = self._is_like_this_machine(node)
         return tuple(
             self._port(port, is_input=side == "inputs", must_be_here=must_be_here)
             for port in node.items(side)

@@ -50,7 +50,8 @@ class Node:
     """One plugin in one container.
 
     Attributes:
-        plugin: absolute path of the Python file with the hooks.
+        plugin: absolute path of the Python file with the hooks; ``Path()`` where it is in a module
+            that this Python does not have.
         script: absolute path of a shell script that runs before the node, or ``None``.
         environment: environment variables, with ``#path`` and ``@path`` already resolved.
         file: the file that describes the node, for messages; ``pointer`` is its place in there.
@@ -59,6 +60,7 @@ class Node:
         resources: what it may use at most.
         access: what its container is let in to.
         parameters: values of ROS parameters, by full name.
+        module: the name of the plugin where it is one of an installed package, else empty.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Node:
     resources: Resources = field(default_factory=Resources)
     access: Access = field(default_factory=Access)
     parameters: Mapping[str, Value] = field(default_factory=lambda: _NOTHING, hash=False)
+    module: str = ""
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -83,6 +86,11 @@ class Node:
     def output(self, name: str) -> Port:
         """The output of that name; raises ``KeyError``."""
         return _named(self.outputs, name)
+
+    @property
+    def plugin_name(self) -> str:
+        """What to call the plugin."""
+        return self.module or self.plugin.name
 
     @property
     def owns_time(self) -> bool:

@@ -17,6 +17,7 @@ from neuros.project.model import (
     parameters_of,
     parameters_to_json,
 )
+from neuros.project.modules import find_module, is_module_name
 from neuros.project.names import names_from, names_to_json
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
@@ -66,12 +67,14 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
     """The inverse of :func:`node_file_to_json`; raises ``KeyError`` for anything else."""
     node = content["node"]
     script = node.get("script")
+    module = node["plugin"] if is_module_name(node["plugin"]) else ""
     names = names_from(content.get("namespace", ""), content.get("remap", {}))
     return NodeFile(
         node=Node(
             name=node["name"],
             container=node["container"],
-            plugin=Path(node["plugin"]),
+            plugin=(find_module(module) or Path()) if module else Path(node["plugin"]),
+            module=module,
             script=None if script is None else Path(script),
             inputs=tuple(_port(port, is_input=True) for port in node.get("inputs", ())),
             outputs=tuple(_port(port, is_input=False) for port in node.get("outputs", ())),
@@ -150,7 +153,7 @@ def _node_keys(node: Node) -> dict[str, Any]:
     keys: dict[str, Any] = {
         "name": node.name,
         "container": node.container,
-        "plugin": str(node.plugin),
+        "plugin": node.module or str(node.plugin),
     }
     if node.script is not None:
         keys["script"] = str(node.script)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from importlib import metadata
 from importlib.util import find_spec
 
+from neuros.distribution import install_command
 from neuros.installation.machine import install_opengl, offscreen_opengl
 from neuros.ports import Finding, SimulatorKind
 from neuros.registry import Registry
@@ -21,7 +22,7 @@ class _MuJoCo(SimulatorKind):
     name = "mujoco"
 
     def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
-        yield installed("MuJoCo", "mujoco", "./install.py --extras mujoco")
+        yield installed("MuJoCo", "mujoco", install_command("mujoco"))
         yield prove_rendering(environ)
 
 
@@ -29,7 +30,7 @@ class _Nest(SimulatorKind):
     name = "nest"
 
     def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
-        yield installed("NEST", "nest-simulator", "./install.py --extras nest")
+        yield installed("NEST", "nest-simulator", install_command("nest"))
 
 
 MUJOCO = _MuJoCo()

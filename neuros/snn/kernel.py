@@ -11,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, NodeError
 from neuros.snn.spikes import checked_positive
 
@@ -42,7 +43,7 @@ def import_nest() -> ModuleType:
             raise
         raise EnvironmentFault(
             "NEST is not installed in this Python: give the node the container neuros_nest, "
-            "or run ./install.py --extras nest"
+            f"or run {install_command('nest')}"
         ) from error
     nest.verbosity = nest.VerbosityLevel.ERROR
     return nest  # type: ignore[no-any-return]

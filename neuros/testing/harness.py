@@ -22,6 +22,7 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
+from neuros.project.modules import find_module, is_module_name
 from neuros.testing.bench import NodeBench
 from neuros.testing.wiring import ports, with_neighbours, with_observer
 from neuros.transport.messages import decode, encode, message_class
@@ -84,7 +85,7 @@ class PluginHarness(NodeBench):
         shutdown_reason: what the plugin gave to ``node.shutdown``, ``None`` before.
 
     Args:
-        plugin: the plugin file.
+        plugin: the plugin file, or the name of an installed module.
         inputs, outputs: message type by name of the port.
         connections: those that differ, ``wire("camera.image -> node.view", discard_limit=3)``.
         environment: environment variables of the node.
@@ -107,7 +108,10 @@ class PluginHarness(NodeBench):
         name: str = "node",
         run_folder: Path | None = None,
     ) -> None:
-        path = Path(plugin).resolve()
+        path, module = Path(plugin).resolve(), ""
+        if not path.exists() and is_module_name(os.fspath(plugin)):
+            module = os.fspath(plugin)
+            path = find_module(module) or Path()
         node = Node(
             name=name,
             container="neuros_python",
@@ -116,6 +120,7 @@ class PluginHarness(NodeBench):
             outputs=ports(outputs or {}),
             environment=dict(environment or {}),
             file=path,
+            module=module,
         )
         wires = with_neighbours(node, connections)
         self._open(node, wires, path.parent, WORKSPACE, run_folder)

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from neuros.backends.sidecars import start_sidecar
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd, Reaper
 from neuros.project.graph import guarantee
@@ -153,10 +154,7 @@ class _Rerun(Viewer):
 
     def prepare(self, back_end: BackEnd, subject: str | None, port: int | None) -> _RerunView:
         if find_spec("rerun") is None:
-            raise EnvironmentFault(
-                "Rerun is not installed: ./install.py --extras rerun, or pip install"
-                " 'neuros[rerun]'"
-            )
+            raise EnvironmentFault(f"Rerun is not installed: {install_command('rerun')}")
         return _RerunView()
 
 
@@ -221,7 +219,7 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
             {
                 "name": node.name,
                 "container": node.container,
-                "plugin": node.plugin.name,
+                "plugin": node.plugin_name,
                 "is_here": node.name in names,
                 "owns_time": node.owns_time,
             }

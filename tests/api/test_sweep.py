@@ -65,6 +65,11 @@ def test_a_sweep_is_a_table_whatever_becomes_of_its_runs_and_can_be_gone_on_with
     assert "[1/1] FACES=1, seed=1: counter ended the project: ten were thrown" in said
     assert "[2/2] FACES=999999999, seed=1: node 'counter' failed" in said
     assert said.endswith(f"\n{tmp_path}/table/sweep.csv\n")
+    again = [*arguments, "--set", f"{FACES}=1,999999999", "--seeds", "1", "--format", "json"]
+    assert main(again) == 1
+    made = json.loads(capsys.readouterr().out)
+    assert made["folder"] == f"{tmp_path}/table"
+    assert [row["exit_code"] for row in made["rows"]] == [0, 1]
 
 
 def test_from_python_it_is_a_frame(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.backends.containers import STANDARD
+from neuros.backends.containers import STANDARD, find_container
 from neuros.backends.docker.layout import as_here, inside, outside
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, Notice
 from neuros.project.model import Folders, Node, NodeFile, Project
@@ -35,7 +36,10 @@ class Docker(BackEnd):
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
         if find_spec("docker") is None:
-            raise EnvironmentFault("the Python package docker is not installed: run install.py")
+            raise EnvironmentFault(
+                f"the Python package docker is not installed: {install_command()}"
+            )
+        _check_modules(nodes, project.folder)
         # The Docker SDK is slow to import.
         from neuros.backends.docker.launcher import find_containers
 
@@ -95,6 +99,24 @@ class _Containers(Deployment):
             return {"docker": None}
 
 
+def _check_modules(nodes: Sequence[Node], project: Path) -> None:
+    """Check that no plugin is a module that its node's container cannot have.
+
+    Raises:
+        EnvironmentFault: with what to write.
+    """
+    for node in nodes:
+        container = find_container(node.container, project)
+        if node.module and container and container.is_own:
+            package = node.module.partition(".")[0]
+            raise EnvironmentFault(
+                f"the plugin of node '{node.name}' is {node.module}, and the container"
+                f" {node.container} has no package {package}: name it in"
+                f" containers/{package}/requirements.txt beside the project file, and write"
+                f' "container": "{package}" in the node{_WITHOUT}'
+            )
+
+
 def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[Notice]:
     """One line on limits that the engine does not keep."""
     asking = [
@@ -124,7 +146,7 @@ def _without_display(nodes: Sequence[Node], environ: Mapping[str, str]) -> Seque
 def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
     """The engine and, if it answers, the images of containers of NeuROS's own."""
     if find_spec("docker") is None:
-        yield Finding.absent("Docker", "its Python package is not installed", "run ./install.py")
+        yield Finding.absent("Docker", "its Python package is not installed", install_command())
         return
     from neuros.backends.docker.engine import connect, engine_faults
     from neuros.backends.docker.images import image_for

@@ -18,6 +18,7 @@ from neuros.backends.docker.context import CERTIFICATES, Surroundings, context_o
 from neuros.backends.docker.dockerfile import after_each_from, label_line, needs_buildkit
 from neuros.backends.docker.python_in_image import PythonInImage, python_in
 from neuros.backends.docker.recipes import BASE, BASE_ARGUMENT, find_recipe
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
 
@@ -173,7 +174,7 @@ class BuildSteps:
         if base is None:
             raise EnvironmentFault(
                 f"image '{self._name}' has no rclpy, and there is no folder containers/{BASE} to"
-                " add it from: it is part of the source checkout of NeuROS"
+                f" add it from: {install_command()}"
             )
         added = {BASE_ARGUMENT: image, "CONSTRAINTS": ""}
         made = self.build(base.folder, base.dockerfile, added)

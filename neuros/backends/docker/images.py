@@ -15,6 +15,7 @@ from docker.errors import APIError, ImageNotFound
 from neuros.backends.docker.engine import engine_faults
 from neuros.backends.docker.python_in_image import PythonInImage, python_in
 from neuros.backends.docker.recipes import BASE, Recipe, find_recipe
+from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault
 
 CONTAINER = "neuros.image.container"
@@ -113,7 +114,7 @@ def added_tag(image: Any) -> str:
 
 def _built(recipe: Recipe, project_folder: Path | None, engine: DockerClient) -> Image:
     image = built_image(recipe, engine)
-    remedy = f"run ./install.py --containers {_to_build(recipe, project_folder)}"
+    remedy = f"run {build_command(_to_build(recipe, project_folder))}"
     if image is None:
         raise EnvironmentFault(f"the image of container '{recipe.name}' is not built: {remedy}")
     notice = ""
@@ -158,6 +159,6 @@ def _given(container: str, engine: DockerClient) -> Image:
     if not python.has_rclpy:
         raise EnvironmentFault(
             f"image '{container}' has Python {'{}.{}'.format(*python.version)} without rclpy, which"
-            f" {BASE} has: to have it added, run ./install.py --containers {container}"
+            f" {BASE} has: to have it added, run {build_command(container)}"
         )
     return Image(image.id, container, python.start, python.version)

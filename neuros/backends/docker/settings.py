@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neuros.backends.containers import PACKAGE
 from neuros.backends.docker.images import Image
 from neuros.backends.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
 from neuros.backends.docker.leftovers import RUN_LABEL
@@ -30,6 +29,7 @@ from neuros.backends.node_command import (
 from neuros.backends.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.backends.run_processes import RUN_ID
 from neuros.control import CONTROL_VARIABLE
+from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import NodeFile

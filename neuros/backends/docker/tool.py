@@ -15,6 +15,7 @@ from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import connect, engine_faults, engine_socket
 from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.run_processes import RUN_ID
+from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault
 from neuros.ports import Reaper
 
@@ -32,7 +33,7 @@ def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
     try:
         engine.images.get(IMAGE)
     except ImageNotFound:
-        return f"the image {IMAGE} is not built (./install.py --containers {IMAGE})"
+        return f"the image {IMAGE} is not built ({build_command(IMAGE)})"
     except (DockerException, requests.RequestException) as error:
         return f"the Docker engine does not say whether it has the image {IMAGE}: {error}"
     finally:

@@ -21,10 +21,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from neuros.backends.containers import PACKAGE, ContainerFolder, find_container
+from neuros.backends.containers import ContainerFolder, find_container
 from neuros.backends.environments.cache import Entry, cache_folder, sweep
 from neuros.backends.environments.requirements import Requirements, read_requirements, unmet
 from neuros.caching import KEY_LENGTH
+from neuros.distribution import PACKAGE, install_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     NEWEST,
@@ -189,7 +190,7 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
     if entry.python():
         return Choice(container, requirements, HERE, entry)
     # The files of NeuROS's own containers say with exact versions what goes into images; which
-    # versions are here is up to install.py.
+    # versions are here is up to what has installed NeuROS.
     lacks = tuple(unmet(requirements, any_version=container.is_own))
     base = Path(getattr(sys, "_base_executable", sys.executable)) if lacks else None
     return Choice(container, requirements, HERE, entry, lacks, base)
@@ -452,7 +453,8 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
     if choice.requirements.has_hashes:
         calls = [needs, ["--require-hashes", *wanted]]
     if not needs:
-        raise _fault(choice, f"neuros itself is not installed for {sys.executable}: run install.py")
+        cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
+        raise _fault(choice, cause)
     progress.step(f"installing {choice.requirements.file} (log: {entry.log})")
     environ = {**clean_environment(os.environ), **run_environment}
     # uv does not see what a layer finds in this environment, and would install all of it again.

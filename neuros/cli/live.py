@@ -1,0 +1,288 @@
+"""``neuros topic`` and ``neuros logs``: look into a run from another terminal, without ROS 2.
+
+What packets hold is sampled by the nodes, as for the dashboard, and comes over the control channel:
+so it is the same on every back end, and nothing of it is on the ROS graph.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuros.backends.sessions import Session, sessions
+from neuros.cli.output import JSON, add_format, print_json
+from neuros.cli.runs import chosen_runs
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.options import positive_number
+from neuros.project.suggest import did_you_mean, listed
+
+if TYPE_CHECKING:
+    from neuros.control import NodeStatus
+    from neuros.project.model import NodeFile
+
+_RUN = "as `neuros ps` shows it (its first digits are enough), or a project"
+_ECHO_PERIOD_S = 0.1
+_HZ_PERIOD_S = 1.0
+_POLL_S = 0.1
+_LIVES_S = 1.0
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """What packets of a run go through.
+
+    Attributes:
+        name: on the ROS graph; topics of connections are there unless all nodes share a process.
+        connection: ``a.out -> b.in``; ``None`` for an external topic.
+        node, port: who samples its packets, and under which name; ``None``: nobody in this run.
+    """
+
+    name: str
+    type: str
+    connection: str | None
+    node: str | None
+    port: str | None
+
+    @property
+    def calls(self) -> set[str]:
+        """What it may be called."""
+        return {self.name, self.connection or self.name, f"{self.node}.{self.port}"}
+
+
+# ---------------------------------------------------------------------- topic
+
+
+def add_topic(topic: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    topic.description = (
+        "List the topics of a run that goes on, show packets of one, or count them. It needs no"
+        " installation of ROS 2, and does the same for every back end."
+    )
+    actions = topic.add_subparsers(title="actions", metavar="ACTION", required=True)
+    show = actions.add_parser("list", help="show topics, their types and connections")
+    show.add_argument("run", metavar="RUN", help=_RUN)
+    add_format(show)
+    show.set_defaults(command=_list)
+    for name, text, command in (
+        ("echo", f"show packets, {1 / _ECHO_PERIOD_S:g} per second at most", _echo),
+        ("hz", "count the packets of a connection, second by second", _hz),
+    ):
+        action = actions.add_parser(name, help=text)
+        action.add_argument("run", metavar="RUN", help=_RUN)
+        action.add_argument(
+            "topic",
+            metavar="TOPIC",
+            help="a topic, an output (node.output) or a connection ('a.out -> b.in')",
+        )
+        action.add_argument(
+            "-n",
+            "--count",
+            type=positive_number,
+            metavar="N",
+            help="end after so many (default: with the run)",
+        )
+        add_format(action)
+        action.set_defaults(command=command)
+
+
+def _list(options: argparse.Namespace) -> int:
+    from tabulate import tabulate
+
+    topics = _topics(_run(options.run))
+    if options.format == JSON:
+        shown = ("name", "type", "connection")
+        print_json([{key: getattr(each, key) for key in shown} for each in topics])
+    else:
+        rows = [[each.connection or each.node, each.type, each.name] for each in topics]
+        print(tabulate(rows, headers=["connection or node", "type", "topic"]))
+    return 0
+
+
+def _echo(options: argparse.Namespace) -> int:
+    session = _run(options.run)
+    topic = _named(_topics(session), options.topic)
+    if topic.node is None or topic.port is None:
+        raise UsageError(f"{topic.name}: its sender is in another run; ask that one")
+    wanted = {topic.node: {topic.port: {"all": True}}}
+    samples = (status.samples.get(topic.port, {}) for status in _watch(session, wanted, topic.node))
+    seen = (sample for sample in samples if "all" in sample or "fault" in sample)
+    for sample in islice(seen, options.count):
+        if "fault" in sample:
+            raise EnvironmentFault(f"{topic.name} cannot be shown: {sample['fault']}")
+        if options.format == JSON:
+            print(json.dumps(sample["all"]), flush=True)
+        else:
+            print("".join(f"{path}: {value}\n" for path, value in sample["all"].items()) + "---")
+            sys.stdout.flush()
+    return 0
+
+
+def _hz(options: argparse.Namespace) -> int:
+    session = _run(options.run)
+    topic = _named([each for each in _topics(session) if each.connection], options.topic)
+    if topic.node is None or topic.connection is None:
+        raise UsageError(f"{topic.name}: its sender is in another run; ask that one")
+    statuses = _watch(session, {}, topic.node, _HZ_PERIOD_S)
+    for per_s in islice(_rates(statuses, topic.connection), options.count):
+        if options.format == JSON:
+            print(json.dumps({"packets_per_s": per_s}), flush=True)
+        else:
+            print(f"{per_s:.2f} packets/s", flush=True)
+    return 0
+
+
+def _rates(statuses: Iterator[NodeStatus], connection: str) -> Iterator[float]:
+    """Packets sent per second, between each two statuses."""
+    last: tuple[float, int] | None = None
+    for status in statuses:
+        if status.counters is None:
+            continue
+        now_s = status.counters.now_s
+        sent = status.counters.metrics["outgoing"][connection]["sent"]
+        if last is not None and now_s > last[0]:
+            yield (sent - last[1]) / (now_s - last[0])
+        last = now_s, sent
+
+
+def _watch(
+    session: Session,
+    wanted: Mapping[str, Mapping[str, Any]],
+    node: str,
+    period_s: float = _ECHO_PERIOD_S,
+) -> Iterator[NodeStatus]:
+    """What a node answers, asked again and again until the run is over."""
+    from neuros.backends.control_sockets import connect
+    from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
+    from neuros.control.link import ControlLink
+
+    try:
+        link = ControlLink(connect(session.control), TO_OBSERVERS, "the supervisor")
+    except OSError as error:
+        raise EnvironmentFault(
+            f"the run {session.run[:8]} does not answer ({error.strerror}): it is ending"
+        ) from error
+    with closing(link):
+        link.send(Watch())
+        next_s = time.monotonic()
+        while True:
+            if time.monotonic() >= next_s:
+                next_s = time.monotonic() + period_s
+                link.send(LookAll(wanted))
+            if not select.select([link], [], [], max(0.0, next_s - time.monotonic()))[0]:
+                continue
+            messages = link.receive()
+            if messages is None:
+                return
+            yield from (m for m in messages if isinstance(m, NodeStatus) and m.node == node)
+
+
+def _run(name: str) -> Session:
+    """The run of that name. Raises ``UsageError`` if there is not one of it."""
+    found = chosen_runs([name], sessions(), is_all=False)
+    if len(found) > 1:
+        several = ", ".join(session.run[:8] for session in found)
+        raise UsageError(f"several runs are called '{name}': name one of {several}")
+    return found[0]
+
+
+def _topics(session: Session) -> list[_Topic]:
+    """The topics of a run, in the order of its nodes."""
+    from neuros.project.split import node_file_from_json
+
+    files: list[NodeFile] = []
+    for name in session.nodes:
+        text = Path(session.folder, name, "node.json").read_text("utf-8")
+        files.append(node_file_from_json(json.loads(text)))
+    found: dict[str, _Topic] = {}
+    for file in files:
+        for topic in _topics_of(file):
+            if topic.node is not None:
+                found[topic.name] = topic
+            else:
+                found.setdefault(topic.name, topic)
+    return [*found.values()]
+
+
+def _topics_of(file: NodeFile) -> Iterator[_Topic]:
+    node = file.node
+    for c in file.connections:
+        name = f"{c.topic}/data"
+        if c.source_node == node.name:
+            kind = node.output(c.source_output).type
+            yield _Topic(name, kind, str(c), node.name, c.source_output)
+        else:
+            yield _Topic(name, node.input(c.destination_input).type, str(c), None, None)
+    for ports, is_input in ((node.inputs, True), (node.outputs, False)):
+        for port in ports:
+            if port.external_topic is not None:
+                name = file.names.resolve(port.external_topic, node.name)
+                seen = port.external_topic if is_input else port.name
+                yield _Topic(name, port.type, None, node.name, seen)
+
+
+def _named(topics: Sequence[_Topic], wanted: str) -> _Topic:
+    for topic in topics:
+        if wanted in topic.calls:
+            return topic
+    known = sorted({each.connection or each.name for each in topics})
+    hint = did_you_mean(wanted, {call for each in topics for call in each.calls})
+    raise UsageError(f"no topic '{wanted}' ({hint or f'there is {listed(known)}'})")
+
+
+# ---------------------------------------------------------------------- logs
+
+
+def add_logs(logs: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    logs.description = "Show what the nodes of a run have logged, in the order of time."
+    logs.add_argument("run", metavar="RUN", help=f"a run folder; of a run that goes on, {_RUN}")
+    logs.add_argument(
+        "-f", "--follow", action="store_true", help="show what comes, too, until the run has ended"
+    )
+    logs.add_argument(
+        "-n",
+        "--node",
+        action="append",
+        default=[],
+        dest="nodes",
+        metavar="NAME",
+        help="only of this node (repeatable)",
+    )
+    logs.set_defaults(command=_logs)
+
+
+def _logs(options: argparse.Namespace) -> int:
+    from neuros.backends.console import LogTail, wants_colours
+    from neuros.backends.node_command import PROCESS_LOG
+
+    folder = Path(options.run)
+    if not (folder / "project.json").is_file():
+        folder = Path(_run(options.run).folder)
+    session = next((s for s in sessions() if Path(s.folder) == folder.resolve()), None)
+    files = {file.parent.name: file.with_name("node.log") for file in folder.glob("*/node.json")}
+    for name in options.nodes:
+        if name not in files:
+            raise UsageError(f"the run has no node '{name}': it has {listed(sorted(files))}")
+    if options.nodes:
+        files = {name: files[name] for name in options.nodes}
+    else:
+        files |= {"neuros": folder / PROCESS_LOG, "recorder": folder / "recorder.log"}
+    colours = wants_colours(sys.stdout, os.environ)
+    with LogTail(files, lambda text: print(text, end="", flush=True), colours) as tail:
+        while options.follow and session is not None and session.is_led:
+            look_s = time.monotonic() + _LIVES_S
+            while time.monotonic() < look_s:
+                if not tail.poll():
+                    time.sleep(_POLL_S)
+        tail.drain()
+    return 0

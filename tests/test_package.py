@@ -1,0 +1,175 @@
+"""The package, without the checkout: what is in its wheel, and what that does when installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from email.parser import HeaderParser
+from pathlib import Path
+
+import pytest
+
+from neuros.backends.environments.pythons import find_python
+from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ("containers", "examples", "schema", "workspace")
+SOURCES = ("neuros", *DATA, "tests/integration/back_ends")
+FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
+PYTHONS = [(3, minor) for minor in range(10, NEWEST_FOR_NEST[1] + 1)]
+_DIGESTS = """
+from neuros.backends.docker.recipes import OWN_FOLDER, find_recipe, names_in
+print({name: find_recipe(name).digest for name in names_in(OWN_FOLDER)})
+"""
+
+
+def files_in(folder: Path) -> Iterator[str]:
+    """All but what runs and Python leave, relative to the folder."""
+    for file in folder.rglob("*"):
+        if file.is_file() and not {"__pycache__", "runs"} & {*file.relative_to(folder).parts}:
+            yield str(file.relative_to(folder))
+
+
+def run(*command: object, cwd: Path, environ: Mapping[str, str]) -> str:
+    """What a command says, which must end well."""
+    done = subprocess.run(
+        [str(word) for word in command],
+        cwd=cwd,
+        env={**environ, "NEUROS_GUI": "0"},
+        capture_output=True,
+        text=True,
+        timeout=550,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an sdist, made of a copy of the checkout, and a wheel, made of the sdist."""
+    folder = tmp_path_factory.mktemp("package")
+    for name in SOURCES:
+        skipped = shutil.ignore_patterns("__pycache__", "runs")
+        shutil.copytree(ROOT / name, folder / "copy" / name, symlinks=True, ignore=skipped)
+    for name in FILES:
+        shutil.copy(ROOT / name, folder / "copy")
+    for kind, place in (("sdist", "copy"), ("wheel", "sdist")):
+        code = f"import setuptools.build_meta as b; b.build_{kind}({str(folder)!r})"
+        run(sys.executable, "-c", code, cwd=folder / place, environ=os.environ)
+        for archive in folder.glob("*.tar.gz"):
+            with tarfile.open(archive) as opened:
+                opened.extractall(folder, filter="data")
+            archive.with_name(archive.name.removesuffix(".tar.gz")).rename(folder / "sdist")
+            archive.unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> Path:
+    (file,) = built.glob("*.whl")
+    return file
+
+
+class TestWheel:
+    @pytest.mark.parametrize("name", DATA)
+    def test_it_has_the_folders_of_the_checkout(self, name: str, wheel: Path) -> None:
+        start = f"neuros/{name}/"
+        with zipfile.ZipFile(wheel) as opened:
+            there = {n.removeprefix(start) for n in opened.namelist() if n.startswith(start)}
+        assert there == {*files_in(ROOT / name)}
+
+    def test_it_has_every_file_of_the_package(self, wheel: Path) -> None:
+        with zipfile.ZipFile(wheel) as opened:
+            assert {f"neuros/{name}" for name in files_in(ROOT / "neuros")} <= {*opened.namelist()}
+
+    def test_it_has_no_tests(self, built: Path) -> None:
+        assert not (built / "sdist" / "tests").exists()
+
+    def test_an_index_can_show_it(self, wheel: Path) -> None:
+        with zipfile.ZipFile(wheel) as opened:
+            (name,) = (n for n in opened.namelist() if n.endswith("/METADATA"))
+            shown = HeaderParser().parsestr(opened.read(name).decode())
+        for key in ("Author", "Project-URL", "Keywords", "License-Expression"):
+            assert shown[key]
+        assert "Operating System :: POSIX :: Linux" in shown.get_all("Classifier", [])
+        assert shown["Description-Content-Type"] == "text/markdown"
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+    """An environment whose ``neuros`` is the wheel's; all it depends on is that of the tests."""
+    folder = tmp_path_factory.mktemp("installed")
+    with zipfile.ZipFile(wheel) as opened:
+        opened.extractall(folder)
+    (script,) = folder.glob("*.data/scripts/neuros")
+    (folder / "bin").mkdir()
+    shutil.copy(script, folder / "bin")
+    (folder / "bin" / "neuros").chmod(0o755)
+    path = os.pathsep.join(
+        [str(folder / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]]
+    )
+    return {**os.environ, "PYTHONPATH": str(folder), "PATH": path}
+
+
+class TestInstalled:
+    def test_it_knows_nothing_of_the_checkout(
+        self, installed: Mapping[str, str], tmp_path: Path
+    ) -> None:
+        code = "from neuros.distribution import *; print(PACKAGE, EXAMPLES, is_checkout())"
+        said = run("python3", "-c", code, cwd=tmp_path, environ=installed)
+        folder = installed["PYTHONPATH"]
+        assert said.split() == [f"{folder}/neuros", f"{folder}/neuros/examples", "False"]
+
+    def test_its_containers_are_those_of_the_checkout(
+        self, installed: Mapping[str, str], tmp_path: Path
+    ) -> None:
+        there = run("python3", "-c", _DIGESTS, cwd=tmp_path, environ=installed)
+        assert "neuros_nest" in there
+        assert there == run(sys.executable, "-c", _DIGESTS, cwd=ROOT, environ=os.environ)
+
+    @pytest.mark.ros
+    def test_a_new_project_runs(self, installed: Mapping[str, str], tmp_path: Path) -> None:
+        said = run("neuros", "new", "mine", cwd=tmp_path, environ=installed)
+        assert said == "made mine; the next command: neuros launch mine\n"
+        command = ("neuros", "launch", "mine", "--backend", "in-process", "-o", "run")
+        assert "the heading is 0.0001 rad" in run(*command, cwd=tmp_path, environ=installed)
+        record = json.loads((tmp_path / "run" / "run.json").read_text("utf-8"))
+        assert record["exit_code"] == 0
+
+    def test_a_copied_example_is_valid(self, installed: Mapping[str, str], tmp_path: Path) -> None:
+        """This one needs the workspace, and a container of its own."""
+        run("neuros", "example", "whiskeye", cwd=tmp_path, environ=installed)
+        for project in ("whiskeye", "whiskeye/homing.json", "whiskeye/nengo.json"):
+            said = run("neuros", "validate", project, cwd=tmp_path, environ=installed)
+            assert ": valid: " in said
+
+
+@pytest.mark.acceptance
+@pytest.mark.ros
+@pytest.mark.parametrize("version", PYTHONS, ids=lambda version: ".".join(map(str, version)))
+def test_three_commands_lead_to_a_robot_that_moves(
+    version: tuple[int, int], wheel: Path, tmp_path: Path
+) -> None:
+    """In an empty environment, with all that it needs from the index."""
+    python = find_python(version, os.environ)
+    if python is None:
+        pytest.skip(f"there is no Python {version} on this machine")
+    environ = clean_environment(os.environ)
+    environ.pop("VIRTUAL_ENV", None)
+    run(python, "-m", "venv", tmp_path / "venv", cwd=tmp_path, environ=environ)
+    environ["PATH"] = f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{environ['PATH']}"
+    run("pip", "install", f"{wheel}[mujoco,nest,plot]", cwd=tmp_path, environ=environ)
+    run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
+    command = ("neuros", "launch", "whiskeye", "--backend", "process", "-o", "run")
+    assert "head-direction error: RMS" in run(*command, cwd=tmp_path, environ=environ)
+    for example in ("clock", "voting", "elevator"):
+        run("neuros", "example", example, cwd=tmp_path, environ=environ)
+        run("neuros", "launch", example, "--duration", "2", cwd=tmp_path, environ=environ)
+    run("neuros", "doctor", cwd=tmp_path, environ=environ)
