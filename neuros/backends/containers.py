@@ -14,7 +14,6 @@ FOLDER = "containers"
 OWN_FOLDER = CONTAINERS
 """NeuROS's own."""
 
-
 STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
 """Those that the examples need."""
 

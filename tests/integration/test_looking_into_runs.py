@@ -95,7 +95,9 @@ def test_topics_are_listed_shown_and_counted(
     assert "no topic 'talker.cout' (did you mean 'talker.count'?)" in capsys.readouterr().err
 
 
-def test_logs_are_followed_to_the_end(running: Running) -> None:
+def test_logs_are_followed_to_the_end_and_can_be_read_after_it(
+    running: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
     command = [sys.executable, "-m", "neuros.cli", "logs", run_of(running), "-f", "-n", "listener"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as shown:
         assert shown.stdout is not None
@@ -107,16 +109,9 @@ def test_logs_are_followed_to_the_end(running: Running) -> None:
     assert done.run_folder is not None
     log = (done.run_folder / "listener" / "node.log").read_text("utf-8")
     assert 1 + len(lines) == len(log.splitlines())
-
-
-def test_logs_of_a_run_that_is_over(
-    running: Running, project: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    running.signal(signal.SIGINT)
-    folder = running.finish().run_folder
-    assert main(["logs", str(folder)]) == 0
+    assert main(["logs", str(done.run_folder)]) == 0
     assert "[listener]: heard" in capsys.readouterr().out
-    assert main(["logs", str(folder), "-n", "nobody"]) == 2
+    assert main(["logs", str(done.run_folder), "-n", "nobody"]) == 2
     assert "the run has no node 'nobody': it has 'listener' or 'talker'" in capsys.readouterr().err
     assert main(["topic", "list", "0123456789"]) == 2
     assert "no run of yours is called '0123456789'" in capsys.readouterr().err
