@@ -99,7 +99,7 @@ class TestTable:
         ('nest.sli_run("ResetKernel")', "sli_run is of NEST 2: NEST 3 has no SLI"),
         (
             "import nest.topology as topology",
-            "topology is of NEST 2: NEST 3 calls it a part of `nest`",
+            "topology is of NEST 2: NEST 3 has it in `nest`",
         ),
         (
             "nest.SetKernelStatus({'grng_seed': 12})",
@@ -109,7 +109,7 @@ class TestTable:
         (
             'recorder.set({"to_file": True, "withtime": True})',
             "to_file is of NEST 2: NEST 3 calls it record_to; "
-            "withtime is of NEST 2: NEST 3 calls it recorded always: leave it out",
+            "withtime is of NEST 2: NEST 3 always records it: leave it out",
         ),
     ],
 )

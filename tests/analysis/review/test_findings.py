@@ -232,7 +232,7 @@ def test_in_process_no_gain_is_promised_for_a_discard_limit(tmp_path: Path) -> N
     found = findings(tmp_path, backend="in-process")
     assert found.headline.startswith("One thread runs all hooks in turn (in-process); slow.use")
     assert found.trial is None
-    assert "at most 1.2 times as fast, since slow" in found.gains[0]
+    assert "up to 1.2 times as fast; then slow is the limit" in found.gains[0]
 
 
 def test_where_no_node_has_reported_that_is_said(tmp_path: Path) -> None:
