@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the pictures of the gallery: graphs of the examples, and their robots in MuJoCo.
+"""Makes the pictures of the gallery and the tutorial: graphs of the examples, robots in MuJoCo.
 
 ::
 
@@ -13,7 +13,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
+from typing import Any
+
+from tutorial_files import files_of, steps
 
 from neuros.installation.machine import offscreen_opengl
 from neuros.project.graph_svg import graph_svg
@@ -41,20 +48,48 @@ def render_scenes() -> None:
     """One PNG per model."""
     os.environ.setdefault("MUJOCO_GL", offscreen_opengl())
     import mujoco
-    from matplotlib.image import imsave
 
-    for name, (joints, (azimuth, elevation, distance), target) in SCENES.items():
+    for name, (joints, view, target) in SCENES.items():
         model = mujoco.MjModel.from_xml_path(str(EXAMPLES / name))
         data = mujoco.MjData(model)
         for joint, position in joints.items():
             data.joint(joint).qpos[0] = position
-        mujoco.mj_forward(model, data)
-        camera = mujoco.MjvCamera()
-        camera.azimuth, camera.elevation, camera.distance = azimuth, elevation, distance
-        camera.lookat[:] = target
-        with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
-            renderer.update_scene(data, camera)
-            imsave(FIGURES / f"gallery_{Path(name).stem}.png", renderer.render())
+        render(model, data, view, target, FIGURES / f"gallery_{Path(name).stem}.png")
+
+
+def render(
+    model: Any, data: Any, view: tuple[float, ...], target: tuple[float, ...], file: Path
+) -> None:
+    """A picture, from azimuth, elevation and distance of the camera to what it looks at."""
+    import mujoco
+    from matplotlib.image import imsave
+
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation, camera.distance = view
+    camera.lookat[:] = target
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        renderer.update_scene(data, camera)
+        imsave(file, renderer.render())
+
+
+def draw_vehicle() -> None:
+    """The tutorial's last robot, and the plot of a run of it."""
+    os.environ.setdefault("MUJOCO_GL", offscreen_opengl())
+    import mujoco
+
+    with tempfile.TemporaryDirectory() as folder:
+        for name, text in files_of(steps()[-1]).items():
+            (Path(folder) / name).parent.mkdir(exist_ok=True)
+            (Path(folder) / name).write_text(text, "utf-8")
+        model = mujoco.MjModel.from_xml_path(f"{folder}/vehicle/vehicle.xml")
+        data = mujoco.MjData(model)
+        data.mocap_pos[0] = 1.0, 0.5, 0.15
+        view, target = (220.0, -25.0, 2.2), (0.4, 0.1, 0.0)
+        render(model, data, view, target, FIGURES / "tutorial_vehicle.png")
+        launch = [sys.executable, "-m", "neuros.cli", "launch", "vehicle", "-o", "run"]
+        subprocess.run([*launch, "--backend", "process"], cwd=folder, check=True)
+        shutil.copy(f"{folder}/run/plot/paths.png", FIGURES / "tutorial_paths.png")
 
 
 if __name__ == "__main__":
@@ -63,6 +98,7 @@ if __name__ == "__main__":
     weights = parser.parse_args().weights
     draw_graphs()
     render_scenes()
+    draw_vehicle()
     if weights:
         from whiskeye_film import make_film
 

@@ -85,7 +85,7 @@ class Registry(Generic[Part]):
         except Exception as error:  # whatever a module of another distribution may raise
             raise self._fault(name, entry, f"cannot be loaded: {error!r}") from error
         if not isinstance(part, self._kind):
-            raise self._fault(name, entry, f"is no {self._kind.__name__}, but {part!r}")
+            raise self._fault(name, entry, f"is not a {self._kind.__name__}, but {part!r}")
         if (own_name := getattr(part, "name", name)) != name:
             raise self._fault(name, entry, f"calls itself '{own_name}'")
         return cast("Part", part)

@@ -192,7 +192,7 @@ def _parts(message: Any) -> tuple[Vector, Quaternion]:
     length = math.hypot(turned.x, turned.y, turned.z, turned.w)
     if not length:
         raise TransformError(
-            "a rotation of length 0 is none: is its w missing, which is 1 for none?"
+            "a quaternion of length 0 is not a rotation: is its w missing? (no rotation: w = 1)"
         )
     x, y, z, w = (each / length for each in (turned.x, turned.y, turned.z, turned.w))
     return (moved.x, moved.y, moved.z), (x, y, z, w)

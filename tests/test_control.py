@@ -89,10 +89,10 @@ def test_half_a_character_arrives_as_its_escape() -> None:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        (b"GET / HTTP/1.1", "sent what is no control message: b'GET / HTTP/1.1'"),
-        (b"[1]", "sent what is no control message"),
-        (b"7", "sent what is no control message"),
-        (b'{"node": "a"}', "sent what is no control message"),
+        (b"GET / HTTP/1.1", "sent something that is not a control message: b'GET / HTTP/1.1'"),
+        (b"[1]", "sent something that is not a control message"),
+        (b"7", "sent something that is not a control message"),
+        (b'{"node": "a"}', "sent something that is not a control message"),
         (b'{"kind": "applaud"}', "sent a control message of the unknown kind 'applaud'"),
         (b'{"kind": ["stop"]}', "sent a control message of the unknown kind ['stop']"),
         (b'{"kind": "probe"}', "sent a wrong control message 'probe': field number is missing"),

@@ -246,7 +246,7 @@ class TestFallback:
         uv = program(python.with_name("uv"), "echo the proxy stops uv; exit 2")
         output, shown = self.run(python, uv, environ)
         assert output is None
-        assert "uv failed: pip tries (log: " in shown
+        assert "uv failed: trying pip (log: " in shown
         assert self.is_installed(python)
         assert "the proxy stops uv" in (python.parent.parent / "log").read_text("utf-8")
 
@@ -272,7 +272,7 @@ class TestFallback:
         uv = program(python.with_name("uv"), "exit 2")
         output, shown = self.run(python, uv, {**environ, "PIP_PRE": "1"})
         assert output is None
-        assert "uv does not know all settings that pip has here: pip installs" in shown
+        assert "uv does not know all settings that pip has here: using pip" in shown
         assert self.is_installed(python)
 
     def test_where_there_is_no_uv_install_says_so_and_takes_pip(
@@ -292,7 +292,7 @@ class TestFallback:
             "    return wheel.name\n"
         )
         install(python, tree, ["plot"], Progress(stream), environ)
-        assert "there is no uv for this machine: pip installs, which takes longer" in (
+        assert "there is no uv for this machine: using pip, which takes longer" in (
             stream.getvalue()
         )
         assert self.is_installed(python)
@@ -305,7 +305,7 @@ class TestFallback:
         stream = StringIO()
         with pytest.raises(EnvironmentFault, match=r"^the package index .* cannot be reached"):
             install(python, ROOT, ["plot"], Progress(stream), online)
-        assert "pip installs" not in stream.getvalue()
+        assert "using pip" not in stream.getvalue()
 
 
 class TestHashes:

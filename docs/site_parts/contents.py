@@ -1,4 +1,7 @@
-"""The site's navigation, from the tables of ``docs/index.md`` and the headings of the gallery."""
+"""The site's navigation, from the tables of ``docs/index.md`` and the headings of the gallery.
+
+The sidebar calls a page what the table calls it.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ _GENERATED = tuple(
 )
 _GENERATED_IN = "Reference"
 _SECTION = re.compile(r"^## (.+)$", re.MULTILINE)
-_ROW = re.compile(r"^\| \[[^\]]+\]\(([^)#]+\.md)\)", re.MULTILINE)
-_EXAMPLE = re.compile(r"^## \[[^\]]+\]\(([^)#]+\.md)\)", re.MULTILINE)
+_ROW = re.compile(r"^\| \[([^\]]+)\]\(([^)#]+\.md)\)", re.MULTILINE)
+_EXAMPLE = re.compile(r"^## \[([^\]]+)\]\(([^)#]+\.md)\)", re.MULTILINE)
 
 
 def add_toctrees(app: Sphinx, page: str, source: list[str]) -> None:
@@ -33,12 +36,13 @@ def add_toctrees(app: Sphinx, page: str, source: list[str]) -> None:
     if page == _INDEX:
         parts = _SECTION.split(source[0])
         for title, text in zip(parts[1::2], parts[2::2], strict=True):
-            entries = [_name("docs", link) for link in _ROW.findall(text)]
+            entries = [_entry("docs", *row) for row in _ROW.findall(text)]
             source[0] += _toctree(
                 title, entries + list(_GENERATED if title == _GENERATED_IN else ())
             )
     elif page == _GALLERY:
-        source[0] += _toctree("", [_name("examples", link) for link in _EXAMPLE.findall(source[0])])
+        examples = _EXAMPLE.findall(source[0])
+        source[0] += _toctree("", [_entry("examples", *example) for example in examples])
 
 
 def leave_out_of_source(
@@ -55,6 +59,7 @@ def _toctree(title: str, entries: list[str]) -> str:
     return f"\n```{{toctree}}\n:hidden:\n{caption}\n{listed}\n```\n"
 
 
-def _name(folder: str, link: str) -> str:
-    """The name of a page, from the root of the checkout."""
-    return "/" + posixpath.normpath(posixpath.join(folder, link)).removesuffix(".md")
+def _entry(folder: str, title: str, link: str) -> str:
+    """A line of a toctree: the title that the table gives, and the page from the root."""
+    page = posixpath.normpath(posixpath.join(folder, link)).removesuffix(".md")
+    return f"{title} </{page}>"

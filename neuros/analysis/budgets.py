@@ -27,10 +27,10 @@ def losses(record: Mapping[str, Any]) -> list[str]:
 def _unknown(sent: int | None, received: int | None) -> str:
     """Say which count is missing for that of lost packets."""
     if sent is None:
-        return "how many packets were sent is not known"
+        return "the number of packets that were sent is not known"
     if received is None:
-        return f"how many of {sent} packets arrived is not known"
-    return "how many packets it lost is not known: a node had not reported its last"
+        return f"it is not known how many of {sent} packets arrived"
+    return "the number of packets that it lost is not known: the last report of a node is missing"
 
 
 def broken_budgets(
@@ -55,11 +55,11 @@ def _losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[st
             continue
         name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
         if lost is None or discarded is None:
-            yield f"how many packets {name} lost is not known, allowed are {limit}"
+            yield f"it is not known how many packets {name} lost; the limit is {limit}"
         elif lost + discarded > limit:
             yield (
                 f"{name} lost {lost + discarded} packets ({lost} on their way,"
-                f" {discarded} discarded), allowed are {limit}"
+                f" {discarded} discarded); the limit is {limit}"
             )
 
 
@@ -70,15 +70,15 @@ def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) 
     owners = [n for n, node in record["nodes"].items() if node.get("sim_time") is not None]
     if not all(_is_known(record["nodes"][name]) for name in owners):
         yield (
-            f"the real-time factor must be at least {least:g}, and is not known:"
-            f" {' and '.join(owners)} had not reported the last"
+            f"the real-time factor must be at least {least:g}, but is not known: the last report"
+            f" of {' and '.join(owners)} is missing"
         )
     elif factor is not None and factor < least:
-        yield f"the real-time factor was {factor:.3g}, and must be at least {least:g}"
+        yield f"the real-time factor was {factor:.3g}, but must be at least {least:g}"
     elif factor is None and not is_partial:
         yield (
-            f"the real-time factor must be at least {least:g}, and there was none: no node owned"
-            " simulated time, or it never began to run"
+            f"the real-time factor must be at least {least:g}, but there was none: no node owns"
+            " simulated time, or the node that does never ran a hook"
         )
 
 
@@ -88,7 +88,7 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
     for node, metrics in record["nodes"].items():
         if _has_ticks(metrics) and not _is_known(metrics):
             yield (
-                f"how far ticks of {node} were off their period is not known, allowed are"
+                f"it is not known how far ticks of {node} were off their period; the limit is"
                 f" {limit_ms:g} ms"
             )
             continue
@@ -97,7 +97,7 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
             if ticks and ticks["largest_error_ms"] > limit_ms:
                 yield (
                     f"a tick of '{hook}' of {node} was off its period by"
-                    f" {ticks['largest_error_ms']:.3g} ms, allowed are {limit_ms:g} ms"
+                    f" {ticks['largest_error_ms']:.3g} ms; the limit is {limit_ms:g} ms"
                 )
 
 

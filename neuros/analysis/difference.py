@@ -141,7 +141,7 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
     others = len(found) - 1
     if others > 0:
         differ = "connections differ" if others > 1 else "connection differs"
-        remarks.append(f"{others} more {differ}, later on")
+        remarks.append(f"{others} more {differ}, from a later moment on")
     text = None if first is None else first.text
     if first is not None and first.packet is not None:  # a bag is read for the first one only
         text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
@@ -163,10 +163,9 @@ def _compare_connection(
     if any(lacking):
         folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
         remarks.append(
-            f"{name}: not compared, there are neither digests nor a recording of it in"
-            f" {' and '.join(dict.fromkeys(map(str, folders)))} (in process digests are kept with"
-            " --digests, or unasked where no packet may be lost and they are cheap; never of what a"
-            " node sends to itself)"
+            f"{name}: not compared, since {' and '.join(dict.fromkeys(map(str, folders)))} has"
+            " neither digests nor a recording of it (the in-process back end keeps digests with"
+            " --digests; packets from a node to itself never have any: record them with -r)"
         )
         return 0
     compared = _first_difference(in_a.sent, in_b.sent)
@@ -174,9 +173,7 @@ def _compare_connection(
     if cut_off:
         listed = min(cut_off)
         in_a, in_b = (replace(packets, sent=packets.sent[:listed]) for packets in (in_a, in_b))
-        remarks.append(
-            f"{name}: compared up to packet {listed}, of later ones no digests are there"
-        )
+        remarks.append(f"{name}: compared up to packet {listed}; later packets have no digests")
         taken = None
     else:
         taken = _taken(name, in_a, in_b)
@@ -186,7 +183,7 @@ def _compare_connection(
     elif taken is not None and a.connections[name]["discard_limit"] == 0:
         found.append(taken)
     elif taken is not None:
-        remarks.append(f"{taken.text}: as a connection may that loses packets")
+        remarks.append(f"{taken.text}: allowed, since this connection may lose packets")
     return compared
 
 
@@ -248,9 +245,9 @@ def _field(folders: tuple[Path, Path], name: str, number: int, recorded: Recorde
     """In which field a packet differs, as far as it was recorded."""
     messages = [recorded.message(folder, name, number) for folder in folders]
     if None in messages:
-        return "(which field, only --record can tell)"
+        return "(to see in which field, run both with --record)"
     field = next(differing_fields(*messages), None)
-    return f"in {field or 'nothing that was recorded'}"
+    return f"in {field}" if field else "(but no recorded field does)"
 
 
 def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
@@ -262,7 +259,7 @@ def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     if place in (len(a), len(b)):
         what = f"hooks took {len(a)} packets in run A, and {len(b)} in run B"
     else:
-        what = f"the packet that hooks took as number {place + 1} is another one"
+        what = f"hooks took different packets as number {place + 1}"
     return _Difference(at_ns, f"{name}: {what}")
 
 

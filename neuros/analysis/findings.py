@@ -244,9 +244,7 @@ def findings_of(run: PastRun) -> Findings:
     """Say what limits a run."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
-        return Findings(
-            "What limits this run cannot be told: no node has reported how it spent its time."
-        )
+        return Findings("The bottleneck is not known: no node has reported how it spent its time.")
     if run.is_one_process:
         return _one_process(run, budgets, run.running_s)
     found = find_bottleneck(budgets, run.ends, run.running_s, run.time_owner)
@@ -255,7 +253,7 @@ def findings_of(run: PastRun) -> Findings:
     reasons += _caveats(run, budgets, run.running_s)
     gains = [_gain(gain, run.record) for gain in found.gains]
     if not gains:
-        gains = ["No discard limit holds this run up: without them it would gain nothing."]
+        gains = ["Discard limits do not slow this run down."]
     best = next((gain for gain in found.gains if gain.up_to >= _WORTH_A_TRY), None)
     return Findings(
         _headline(found, budgets),
@@ -336,8 +334,8 @@ def _caveats(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) 
         return []
     subject = "The processor was" if cores == 1 else f"The {cores} processors were"
     return [
-        f"{subject} {min(1.0, max(shares)):.0%} busy: what a hook costs depends on what else runs,"
-        " and predictions may be off either way."
+        f"{subject} {min(1.0, max(shares)):.0%} busy: other programs slow hooks down, so"
+        " predictions may be too high or too low."
     ]
 
 
@@ -345,7 +343,7 @@ def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
     plural = "" if len(gain.connections) == 1 else "s"
     text = f"Without the discard limit{plural} of {' and '.join(gain.connections)}:"
     if gain.up_to < _WORTH_A_TRY:
-        return f"{text} next to nothing."
+        return f"{text} about as fast as now."
     text += f" up to {gain.up_to:.1f} times as fast"
     factor = record.get("real_time_factor")
     if factor:
@@ -376,9 +374,7 @@ def _one_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: flo
         f" {budgets[node].share(busy_s):.0%} of the time."
     )
     if idle > 0.5:
-        headline = (
-            f"Nothing that was computed limits the speed: {idle:.0%} of the time no hook executes."
-        )
+        headline = f"No computation limits the speed: no hook executes for {idle:.0%} of the time."
     return Findings(
         headline,
         tuple(
@@ -386,8 +382,8 @@ def _one_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: flo
             for name, spent in budgets.items()
         ),
         (
-            "With the process back end hooks overlap: those that cost what they cost here would"
-            f" be done at most {at_most:.1f} times as fast, since {slowest} alone has that much to"
-            " do. What a discard limit costs, a run in one thread does not show.",
+            f"With the process back end, hooks overlap, and the run could be up to {at_most:.1f}"
+            f" times as fast; then {slowest} is the limit. A run in one thread does not show what"
+            " discard limits cost.",
         ),
     )

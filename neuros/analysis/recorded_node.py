@@ -158,8 +158,8 @@ class RecordedNode:
         topic = self._topic(name)
         if not self._keeps(Way.HEARD, name):
             raise UsageError(
-                f"replay: another node has recorded {topic}, and it cannot be told which of its"
-                f" packets have reached '{self._name}'"
+                f"replay: another node has recorded {topic}, so it is not known which packets"
+                f" reached '{self._name}'"
             )
         return [packet.data for packet in self._packets(topic)]
 

@@ -337,7 +337,7 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
     from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
 
     if not (folder / "project.json").is_file():
-        raise UsageError(f"{folder} has no run.json: it is no folder that a run has left behind")
+        raise UsageError(f"{folder} has no run.json: it is not the folder of a run")
     project = read_object(folder / "project.json")
     try:
         connections = [
@@ -352,7 +352,7 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
         ]
         nodes = {str(node["name"]): {"report": None} for node in project.get("nodes", ())}
     except (AttributeError, KeyError, TypeError) as error:
-        text = f"{folder / 'project.json'} is broken: it is no project"
+        text = f"{folder / 'project.json'} is broken: it is not a project"
         raise EnvironmentFault(text) from error
     record = {
         "project": folder.parent.name if folder.parent.parent.name == "runs" else folder.name,
@@ -370,7 +370,7 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
     return record, [
         "run.json: the run goes on, or its launcher was killed. Packets are counted from the"
         " nodes' lists (up to a second before the end); how nodes spent their time, losses and"
-        " ticks are not known, and so the bottleneck cannot be told"
+        " ticks are not known, so neither is the bottleneck"
     ]
 
 

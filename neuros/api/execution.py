@@ -246,7 +246,7 @@ class Execution:
         except OSError as error:
             spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
             problem = f"{self.folder / RUN_FILE} cannot be written ({error.strerror})"
-            outcome.fail(f"{problem}: it is in {spare}, if there is room", EXIT_ENVIRONMENT)
+            outcome.fail(f"{problem}: it is in {spare} instead, if there is room", EXIT_ENVIRONMENT)
             record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
             with contextlib.suppress(OSError):
                 spare.mkdir(0o700)

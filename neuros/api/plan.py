@@ -208,8 +208,8 @@ def make_plan(
     plan = Plan(project, names, chosen, request, pythons, network, messages)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
-            f"--network with -n: the nodes of the {back_end.name} back end reach none elsewhere;"
-            " use --backend process"
+            f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"
+            " elsewhere; use --backend process"
         )
     if request.isolate:
         _check_isolation(plan)
@@ -241,8 +241,8 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     is_local = plan.network.environment(environ)[RANGE_VARIABLE] == "LOCALHOST"
     if not is_one_process and is_local and len(plan.names) > MOST_LOCAL_PARTICIPANTS:
         raise EnvironmentFault(
-            f"{len(plan.names)} processes are more than find each other with discovery on this"
-            f" machine only ({MOST_LOCAL_PARTICIPANTS}): use --backend in-process, or --network"
+            f"{len(plan.names)} processes cannot all find each other: with discovery on this"
+            f" machine only, {MOST_LOCAL_PARTICIPANTS} can: use --backend in-process, or --network"
         )
 
 

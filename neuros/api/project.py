@@ -188,7 +188,7 @@ class Project:
         plan = make_plan(project, messages, options)
         if options.isolate and not plan.back_end.has_own_network:
             raise UsageError(
-                "isolate: a Python program cannot leave its network for a run: use"
+                "isolate: a Python program cannot give a run a network of its own: use"
                 " backend='docker', or `neuros launch --isolate`"
             )
         make_environments(plan.pythons, messages, sys.stderr)
@@ -250,7 +250,7 @@ def _seed_texts(project: Described, seed: int) -> tuple[str, ...]:
     ]
     if not places:
         raise UsageError(
-            f"seed {seed}: no node of {project.name} has a variable with SEED in its name in its"
-            " environment: add one there, or set what its plugin takes for a seed"
+            f"seed {seed}: no node of {project.name} has an environment variable with SEED in its"
+            " name: add the one that its plugin reads to its environment"
         )
     return tuple(f"{place}={int(seed)}" for place in places)

@@ -140,7 +140,7 @@ def summary(report: Mapping[str, Any]) -> str:
         seen = sum(topic["recorded"] for topic in lossy)
         passed = [topic["passed"] for topic in lossy]
         of = "?" if None in passed else sum(passed)
-        lines.append(f"{seen} of {of} packets on connections without discard limit")
+        lines.append(f"recorded {seen} of {of} packets of connections that may lose any number")
     return "\n".join(lines)
 
 

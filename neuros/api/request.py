@@ -60,15 +60,15 @@ class ProjectOptions:
         metavar="NS",
         default_help="the project's",
         page="external_nodes.md#two-copies-of-a-project",
-        help="put nodes, connections and relative topics into this namespace of the ROS graph, as"
-        " in /left, so that two copies of a project share a domain; / takes the project's away",
+        help="run in this namespace of the ROS graph, such as /left, so that two copies of a"
+        " project can share a domain; / removes the namespace that the project sets",
     )
     remap: Sequence[str] = option(
         "--remap",
         is_repeatable=True,
         metavar="FROM:=TO",
         help="rename an external topic, or a topic or service of a plugin, as in ROS;"
-        " NODE:FROM:=TO for one node alone",
+        " NODE:FROM:=TO renames it for one node only",
     )
 
 
@@ -102,8 +102,8 @@ class Request(ProjectOptions):
         "--network",
         default=False,
         page="network.md",
-        help="let the nodes find, and be found by, those on other machines of the network, all of"
-        " which can then read and send packets; without it they see this machine only",
+        help="connect to nodes on other machines of the network, instead of this machine only;"
+        " every machine of the network can then read and send packets",
     )
     peers: str | None = option(
         "--peers",
@@ -117,8 +117,8 @@ class Request(ProjectOptions):
         default=False,
         page="security.md#a-network-of-the-runs-own",
         help="give the run a network of its own, so that no other program of this machine can read"
-        " or send its packets; not with nodes elsewhere or external inputs. Python programs can ask"
-        " for it with --backend docker only",
+        " or send its packets; impossible with nodes elsewhere or external inputs, and from Python"
+        " possible with the back end docker only",
     )
     backend: str | None = option(
         "--backend",
@@ -139,8 +139,8 @@ class Request(ProjectOptions):
         "--duration",
         metavar="SECONDS",
         default_help="no limit",
-        help="end the run, drained, this long after the first hook started: 30, or 30sim in"
-        " simulated time",
+        help="end the run this long after the first hook started, when packets under way have"
+        " arrived: 30 seconds, or 30sim in simulated time",
     )
     output: str | os.PathLike[str] | None = option(
         "-o",
@@ -161,16 +161,16 @@ class Request(ProjectOptions):
         "--monitor-system-load",
         default=False,
         page="command_line.md#system-load",
-        help="write processor, memory, network and threads, of the machine and by node, to"
-        " system_load.csv in the run folder, once per second",
+        help="once per second, write the use of processor, memory, network and threads by the"
+        " machine and by each node to system_load.csv in the run folder",
     )
     digests: bool = option(
         "--digests",
         default=False,
         page="command_line.md#neuros-verify",
-        help="keep a digest of every packet for `neuros verify` in process, too, where each packet"
-        " is serialised for it; other back ends always keep them, in-process does where all"
-        " connections are lossless and it costs under 2 %% of the processor time",
+        help="keep a digest of every packet, for `neuros verify`. Other back ends always do;"
+        " in-process must serialise packets for it, and without this option keeps digests only if"
+        " all connections are lossless and it costs under 2 %% of the processor time",
     )
     record: bool | Sequence[str] = option(
         "-r",
@@ -187,14 +187,15 @@ class Request(ProjectOptions):
         metavar="NAME",
         group=_RECORDING,
         page="recording.md",
-        help="record this, be it a ROS topic that no node has; without -r: only this",
+        help="record this topic, which need not be one of the project; without -r, record nothing"
+        " else",
     )
     exclude: Sequence[str] = option(
         "--exclude",
         is_repeatable=True,
         metavar="NAME",
         group=_RECORDING,
-        help="do not record this",
+        help="do not record this topic",
     )
     storage: str = option(
         "--storage",
@@ -207,10 +208,10 @@ class Request(ProjectOptions):
         "--progress",
         is_negatable=True,
         is_recorded=False,
-        default_help="if it is known when the run ends",
+        default_help="on if it is known when the run ends",
         page="command_line.md#progress",
-        help="show how far the run has come: in a terminal a line that stays, elsewhere a line"
-        " every 10 s",
+        help="show the progress of the run: in a terminal on the last line, elsewhere on a new"
+        " line every 10 s",
     )
     verbose: bool = option(
         "-v", "--verbose", default=False, is_recorded=False, help="show DEBUG records, too"
@@ -339,8 +340,8 @@ class SweepOptions:
         "--set",
         is_repeatable=True,
         metavar="PATH=VALUE,...",
-        help="set a key of the project, as for launch, to one value or several; commas in brackets"
-        " and quotes do not separate",
+        help="set a key of the project, as for launch, to one value or to several, separated by"
+        " commas outside of brackets and quotes",
     )
     seeds: Iterable[int] = option(
         "--seeds",
@@ -348,8 +349,8 @@ class SweepOptions:
         default=(),
         metavar="SEED,...",
         default_help="as in the files",
-        help="give these seeds to every variable with SEED in its name in the environment of a"
-        " node",
+        help="give each of these seeds to every environment variable of a node that has SEED in"
+        " its name",
     )
     repeat: int = option(
         "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"
@@ -360,9 +361,9 @@ class SweepOptions:
         suggestions=_executors,
         metavar="NAME",
         page="python.md#sweeps-on-a-cluster",
-        help="make the runs on this machine (local), as an array of Slurm jobs (slurm, or"
-        " slurm=PARTITION), or on Dask workers (dask=ADDRESS; dask alone: on workers of this"
-        " machine); other distributions may add executors. From Python also any executor of"
+        help="where the runs are made: local (this machine), slurm or slurm=PARTITION (an array"
+        " of Slurm jobs), dask=ADDRESS (Dask workers), dask (Dask workers on this machine); other"
+        " distributions may add executors, and Python programs may give any executor of"
         " concurrent.futures",
     )
     jobs: int | None = option(
@@ -370,10 +371,11 @@ class SweepOptions:
         parse=positive_number,
         metavar="N",
         default_help="1 with local, else as many as there is room for",
-        help="runs at once, which take processors from each other: not for real-time factors",
+        help="number of runs at the same time; they share the processors, so their real-time"
+        " factors mean little",
     )
     retry: bool = option(
-        "--retry", default=False, help="make runs again that have failed in an earlier call"
+        "--retry", default=False, help="repeat the runs that failed in an earlier call"
     )
     backend: str | None = like(Request, "backend")
     duration: float | str | None = like(Request, "duration")
@@ -383,7 +385,7 @@ class SweepOptions:
         "--output",
         metavar="DIR",
         default_help="runs/<project>/sweep-<utc time>",
-        help="write into a new folder, or go on with that of an earlier call",
+        help="write into this folder: a new one, or that of an earlier call, to continue its sweep",
     )
     on_row: OnRow | None = option(
         help="called with the number of a run, of how many, and its row", is_recorded=False

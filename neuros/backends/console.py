@@ -184,7 +184,7 @@ class _GrowingFile:
         os.lseek(self._descriptor, -len(shown), os.SEEK_CUR)
         self._rest = b""
         left_out = (size - at - len(shown)) / 1e6
-        return [f"({left_out:.0f} MB are not shown here: {self._path} has all)".encode()]
+        return [f"({left_out:.0f} MB are not shown here; all of it is in {self._path})".encode()]
 
     def take_rest(self) -> list[bytes]:
         rest, self._rest = self._rest, b""

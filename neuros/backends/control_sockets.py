@@ -99,8 +99,8 @@ def connect_by(environ: Mapping[str, str]) -> ControlStream:
     address = environ.get(CONTROL_VARIABLE)
     if not address:
         raise EnvironmentFault(
-            f"{CONTROL_VARIABLE} is not set: this program is started by `neuros launch`, which says"
-            " there where it listens"
+            f"{CONTROL_VARIABLE} is not set: do not start this program by hand; `neuros launch`"
+            " starts it, and sets the variable"
         )
     return connect(address)
 

@@ -112,7 +112,7 @@ def _valid(text: str, source: str) -> int:
     if text.isascii() and text.isdigit() and int(text) <= _HIGHEST:
         return int(text)
     raise UsageError(
-        f"{source}: {text!r} is no ROS domain id: use a whole number from 0 to 101 (up to"
+        f"{source}: {text!r} is not a ROS domain id: use a whole number from 0 to 101 (up to"
         f" {_HIGHEST} where the machine's ephemeral ports allow it)"
     )
 

@@ -49,9 +49,7 @@ def checkout_command(name: str) -> Any:
 
 def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    benchmark.description = (
-        "Measure what NeuROS costs, side by side with the same thing without it."
-    )
+    benchmark.description = "Measure what NeuROS costs, compared with the same program without it."
     benchmark.epilog = _BENCHMARK_EPILOG
     add = benchmark.add_argument
     add("subjects", nargs="*", metavar="SUBJECT", help="what to measure (default: everything)")
@@ -63,14 +61,18 @@ def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
         metavar="N",
         help="rounds (default: 10 where a target is held)",
     )
-    add("--quick", action="store_true", help="few and short rounds: no figures to quote")
+    add(
+        "--quick",
+        action="store_true",
+        help="few and short rounds, to try it out: do not quote the figures",
+    )
     add("-o", "--output", metavar="FILE", help="default: build/benchmarks/<utc time>.json")
     add(
         "--from",
         dest="files",
         nargs="+",
         metavar="FILE",
-        help="measure nothing, but show these results; of rows in several files, the last",
+        help="measure nothing; show these results (if several files have a row, that of the last)",
     )
     add("--compare", nargs=2, metavar=("A", "B"), help="show what differs between two results")
     add("--figures", metavar="DIR", help="draw figures of the results (SVG)")
@@ -87,18 +89,18 @@ def _benchmark(options: argparse.Namespace) -> int:
 def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     reproduce.description = (
-        "Make a published experiment again, one run after the other, and write its"
-        " tables and figures, with the published numbers beside them."
+        "Repeat a published experiment, one run after the other, and write its tables and figures"
+        " beside the published numbers."
     )
     reproduce.epilog = _REPRODUCE_EPILOG
     add = reproduce.add_argument
     add(
         "experiment",
         choices=("whiskeye", "headdirection", "tick", "voting", "elevator"),
-        help="whiskeye: the robot in its seven orchestrations; headdirection:"
-        " what its eyes see corrects its heading; tick: how regular ticks are, beside"
-        " a timer of rclpy; voting: what is added to three tasks of 5 s at once; elevator: how fast"
-        " a simulation is in three orchestrations",
+        help="whiskeye: the robot in its seven orchestrations; headdirection: its eyes correct its"
+        " heading; tick: how regular ticks are, compared with a timer of rclpy; voting: what"
+        " NeuROS adds to three parallel tasks of 5 s; elevator: how fast a simulation is in three"
+        " orchestrations",
     )
     add("--repeat", type=positive_number, metavar="N", help="runs of each part (default: 1)")
     add(
@@ -114,13 +116,13 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
         "--duration",
         type=_seconds,
         metavar="SECONDS",
-        help="of a run: simulated seconds of whiskeye and headdirection, else wall seconds"
-        " (default: 20 for whiskeye and elevator, 60 for the others)",
+        help="length of a run: in simulated seconds for whiskeye and headdirection, else in wall"
+        " seconds (default: 20 for whiskeye and elevator, 60 for the others)",
     )
     add(
         "--weights",
         metavar="FILE",
-        help="of an earlier training run, instead of training (headdirection)",
+        help="headdirection: use the weights of an earlier training run, and do not train",
     )
     add_options(reproduce, [each for each in options_of(Request) if each.name == "backend"])
     add(
@@ -143,7 +145,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     names = ("repeat", "only", "duration", "weights", "backend", "output")
     given = [getattr(options, name) for name in names]
     if options.source is not None and any(each is not None for each in given):
-        raise UsageError("--from runs nothing: no other option goes with it")
+        raise UsageError("--from runs nothing: leave out all other options")
     return int(checkout_command("benchmarks.reproduce.command").run(options))
 
 

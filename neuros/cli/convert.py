@@ -62,7 +62,7 @@ def _convert(options: argparse.Namespace) -> int:
         raise EnvironmentFault(f"{output}: cannot be written: {error.strerror}") from error
     except ValueError as error:
         text = " ".join(str(error).split())
-        text = f"MuJoCo does not read what it has written: {text}"
+        text = f"MuJoCo cannot read its own output: {text}"
         problem = Problem(str(source), 1, 1, "/", text)
         raise DescriptionError([problem]) from error
     if converted.not_taken:
@@ -96,7 +96,7 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
         raise UsageError(str(error)) from None
     output = Path(options.output) if options.output else source.with_suffix(".xml")
     if os.path.exists(output) and not output.is_file():
-        raise UsageError(f"{output}: is no file; name the file to write")
+        raise UsageError(f"{output}: is not a file; name the file to write")
     if os.path.exists(output) and not options.force and not is_ours(output):
         raise UsageError(f"{output}: exists and is not from this command: name another, or --force")
     folders = [Path(folder) for folder in options.include]

@@ -132,7 +132,7 @@ def _enter_own_network() -> None:
     unshare = ctypes.CDLL(None, use_errno=True).unshare
     if unshare(_CLONE_NEWNET if is_root else _CLONE_NEWUSER | _CLONE_NEWNET):
         reason = os.strerror(ctypes.get_errno())
-        raise EnvironmentFault(f"--isolate: no network of its own here ({reason}): {_REMEDY}")
+        raise EnvironmentFault(f"--isolate: the run gets no network here ({reason}): {_REMEDY}")
     try:
         if not is_root:
             itself = Path("/proc/self")
@@ -143,7 +143,7 @@ def _enter_own_network() -> None:
             fcntl.ioctl(any_socket, _SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", _IFF_UP))
     except OSError as error:
         raise EnvironmentFault(
-            f"--isolate: no network of its own here ({error.strerror}): {_REMEDY}"
+            f"--isolate: the run gets no network here ({error.strerror}): {_REMEDY}"
         ) from error
 
 

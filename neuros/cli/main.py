@@ -61,11 +61,13 @@ COMMANDS = {
     "report": Command("runs", "say what limited a run, and draw figures of it"),
     "compare": Command("runs", "show the figures of runs side by side"),
     "bag": Command("runs", "show or complete what a run has recorded"),
-    "replay": Command("replay", "run one node of a run once more, or publish recorded topics"),
+    "replay": Command("replay", "run one node of a recorded run again, or publish recorded topics"),
     "convert": Command("convert", "turn a robot or world in SDF or URDF into a MuJoCo model"),
     "doctor": Command("setup", "check this machine, and prove that packets arrive"),
     "containers": Command("setup", "build, list and remove the images that nodes run in"),
-    "benchmark": Command("checkout", "measure what NeuROS costs, against the same without it"),
+    "benchmark": Command(
+        "checkout", "measure what NeuROS costs, compared with the same program without it"
+    ),
     "reproduce": Command("checkout", "make the published experiments again"),
     "node": Command("node"),
     "import-plugin": Command("projects"),

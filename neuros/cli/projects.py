@@ -31,7 +31,7 @@ def add_project(command: argparse.ArgumentParser, declared_in: type = ProjectOpt
         "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
     )
     command.add_argument(
-        "-p", "--project", dest="project_option", metavar="PROJECT", help="the same, as an option"
+        "-p", "--project", dest="project_option", metavar="PROJECT", help="another way to name it"
     )
     add_options(command, options_of(declared_in))
 
@@ -72,15 +72,15 @@ def add_validate(validate: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     validate.description = (
         "Check a project and list every problem with its file, line and column. Plugins are read,"
-        " and not run."
+        " but not run."
     )
     add_project(validate)
     validate.add_argument(
         "--import",
         dest="imports",
         action="store_true",
-        help="import the plugin of each node, too, as its process would: their code is run, but no"
-        " hook",
+        help="also import the plugin of each node, as its process would: code outside of functions"
+        " runs, hooks do not",
     )
     add_format(validate)
     validate.set_defaults(command=_validate)
@@ -156,7 +156,9 @@ def add_graph(graph: argparse.ArgumentParser) -> None:
         help="for the terminal, a Mermaid diagram for Markdown, or a picture (default: text, unless"
         " the name of the file ends in .mmd or .svg)",
     )
-    graph.add_argument("-o", "--output", metavar="FILE", help="write it there, not to the terminal")
+    graph.add_argument(
+        "-o", "--output", metavar="FILE", help="write to this file, not to the terminal"
+    )
     graph.set_defaults(command=_graph)
 
 

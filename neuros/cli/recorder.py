@@ -48,8 +48,8 @@ def _run_recorder(options: argparse.Namespace) -> int:
     except (NeurosError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         problems.add(
-            f"the recording has stopped: {reason}; what is in the bag can be read, and"
-            f" neuros bag repair {run} adds what is not"
+            f"the recording has stopped: {reason}; the bag can be read, and neuros bag repair"
+            f" {run} adds the packets that it lacks"
         )
         with contextlib.suppress(OSError):
             counts = counts_of(run)

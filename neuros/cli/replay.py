@@ -30,9 +30,9 @@ EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
 def add_replay(replay: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     replay.description = (
-        "With --node: run one node once more on exactly what it received, and compare"
-        " what it sends, packet by packet. With --topic: publish recorded topics on the ROS graph,"
-        " spaced as they were sent."
+        "With --node: run one node again on exactly the packets that it received, and compare what"
+        " it sends, packet by packet. With --topic: publish recorded topics on the ROS graph, at"
+        " the intervals of the run."
     )
     replay.epilog = (
         "exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
@@ -40,26 +40,28 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")
-    add("-n", "--node", metavar="NAME", help="the node to run once more")
+    add("-n", "--node", metavar="NAME", help="the node to run again")
     debugger = replay.add_mutually_exclusive_group()
     debugger.add_argument(
         "--pdb",
         "--debug",
         action="store_true",
-        help="with --node: under Python's debugger, which stops at the start of each hook, and"
+        help="with --node: run it in Python's debugger, which stops at the start of each hook, and"
         " after a failure",
     )
     debugger.add_argument(
         "--debugpy",
         type=int,
         metavar="PORT",
-        help="with --node: wait until an editor's debugger attaches there (pip install debugpy)",
+        help="with --node: wait until an editor's debugger attaches to this port (pip install"
+        " debugpy)",
     )
     add(
         "-o",
         "--output",
         metavar="FOLDER",
-        help="with --node: keep what the node writes to node.run_dir (default: it is removed)",
+        help="with --node: keep the files that the node writes (node.run_dir) in this folder"
+        " (default: remove them)",
     )
     add(
         "-t",
@@ -68,15 +70,16 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
         default=[],
         dest="replay_topics",
         metavar="NAME",
-        help="a topic, an output (node.output) or a connection (repeatable); * stands for any",
+        help="publish this topic, output (node.output) or connection (repeatable); * stands for"
+        " any characters",
     )
-    add("--rate", type=float, default=1.0, metavar="FACTOR", help="times as fast (default: 1)")
+    add("--rate", type=float, default=1.0, metavar="FACTOR", help="speed-up (default: 1)")
     add(
         "--delay",
         type=float,
         default=1.0,
         metavar="SECONDS",
-        help="before the first packet, so that subscribers find the topics (default: 1)",
+        help="wait before the first packet, so that subscribers find the topics (default: 1)",
     )
     add(
         "-w",
@@ -84,9 +87,16 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar="N",
-        help="begin when each topic has that many, as `ros2 topic pub` does (default: 0)",
+        help="begin when each topic has this many subscriptions, as `ros2 topic pub` does"
+        " (default: 0)",
     )
-    add("-d", "--domain-id", type=int, metavar="ID", help="default: ROS_DOMAIN_ID, else 0")
+    add(
+        "-d",
+        "--domain-id",
+        type=int,
+        metavar="ID",
+        help="publish in this ROS domain (default: ROS_DOMAIN_ID, else 0)",
+    )
     replay.set_defaults(command=_replay)
 
 
@@ -104,14 +114,14 @@ def _replay(options: argparse.Namespace) -> int:
     if options.node is not None:
         return _replay_node(options)
     if options.pdb or options.debugpy is not None or options.output is not None:
-        raise UsageError("replay: --pdb, --debugpy and --output are for a node: name it, --node")
+        raise UsageError("replay: --pdb, --debugpy and --output need --node NAME")
     if not options.replay_topics:
         raise UsageError(
-            "replay: name a node to run once more (--node NAME), or what to publish (--topic NAME,"
-            " or --topic '*' for all)"
+            "replay: name a node to run again (--node NAME), or what to publish (--topic NAME, or"
+            " --topic '*' for all)"
         )
     if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
-        raise UsageError("replay: --rate must be above 0, --delay and -w not below")
+        raise UsageError("replay: --rate must be above 0; --delay and -w must be 0 or more")
     from neuros.cli.environments import find_messages_of
     from neuros.recording.bag_reader import open_bag
     from neuros.transport.playing import PlayedTopic, play
@@ -273,7 +283,7 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
             if ran_in_container(run) and (lack := missing_module(node.failure)):
                 raise not_here(run, name, lack)
             first = str(node.failure).partition("\n")[0]
-            print(f"different: it failed, and did not in the run: {first}")
+            print(f"different: it failed, but did not in the run: {first}")
             return EXIT_DIFFERENT
         node.notes.append(f"it failed, as in the run: {node.failure}")
     for note in node.notes:

@@ -44,7 +44,7 @@ def add_ps(ps: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="only nodes of which that is true; KEY is run, project, node, backend or state"
+        help="show only nodes with this value; KEY is run, project, node, backend or state"
         " (repeatable)",
     )
     add_format(ps)
@@ -55,14 +55,14 @@ def add_stop(stop: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     stop.description = (
         "Stop runs of this user, as Ctrl+C in their terminal does, and wait until they have ended."
-        " Root stops a run of another user by its id alone."
+        " Root can stop a run of another user, but only by its id."
     )
     stop.add_argument(
         "runs",
         nargs="*",
         metavar="RUN",
-        help="as `neuros ps` shows it (its first digits are enough), or a project; can be left out"
-        " where there is one run only",
+        help="the id that `neuros ps` shows (its first digits are enough), or the name of a"
+        " project; needless if there is only one run",
     )
     stop.add_argument("--all", action="store_true", help="stop all runs of this user")
     stop.set_defaults(command=_stop)
@@ -97,7 +97,7 @@ def _ps(options: argparse.Namespace) -> int:
     elif options.format == JSON:
         print_json(rows)
     elif not rows:
-        print("no running node is like that" if found else "nothing is running")
+        print("no running node matches" if found else "nothing is running")
     else:
         print(_table(rows, shows_users=not all(session.is_own for session in found)))
     return 0
@@ -150,7 +150,7 @@ def _stop(options: argparse.Namespace) -> int:
     found = sessions()
     chosen = chosen_runs(options.runs, found, is_all=options.all)
     if not chosen:
-        print("no run of yours goes on" if found else "nothing is running")
+        print("none of your runs is running" if found else "nothing is running")
     for session in chosen:
         session.interrupt()
     _await_end(chosen)
@@ -219,8 +219,8 @@ def add_report(report: argparse.ArgumentParser) -> None:
 def add_compare(compare: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     compare.description = (
-        "Print the figures of several runs side by side. What is no run is named and left out"
-        " (exit code 2)."
+        "Print the figures of several runs side by side. A folder that is not of a run is named"
+        " and left out (exit code 2)."
     )
     compare.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     compare.add_argument(
@@ -322,7 +322,7 @@ def _comparison(runs: list[PastRun], header: list[str], rows: list[list[str]]) -
 
 def _no_matplotlib(error: ModuleNotFoundError) -> EnvironmentFault:
     return EnvironmentFault(
-        f"figures need {error.name}, which this Python has not: pip install 'neuros[plot]'"
+        f"figures need {error.name}, which is not installed: pip install 'neuros[plot]'"
     )
 
 
@@ -340,8 +340,8 @@ def _write(folder: Path, files: dict[str, bytes]) -> None:
 def add_verify(verify: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     verify.description = (
-        "Say whether two runs carried the same packets, or where they parted first:"
-        " connection, packet, and, where both were recorded, field."
+        "Say whether two runs carried the same packets. If not, name the first difference:"
+        " connection, packet and, if both runs were recorded, field."
     )
     verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
@@ -385,7 +385,7 @@ def add_bag(bag: argparse.ArgumentParser) -> None:
     repair = actions.add_parser(
         "repair",
         help="complete the bag of a run that was killed",
-        description="Put the packets that had not reached the bag into it, and complete its files.",
+        description="Add the packets that had not reached the bag, and complete its files.",
     )
     repair.add_argument("run", metavar="RUN", help="the run folder")
     repair.set_defaults(command=_repair)

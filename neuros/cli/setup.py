@@ -28,26 +28,26 @@ exit codes:
 _DOCTOR_EPILOG = """\
 exit codes:
   0    nothing is wrong
-  4    something is: the lines that begin with PROBLEM say what, and what to do
+  4    something is wrong: lines that begin with PROBLEM say what, and what to do
 """
 
 
 def add_build(build: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     build.description = (
-        "Build the ROS packages with messages, services and actions of a workspace"
-        " that are not built yet, and those of NeuROS's own. Launching a project does it, too."
+        "Build the message packages of a workspace, and those of NeuROS, unless they are built."
+        " `neuros launch` does so, too."
     )
     build.epilog = (
-        "exit codes: 0 all are built, 2 no such package, 3 every mistake in a file is listed"
-        " with its line, 4 no compiler, or it fails"
+        "exit codes: 0 all are built, 2 there is no such package, 3 a file has mistakes (listed"
+        " with their lines), 4 there is no compiler, or it fails"
     )
     build.add_argument("packages", nargs="*", metavar="PACKAGE", help="these only (default: all)")
     build.add_argument(
         "-p",
         "--project",
         metavar="PROJECT",
-        help="whose workspace, a folder beside the project file (default: that of this folder)",
+        help="build the workspace beside this project's file (default: ./workspace)",
     )
     # For install.py: a machine without a compiler can do all the rest.
     build.add_argument("--if-compiler", action="store_true", help=argparse.SUPPRESS)
@@ -99,8 +99,8 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
         "names",
         nargs="*",
         metavar="NAME",
-        help="a container, an image of your own, or a project (a folder or file) for all that its"
-        f" nodes need (default: {' '.join(STANDARD)})",
+        help="a container, an image of your own, or a project (folder or file), for all containers"
+        f" of its nodes (default: {' '.join(STANDARD)})",
     )
     add_build_options(build)
     build.add_argument(
@@ -108,17 +108,19 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="a build argument of the Dockerfiles, as VARIANT=cuda of neuros_tensorflow",
+        help="a build argument of the Dockerfiles, such as VARIANT=cuda for neuros_tensorflow",
     )
     build.add_argument(
-        "--if-engine", action="store_true", help="where there is no engine, say so, and that is all"
+        "--if-engine",
+        action="store_true",
+        help="if there is no Docker engine, say so, build nothing, and end with exit code 0",
     )
     build.set_defaults(command=_build_images)
     show = actions.add_parser("list", aliases=["ls"], help="show NeuROS's images")
     add_format(show)
     show.set_defaults(command=_list_images)
     remove = actions.add_parser("remove", help="remove images that NeuROS has built")
-    remove.add_argument("names", nargs="*", metavar="NAME", help="of containers (default: all)")
+    remove.add_argument("names", nargs="*", metavar="NAME", help="containers (default: all)")
     remove.set_defaults(command=_remove_images)
 
 
@@ -133,7 +135,7 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
         help="begin the image of container NAME (default: neuros_python) from IMAGE",
     )
     add("--wheelhouse", metavar="DIR", help="take all Python packages from a folder of wheels")
-    add("--ca-bundle", metavar="FILE", help="certificates (PEM) that builds are to trust")
+    add("--ca-bundle", metavar="FILE", help="certificates (PEM) that builds trust")
     add("--pull", action="store_true", help="ask for the newest version of base images")
 
 
@@ -266,8 +268,8 @@ def _cache() -> Path:
 def add_doctor(doctor: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     doctor.description = (
-        "Check what runs need of this machine, and prove with packets between two"
-        " nodes that they can talk, on each back end that there is."
+        "Check that this machine has what runs need, then send packets between two nodes on each"
+        " back end of this machine, to prove that they arrive."
     )
     doctor.epilog = _DOCTOR_EPILOG
     doctor.add_argument(

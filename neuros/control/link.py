@@ -113,7 +113,9 @@ def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Mes
         content = json.loads(line)
         kind = content.pop("kind")
     except (ValueError, AttributeError, TypeError, KeyError, RecursionError):
-        raise ControlError(f"{peer} sent what is no control message: {_shown(line)}") from None
+        raise ControlError(
+            f"{peer} sent something that is not a control message: {_shown(line)}"
+        ) from None
     message = accepted.get(kind) if isinstance(kind, str) else None
     if message is None:
         raise ControlError(f"{peer} sent a control message of the unknown kind {_shown(kind)}")

@@ -112,7 +112,7 @@ class Script:
         if place != self._next:
             expected = names.get(self._next, "one that the plugin no longer has")
             raise ReplayParted(
-                f"start {self.started + 1} of a hook is of '{names[place]}', and was of"
+                f"start {self.started + 1} of a hook is of '{names[place]}', but was of"
                 f" '{expected}' in the run"
             )
         self.started += 1

@@ -114,7 +114,7 @@ def _resources_for(plan: SweepPlan, declared: Sequence[Mapping[str, float]]) -> 
     ):
         text = ", ".join(f"{name}={number:g}" for name, number in asked.items())
         raise EnvironmentFault(
-            f"executor dask: no worker has what a run of {plan.name} asks for ({text}): start one"
+            f"executor dask: no worker has what a run of {plan.name} needs ({text}): start one"
             f' with dask worker --resources "{text.replace(",", "")}", or ask for less (resources)'
         )
     return asked

@@ -167,7 +167,7 @@ def _install_uv(
         return find_uv(python, environ)
     if explain_machine(output):
         raise _fault(output, log, progress)
-    progress.step("there is no uv for this machine: pip installs, which takes longer")
+    progress.step("there is no uv for this machine: using pip, which takes longer")
     return None
 
 
@@ -193,13 +193,13 @@ def run_installs(
     """
     in_uv = uv_settings(_settings_of_pip(python, environ), environ) if uv else None
     if uv and in_uv is None:
-        progress.step("uv does not know all settings that pip has here: pip installs")
+        progress.step("uv does not know all settings that pip has here: using pip")
     elif uv and in_uv is not None:
         command = [str(uv), *_UV_INSTALL, "--python", str(python)]
         output = _run_each(command, calls, folder, log, progress, {**environ, **in_uv})
         if output is None or re.search(_DISK_IS_FULL, output):
             return output
-        progress.step(f"uv failed: pip tries (log: {log})")
+        progress.step(f"uv failed: trying pip (log: {log})")
     return _run_each([str(python), *PIP_INSTALL], calls, folder, log, progress, environ)
 
 

@@ -40,7 +40,7 @@ from neuros.errors import ControlError
 from neuros.launcher.outcome import Outcome, Output, Phase
 from neuros.ports import ControlListener
 
-STRANGER = "a program that has not said what it is"
+STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024

@@ -241,7 +241,7 @@ class Peers:
             self._next_remark_s = now_s + _FIRST_REMARK_S
         if self._missing and now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
-            yield "INFO", f"nodes elsewhere are still waited for: {self._names()}{self._hint}"
+            yield "INFO", f"still waiting for nodes elsewhere: {self._names()}{self._hint}"
 
     # ------------------------------------------------------------------ inside
 

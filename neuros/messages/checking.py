@@ -142,7 +142,7 @@ def package_name_mistake(name: str) -> str:
     if not is_valid_package_name(name):
         return f"found the name '{name}', expected {_A_PACKAGE}"
     if keyword.iskeyword(name):
-        return f"found the name '{name}', expected one that is no keyword of Python"
+        return f"found the name '{name}', expected one that is not a keyword of Python"
     if name in sys.stdlib_module_names:
         return f"found the name '{name}' of a module of Python, expected another"
     return ""
@@ -250,7 +250,7 @@ def _check_words(name: str, column: int) -> None:
         ("macro of C", _MACROS.fullmatch(name)),
     ):
         if is_taken:
-            raise _Wrong(f"the name '{name}'", f"one that is no {language}", column)
+            raise _Wrong(f"the name '{name}'", f"one that is not a {language}", column)
 
 
 def _parts(lines: list[str]) -> Iterator[dict[int, str]]:

@@ -328,4 +328,4 @@ def _plain(value: Any) -> Any:
     """A number or an array of NumPy as Python's own."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise TypeError(f"{type(value).__name__} is nothing that JSON knows")
+    raise TypeError(f"JSON cannot hold a {type(value).__name__}")

@@ -194,9 +194,9 @@ PARAMETERS: Mapping[str, str] = {
     "time": "biological_time",
 }
 """Of nodes, connections and the kernel; ``record_to`` takes ``"ascii"``, ``"memory"``, ...."""
-_SUBNETS = "today there are no subnets: what `Create` returns can be sliced and joined"
-_SLI = "today there is no SLI: the functions of `nest` take its place"
-_ALWAYS = "today it is recorded always: leave it out"
+_SUBNETS = "NEST 3 has no subnets: what `Create` returns can be sliced and joined"
+_SLI = "NEST 3 has no SLI: the functions of `nest` take its place"
+_ALWAYS = "NEST 3 always records it: leave it out"
 _GONE_FROM_NEST: Mapping[str, str] = {
     **dict.fromkeys(
         ("subnet", "BeginSubnet", "EndSubnet", "CurrentSubnet", "ChangeSubnet", "GetNetwork"),
@@ -204,12 +204,12 @@ _GONE_FROM_NEST: Mapping[str, str] = {
     ),
     **dict.fromkeys(("sli_run", "sli_func", "sli_push", "sli_pop", "sr", "sps", "spp"), _SLI),
     **dict.fromkeys(("withtime", "withgid"), _ALWAYS),
-    "topology": "today it is a part of `nest`: Create(..., positions=nest.spatial.grid(...))",
-    "hl_api": "today its functions are those of `nest`",
-    "kernel": "today its errors are `nest.NESTErrors`",
+    "topology": "NEST 3 has it in `nest`: Create(..., positions=nest.spatial.grid(...))",
+    "hl_api": "NEST 3 has its functions in `nest`",
+    "kernel": "NEST 3 has its errors in `nest.NESTErrors`",
 }
 _TODAY: Mapping[str, str] = {
-    **{old: f"today it is {new}" for old, new in {**MODELS, **FUNCTIONS, **PARAMETERS}.items()},
+    **{old: f"NEST 3 calls it {new}" for old, new in {**MODELS, **FUNCTIONS, **PARAMETERS}.items()},
     **_GONE_FROM_NEST,
 }
 

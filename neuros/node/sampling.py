@@ -273,7 +273,9 @@ def preview(packet: Any) -> Preview:
     width, height, step = packet.width, packet.height, packet.step or packet.width * size
     pixels = memoryview(packet.data).cast("B")
     if not (width and height) or step < width * size or len(pixels) < step * height:
-        raise ValueError(f"{len(pixels)} bytes are no image of {width} x {height}, {step} per row")
+        raise ValueError(
+            f"{len(pixels)} bytes are not an image of {width} x {height}, {step} per row"
+        )
     stride = max(1, -(-width // WIDTH), -(-height // HEIGHT))
     rows = tuple(
         bytes(pixels[y * step : y * step + width * size]) for y in range(0, height, stride)

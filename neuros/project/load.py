@@ -139,7 +139,7 @@ class _Builder:
             return str(value), False
         if value[:2] in ("##", "@@"):
             return value[1:], False
-        advice = f"write '{value[0]}{value}' if it is no path"
+        advice = f"write '{value[0]}{value}' if it is not a path"
         return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
 
     def _ports(self, node: Element, side: str) -> tuple[Port, ...]:

@@ -229,7 +229,7 @@ def _key(parent: Element, step: str, source: Source) -> str | int:
     """The key or index behind a step; a key need not exist yet. Raises :class:`SourceError`."""
     if isinstance(parent.value, dict):
         return step
-    text, hint = f"'{step}' leads nowhere: there is no object around it", ""
+    text, hint = f"'{step}' cannot be set: there is no object around it", ""
     if isinstance(parent.value, list):
         names = [item.string("name") or "" for item in parent.value]
         if step in names:
@@ -255,7 +255,7 @@ def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
         source = Source(f"--remap {text}", parsed.roots.project, text)
         old, sign, new = text.partition(":=")
         if not (sign and old and new):
-            problems.append(source.problem(0, "/remap", "is no rule", _REMAP_FORM))
+            problems.append(source.problem(0, "/remap", "is not a rule", _REMAP_FORM))
         elif old.rpartition(":")[2] in _SPECIAL_NAMES:
             hint = _SPECIAL_NAMES[old.rpartition(":")[2]]
             problems.append(source.problem(0, "/remap", f"'{old}' is not remapped", hint))

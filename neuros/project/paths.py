@@ -55,7 +55,7 @@ class Roots:
             elif path.is_dir() and not folder_allowed:
                 raise PathError(f"'{text}' is a folder, not a file")
             elif not folder_allowed and not path.is_file():
-                raise PathError(f"'{text}' is no ordinary file: a pipe, socket or device")
+                raise PathError(f"'{text}' is not an ordinary file: a pipe, socket or device")
             else:
                 return path
         if outside is not None:

@@ -157,7 +157,7 @@ def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise OSError("it is no ordinary file")
+            raise OSError("it is not an ordinary file")
         if most_bytes is not None and status.st_size > most_bytes:
             raise OSError(f"it has more than {most_bytes >> 20} MiB")
         return file.read()
@@ -313,4 +313,4 @@ def place_of(file: Path, pointer: str) -> tuple[int, int]:
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
+    raise ValueError(f"{name} is not a JSON number")

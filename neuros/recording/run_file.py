@@ -43,7 +43,7 @@ def read_run_file(folder: Path) -> dict[str, Any]:
         if any(folder.glob("*/node.json")):
             why = "its run goes on, or its launcher was killed"
         else:
-            why = "it is no folder that a run has left behind"
+            why = "it is not the folder of a run"
         raise UsageError(f"{folder} has no {RUN_FILE}: {why}") from error
     found = record.get("format")
     if found != FORMAT:

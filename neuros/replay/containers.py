@@ -40,8 +40,8 @@ def _back_end(run: PastRun) -> BackEnd:
 def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
     """The error for something that a node had where it ran and this machine lacks."""
     return EnvironmentFault(
-        f"replay: in {run.folder} '{name}' ran in {_back_end(run).place}, a replay is a process of"
-        f" this machine, and here it lacks something: {cause}"
+        f"replay: in {run.folder} '{name}' ran in {_back_end(run).place}; a replay runs as a"
+        f" process of this machine, which lacks something: {cause}"
     )
 
 

@@ -97,7 +97,7 @@ class Comparison:
                 continue
             if passed.sent > len(packets):
                 self.difference = (
-                    f"{topic}: packet {passed.sent} is sent in the replay, and was not in the run"
+                    f"{topic}: the replay sends packet {passed.sent}, which the run did not send"
                 )
             elif packets[passed.sent - 1].data != data:
                 self._compare(topic, type_name, passed.sent, packets[passed.sent - 1].data, data)
@@ -255,15 +255,15 @@ class ReplayedNode:
         """The event log is at its end."""
         if not is_whole(self._recorded.event_log):
             self.notes.append(
-                f"the run's list of what happened to the node ends after {self.starts} starts of"
-                " hooks (it was killed, or ran for very long): what it sent later is not compared"
+                f"the event log of the run ends after {self.starts} starts of hooks (the node was"
+                " killed, or ran for very long): what it sent later is not compared"
             )
         elif self._is_cut_off:
             return
         elif self._script.expects_start:
             self.difference = (
-                f"{self.starts} hooks have started, and more did in the run: a hook is not ready"
-                " where it was"
+                f"only {self.starts} hooks have started, and more did in the run: the next one is"
+                " not ready here"
             )
         else:
             self.comparison.find_missing()

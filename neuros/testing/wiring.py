@@ -20,7 +20,7 @@ def wire(text: str, discard_limit: int | None = None, queue_size: int = 1) -> Co
     """
     ends = [end.strip().split(".") for end in text.split("->")]
     if [len(end) for end in ends] != [2, 2] or not all(part for end in ends for part in end):
-        raise ValueError(f"{text!r} is no connection: write 'node.output -> node.input'")
+        raise ValueError(f"{text!r} is not a connection: write 'node.output -> node.input'")
     (source, output), (destination, input_name) = ends
     return Connection(source, output, destination, input_name, discard_limit, queue_size)
 
@@ -32,7 +32,7 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
         type_name = normalised(written)
         if type_name is None:
             raise ValueError(
-                f"'{name}': {written!r} is no message type: write it like 'std_msgs/msg/String'"
+                f"'{name}': {written!r} is not a message type: write it like 'std_msgs/msg/String'"
             )
         found.append(Port(name, type_name))
     return tuple(found)

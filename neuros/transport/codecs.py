@@ -36,7 +36,7 @@ class WrongBytes(ProtocolError):
 
     def __init__(self, kind: type, data: bytes, why: object) -> None:
         name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
-        super().__init__(f"{len(data)} bytes are no {name}: {why}")
+        super().__init__(f"{len(data)} bytes are not a {name}: {why}")
 
 
 class Encoder(Protocol):

@@ -354,10 +354,11 @@ class RosTransport:
             listed = self._ros_node.get_publishers_info_by_topic(topic)
             names = {each.node_name for each in listed}
             others = sorted(names - {connection.source_node, connection.destination_node})
+            seen = ", ".join(others) or "none that can be seen"
             self._ros_node.get_logger().warning(
-                f"{connection}: a message on {topic} is not from its node and is not taken; others"
-                f" that publish there: {', '.join(others) or 'none that can be seen'}. The run"
-                " counts them as foreign; --isolate keeps others out"
+                f"{connection}: a message on {topic} is not from its node: it is dropped, and"
+                f" counted as foreign; others that publish there: {seen}. --isolate keeps others"
+                " out"
             )
         self._unnamed.clear()
 

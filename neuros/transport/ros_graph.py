@@ -270,8 +270,8 @@ class QosCheck:
 
     def _warn_of_unknown(self, side: str, policy: str) -> None:
         self._ros_node.get_logger().warning(
-            f"{side} '{self._port.name}': somebody on {self._topic} cannot be connected: the"
-            f" {policy} that one side offers is not what the other asks for"
+            f"{side} '{self._port.name}': another node on {self._topic} cannot be connected: its"
+            f" {policy} does not fit"
         )
 
     def _warn(self, side: str, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
@@ -283,11 +283,9 @@ class QosCheck:
         offered = " and ".join(each for each, _ in lacking)
         asked = " and ".join(each for _, each in lacking)
         if side == "input":
-            text = f"{name} offers {offered}, and this input asks for {asked}: it hears nothing"
-            text += " of that"
+            text = f"{name} offers {offered}, but this input requires {asked}: it gets no packets"
         else:
-            text = f"{name} asks for {asked}, and this output offers {offered}: it is not heard"
-            text += " there"
+            text = f"{name} requires {asked}, but this output offers {offered}: it gets no packets"
         self._ros_node.get_logger().warning(
             f"{side} '{self._port.name}': on {self._topic} {text}; {_ADVICE}"
         )

@@ -57,8 +57,8 @@ class _DashboardView:
         except (OSError, OverflowError) as error:
             self._listening.close()
             raise UsageError(
-                f"--dashboard-port {port}: cannot be listened on ({error}); name another one, or"
-                " leave it out for any free one"
+                f"--dashboard-port {port}: this port cannot be used ({error}); name another one, or"
+                " leave the option out for any free one"
             ) from error
         self._listening.listen(64)
         # With the token that lets the reader in.

@@ -417,7 +417,9 @@ def _pixels(image: Any) -> Any:
     data = np.frombuffer(image.data, np.uint8)
     step = image.step or width * channels
     if not (width and height) or step < width * channels or len(data) < step * height:
-        raise ValueError(f"{len(data)} bytes are no image of {width} x {height}, {step} per row")
+        raise ValueError(
+            f"{len(data)} bytes are not an image of {width} x {height}, {step} per row"
+        )
     rows = data[: step * height].reshape(height, step)
     if encoding == "mono8":
         return rows[:, :width]

@@ -50,7 +50,7 @@ def test_packets_that_were_lost_or_discarded_count_together() -> None:
     budgets = Budgets(lost_packets={CONNECTION: 5})
     assert broken_budgets(record(2, 3), budgets) == []
     assert broken_budgets(record(2, 4), budgets) == [
-        f"{CONNECTION} lost 6 packets (2 on their way, 4 discarded), allowed are 5"
+        f"{CONNECTION} lost 6 packets (2 on their way, 4 discarded); the limit is 5"
     ]
 
 
@@ -58,7 +58,7 @@ def test_the_real_time_factor_must_be_reached() -> None:
     budgets = Budgets(real_time_factor=0.5)
     assert broken_budgets(record(factor=0.5), budgets) == []
     assert broken_budgets(record(factor=0.421), budgets) == [
-        "the real-time factor was 0.421, and must be at least 0.5"
+        "the real-time factor was 0.421, but must be at least 0.5"
     ]
 
 
@@ -73,17 +73,17 @@ def test_the_worst_tick_of_any_hook_counts() -> None:
     budgets = Budgets(tick_error_ms=5)
     assert broken_budgets(record(worst_ms=5.0), budgets) == []
     assert broken_budgets(record(worst_ms=7.25), budgets) == [
-        "a tick of 'step' of robot was off its period by 7.25 ms, allowed are 5 ms"
+        "a tick of 'step' of robot was off its period by 7.25 ms; the limit is 5 ms"
     ]
 
 
 def test_a_figure_that_is_not_known_breaks_its_budget() -> None:
     budgets = Budgets({CONNECTION: 7}, real_time_factor=0.5, tick_error_ms=5)
     assert broken_budgets(record(None, None, worst_ms=1.0, robot=KILLED), budgets) == [
-        f"how many packets {CONNECTION} lost is not known, allowed are 7",
-        "the real-time factor must be at least 0.5, and is not known: robot had not reported the"
-        " last",
-        "how far ticks of robot were off their period is not known, allowed are 5 ms",
+        f"it is not known how many packets {CONNECTION} lost; the limit is 7",
+        "the real-time factor must be at least 0.5, but is not known: the last report of robot is"
+        " missing",
+        "it is not known how far ticks of robot were off their period; the limit is 5 ms",
     ]
 
 
@@ -120,9 +120,12 @@ def test_a_packet_lost_on_a_lossless_connection_is_named() -> None:
 @pytest.mark.parametrize(
     ("sent", "received", "what"),
     [
-        (None, 3, "how many packets were sent is not known"),
-        (10, None, "how many of 10 packets arrived is not known"),
-        (10, 9, "how many packets it lost is not known: a node had not reported its last"),
+        (None, 3, "the number of packets that were sent is not known"),
+        (10, None, "it is not known how many of 10 packets arrived"),
+        (
+            *(10, 9),
+            "the number of packets that it lost is not known: the last report of a node is missing",
+        ),
     ],
 )
 def test_so_is_one_of_which_that_is_not_known(

@@ -73,7 +73,7 @@ def test_a_damaged_record_is_named_with_the_place(
 def test_a_record_is_a_file_and_no_pipe(folder: Path) -> None:
     (folder / "run.json").unlink()
     os.mkfifo(folder / "run.json")
-    with pytest.raises(EnvironmentFault, match="it is no ordinary file"):
+    with pytest.raises(EnvironmentFault, match="it is not an ordinary file"):
         open_run(folder)
 
 

@@ -38,7 +38,7 @@ def test_it_is_json(tmp_path: Path) -> None:
 
 
 def test_what_is_no_record_is_refused_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no run\.json: it is no folder that a run has left"):
+    with pytest.raises(UsageError, match=r"no run\.json: it is not the folder of a run"):
         read_run_file(tmp_path)
     (tmp_path / "a").mkdir()
     (tmp_path / "a/node.json").touch()

@@ -264,7 +264,7 @@ def test_errors_are_exceptions_of_neuros(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "dice/project.json").read_text())
     del content["nodes"][0]["environment"]
     (tmp_path / "dice/project.json").write_text(json.dumps(content))
-    with pytest.raises(UsageError, match="no node of dice has a variable with SEED in its name"):
+    with pytest.raises(UsageError, match="no node of dice has an environment variable with SEED"):
         made.run(seed=1)
 
 

@@ -110,7 +110,7 @@ def test_what_is_too_much_to_be_shown_is_left_out_and_said_so(screen: Screen) ->
     shown = screen.after("snn", b"first\n" + line * 100_000 + b"last\n").splitlines()
     assert (shown[0], shown[-1]) == ("[snn] first", "[snn] last")
     (notice,) = [each for each in shown if "not shown" in each]
-    assert notice == f"[snn] (10 MB are not shown here: {screen.files['snn']} has all)"
+    assert notice == f"[snn] (10 MB are not shown here; all of it is in {screen.files['snn']})"
     assert {*shown} == {"[snn] first", f"[snn] {'x' * 99}", notice, "[snn] last"}
 
 

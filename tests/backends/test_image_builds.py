@@ -75,7 +75,7 @@ class TestBuildLog:
                 "docker.io/library/nest:9: pull access denied, repository does not exist or may",
                 "there is no image docker.io/library/nest:9 to begin from",
             ),
-            ("dockerfile parse error line 2: Unknown flag: link", "uses the option --link"),
+            ("dockerfile parse error line 2: Unknown flag: link", "too old for the option --link"),
             ("E: Could not open lock file - open (13: Permission denied)", "put USER 0 above it"),
             ("/bin/sh: 1: python3: not found", "its base has no Python"),
             ("ensurepip is not available", "add the package python3-venv"),

@@ -141,7 +141,7 @@ def test_a_run_that_is_no_longer_there_is_named(
     ("more", "reason"),
     [
         (["--only", "nobody"], "--only nobody: there is no such part (there are good, bad, "),
-        (["--from", "somewhere"], "--from runs nothing: no other option goes with it"),
+        (["--from", "somewhere"], "--from runs nothing: leave out all other options"),
     ],
 )
 def test_wrong_usage_is_one_sentence(

@@ -95,7 +95,7 @@ def test_help_documents_the_exit_codes(
         ([".", "-n", "c"], "-n c: no such node; the project has a, b"),
         ([".", "--duration", "soon"], "--duration soon: give seconds"),
         ([".", "--duration", "0"], "--duration 0: give seconds"),
-        ([".", "-d", "300"], "-d/--domain-id: '300' is no ROS domain id"),
+        ([".", "-d", "300"], "-d/--domain-id: '300' is not a ROS domain id"),
         ([".", "--backend", "in-process", "-n", "a"], "-n leaves out one end of a.o -> b.x"),
         ([".", "--peers", "10.0.0.7,2.3"], "--peers 10.0.0.7,2.3: '2.3' is neither an IPv4"),
         ([".", "--peers", "a b,"], "--peers a b,: 'a b', '' is neither an IPv4"),

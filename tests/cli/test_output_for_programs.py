@@ -65,7 +65,7 @@ def test_ps_filters_as_docker_does(said: Any, capsys: pytest.CaptureFixture[str]
     assert main(["ps", "-q", "-f", "run=aaaa"]) == 0
     assert capsys.readouterr().out == "aaaaaaaa\n"
     assert main(["ps", "-f", "state=running"]) == 0
-    assert capsys.readouterr().out == "no running node is like that\n"
+    assert capsys.readouterr().out == "no running node matches\n"
     for wrong in ("colour=red", "run", "=x"):
         assert main(["ps", "-f", wrong]) == 2
         assert f"--filter {wrong}: it must be KEY=VALUE" in capsys.readouterr().err

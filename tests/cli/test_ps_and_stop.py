@@ -96,5 +96,5 @@ def test_where_others_have_runs_only_there_is_nothing_of_ones_own_to_stop(
 ) -> None:
     del machine.there[0]
     assert main(["stop"]) == 0
-    assert capsys.readouterr().out == "no run of yours goes on\n"
+    assert capsys.readouterr().out == "none of your runs is running\n"
     assert machine.stopped == []

@@ -78,7 +78,7 @@ def test_a_run_without_anything_is_no_failure(
     (tmp_path / "project.json").write_text('{"nodes": [{"name": "a"}], "connections": []}')
     assert main(["report", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("What limits this run cannot be told")
+    assert out.startswith("The bottleneck is not known")
     assert "missing: run.json" in out
 
 
@@ -87,7 +87,7 @@ def test_what_is_no_run_is_a_wrong_usage(
 ) -> None:
     assert main(["report", str(tmp_path / "nowhere")]) == 2
     assert main(["compare", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("no folder that a run has left behind") == 2
+    assert capsys.readouterr().err.count("not the folder of a run") == 2
 
 
 def test_a_page_that_cannot_be_written_is_a_fault_of_the_machine(

@@ -104,10 +104,19 @@ class TestReference:
 
     def test_the_navigation_has_the_pages_of_each_table_of_the_index(self) -> None:
         source = [(DOCS / "index.md").read_text("utf-8")]
+        table = source[0]
         contents.add_toctrees(None, "docs/index", source)
-        assert ":caption: Tutorial\n\n/docs/tutorial\n/examples/README\n```" in source[0]
         for page in DOCS.glob("*.md"):
-            assert page.stem == "index" or f"\n/docs/{page.stem}\n" in source[0]
+            if page.stem != "index":
+                title = re.search(rf"^\| \[(.+)\]\({page.name}\)", table, re.MULTILINE)
+                assert title, page.name
+                assert f"\n{title[1]} </docs/{page.stem}>\n" in source[0]
+        assert ":caption: Tutorial\n\nFrom zero" in source[0]
+
+    def test_the_front_page_does_not_say_how_the_site_is_built(self) -> None:
+        page = (DOCS / "index.md").read_text("utf-8")
+        assert "--docs" not in page
+        assert "--docs" in (ROOT / "CONTRIBUTING.md").read_text("utf-8")
 
 
 def test_options_are_kept_whole_and_long_paths_may_be_broken() -> None:

@@ -171,7 +171,7 @@ def test_a_plugin_whose_hooks_have_changed_is_told() -> None:
     run, event_log = some_run()
     begin, loop, *others = hooks()
     again = Again(run, event_log, [begin, function("other", "y"), loop, *others])
-    with pytest.raises(ReplayParted, match="start 2 of a hook is of 'loop', and was of 'other'"):
+    with pytest.raises(ReplayParted, match="start 2 of a hook is of 'loop', but was of 'other'"):
         again.play()
 
 
@@ -181,7 +181,7 @@ def test_a_changed_plugin_that_sends_less_is_told_where_it_parts() -> None:
     specs = hooks()
     specs[1] = function("loop", Optional("x"), Optional("p"))
     again = Again(run, event_log, specs)
-    with pytest.raises(ReplayParted, match="is of 'loop', and was of 'joined'"):
+    with pytest.raises(ReplayParted, match="is of 'loop', but was of 'joined'"):
         again.play()
     assert not again.bench.sent
     assert again.bench.ran == run.bench.ran[: len(again.bench.ran)]

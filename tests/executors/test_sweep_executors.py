@@ -66,7 +66,7 @@ def test_dask_is_asked_for_what_its_workers_declare(tmp_path: Path) -> None:
     wanted = plan(tmp_path, cpus=3, gpus=1)
     assert _resources_for(wanted, []) == {}
     assert _resources_for(wanted, [{"GPU": 2}, {}]) == {"GPU": 1.0}
-    with pytest.raises(EnvironmentFault, match="no worker has what a run of dice asks for"):
+    with pytest.raises(EnvironmentFault, match="no worker has what a run of dice needs"):
         _resources_for(wanted, [{"CPU": 2}])
 
 

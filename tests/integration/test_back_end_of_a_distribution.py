@@ -95,7 +95,7 @@ def test_a_name_that_is_none_is_refused_with_all_that_there_are() -> None:
     [
         ("no_such_module:BACK_END", "cannot be loaded: ModuleNotFoundError"),
         ("neuros_nice:NO_SUCH_NAME", "cannot be loaded: AttributeError"),
-        ("neuros_nice:Nice", "is no BackEnd, but <class 'neuros_nice.Nice'>"),
+        ("neuros_nice:Nice", "is not a BackEnd, but <class 'neuros_nice.Nice'>"),
         ("neuros_nice:BACK_END", "calls itself 'nice'"),
     ],
 )

@@ -146,7 +146,7 @@ def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -
         with start(WATCHED, "--dashboard-port", taken, cwd=tmp_path) as second:
             refused = second.finish()
         assert refused.exit_code == 2
-        assert f"--dashboard-port {taken}: cannot be listened on" in refused.output
+        assert f"--dashboard-port {taken}: this port cannot be used" in refused.output
 
         assert visitor.post("/do/stop", Origin=f"http://{netloc}") == 204
         assert running.finish().exit_code == 0

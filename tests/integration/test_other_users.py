@@ -147,7 +147,7 @@ def test_where_no_network_can_be_had_it_is_said(everybodys: Path) -> None:
     with start(CLOCK, "--isolate", cwd=everybodys, through=("setpriv", *no_namespaces)) as running:
         run = running.finish()
     assert run.exit_code == 4
-    assert "--isolate: no network of its own here (Operation not permitted)" in run.output
+    assert "--isolate: the run gets no network here (Operation not permitted)" in run.output
     assert "Traceback" not in run.output
 
 

@@ -20,8 +20,8 @@ LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 LIMIT_S = 60.0
 MATCHED = ("fast heard: 1", "sure heard: 1", "latched heard: 1")
 UNMATCHED = (
-    "input 'strict': on /strict /program offers best_effort, and this input asks for reliable",
-    "output 'loose': on /loose /program asks for reliable, and this output offers best_effort",
+    "input 'strict': on /strict /program offers best_effort, but this input requires reliable",
+    "output 'loose': on /loose /program requires reliable, but this output offers best_effort",
 )
 
 
@@ -74,4 +74,4 @@ def check_the_end(running: Running) -> None:
     finished = running.finish()
     assert finished.exit_code == 130, finished.output
     assert "strict heard" not in finished.output
-    assert finished.output.count("asks for reliable") == 2, "each is said once"
+    assert finished.output.count("requires reliable") == 2, "each is said once"

@@ -74,7 +74,7 @@ def test_a_node_that_is_killed_ends_all_and_its_own_launcher_says_how(parts: Par
 
 def test_a_part_that_is_alone_is_ended_by_ctrl_c_as_ever(parts: Parts) -> None:
     with parts.start("source") as source:
-        source.wait_for("nodes elsewhere are still waited for: sink (", FOUND_S)
+        source.wait_for("still waiting for nodes elsewhere: sink (", FOUND_S)
         source.signal(signal.SIGINT)
         finished = source.finish()
     assert finished.exit_code == 130

@@ -65,7 +65,7 @@ def test_every_packet_of_every_connection_is_in_the_bag(pipeline: Finished) -> N
 def test_the_end_of_a_run_says_what_was_recorded_of_lossy_connections(pipeline: Finished) -> None:
     count = sum(topic["recorded"] for topic in recorded(pipeline).values())
     assert f"recorded {count} packets on 7 topics" in pipeline.output
-    assert "200 of 200 packets on connections without discard limit" in pipeline.output
+    assert "recorded 200 of 200 packets of connections that may lose any number" in pipeline.output
 
 
 def test_rosbags_reads_it_in_the_order_of_time(pipeline: Finished) -> None:

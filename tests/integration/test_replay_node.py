@@ -63,7 +63,7 @@ def test_a_plugin_that_fails_now_is_different(own: Recorded) -> None:
     (own.project / "mixer.py").write_text(MIXER.replace("seen[0] += ", "seen[1] += "))
     done = replay(own.run, "mixer")
     assert done.returncode == 1
-    assert "different: it failed, and did not in the run: " in done.stdout
+    assert "different: it failed, but did not in the run: " in done.stdout
     assert "IndexError: list index out of range" in done.stdout
 
 

@@ -109,7 +109,7 @@ def test_another_project_is_told_by_its_first_packet_and_the_field(
     (changed.run_folder / "recording.json").write_text("{")
     _code, text = verify(reference, changed, capsys)
     assert "recording.json is damaged" in text
-    assert f"{first} (which field, only --record can tell)" in text
+    assert f"{first} (to see in which field, run both with --record)" in text
 
 
 def test_in_process_without_digests_there_is_nothing_to_compare(

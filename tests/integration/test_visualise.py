@@ -112,7 +112,7 @@ def test_ros_images_are_shown_in_their_colours() -> None:
     with pytest.raises(ValueError, match="encoding 32FC1 cannot be drawn"):
         figure.plot("eye", SimpleNamespace(encoding="32FC1"))
     message.height = 0
-    with pytest.raises(ValueError, match="48 bytes are no image of 4 x 0, 12 per row"):
+    with pytest.raises(ValueError, match="48 bytes are not an image of 4 x 0, 12 per row"):
         figure.plot("eye", message)
     with pytest.raises(ValueError, match="'ear' was not added to the figure; there are eye"):
         figure.plot("ear", message)

@@ -79,7 +79,7 @@ def said_last(launcher: Launcher) -> PeerState:
 def test_neighbours_that_are_missing_are_named_after_five_seconds_and_then_every_ten(
     launcher: Launcher,
 ) -> None:
-    waits = "nodes elsewhere are still waited for: b (hint)"
+    waits = "still waiting for nodes elsewhere: b (hint)"
     heard = {now_s: texts for now_s in range(20) if (texts := launcher.remarks(float(now_s)))}
     assert heard == {5: [waits], 15: [waits]}, "c is no neighbour of a"
 

@@ -78,9 +78,7 @@ def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
     node.send(Hello(("a", "b")))
     node.socket.sendall(b'{"kind": "first_hook"}\n')
     (link, stranger), _, (_, known) = channels.receive()
-    assert str(stranger).startswith(
-        "a program that has not said what it is sent what is no control"
-    )
+    assert str(stranger).startswith("an unknown program sent something that is not a control")
     assert str(known) == (
         "the process of a and b sent a wrong control message 'first_hook': field node is missing"
     )

@@ -212,8 +212,8 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
     assert outcome.exit_code == 0
     (text,) = [text for text in run.output.said if text.startswith("control channel")]
     assert text == (
-        "control channel: hung up: a program that has not said what it is sent what is no control"
-        " message: b'GET / HTTP/1.1'"
+        "control channel: hung up: an unknown program sent something that is not a control message:"
+        " b'GET / HTTP/1.1'"
     )
 
 

@@ -225,7 +225,7 @@ class TestMistakes:
         [
             ("std_msgs", " of a package of ROS"),
             ("random", " of a module of Python"),
-            ("import", ", expected one that is no keyword"),
+            ("import", ", expected one that is not a keyword"),
             ("rover-msgs", ", expected a letter, then letters"),
         ],
     )

@@ -70,36 +70,46 @@ class TestTable:
     [
         (
             'nest.Create("spike_detector")',
-            "spike_detector is of NEST 2: today it is spike_recorder",
+            "spike_detector is of NEST 2: NEST 3 calls it spike_recorder",
         ),
-        ('nest.Create("iaf_neuron", 10)', "iaf_neuron is of NEST 2: today it is iaf_psc_alpha"),
-        ('nest.GetDefaults("iaf_neuron")', "iaf_neuron is of NEST 2: today it is iaf_psc_alpha"),
+        ('nest.Create("iaf_neuron", 10)', "iaf_neuron is of NEST 2: NEST 3 calls it iaf_psc_alpha"),
+        (
+            'nest.GetDefaults("iaf_neuron")',
+            "iaf_neuron is of NEST 2: NEST 3 calls it iaf_psc_alpha",
+        ),
         (
             'nest.Connect(nodes, nodes, "all_to_all", "stdp_nn_pre-centered_synapse")',
-            "stdp_nn_pre-centered_synapse is of NEST 2: today it is stdp_nn_pre_centered_synapse",
+            "stdp_nn_pre-centered_synapse is of NEST 2: NEST 3 calls it"
+            " stdp_nn_pre_centered_synapse",
         ),
         (
             'nest.Connect(nodes, nodes, "all_to_all", {"model": "static_synapse"})',
-            "model is of NEST 2: today it is synapse_model",
+            "model is of NEST 2: NEST 3 calls it synapse_model",
         ),
         (
             'nest.Connect(nodes, nodes, model="static_synapse")',
-            "model is of NEST 2: today it is synapse_model",
+            "model is of NEST 2: NEST 3 calls it synapse_model",
         ),
-        ("nest.ResetNetwork()", "ResetNetwork is of NEST 2: today it is ResetKernel"),
-        ("from nest import PrintNetwork", "PrintNetwork is of NEST 2: today it is PrintNodes"),
+        ("nest.ResetNetwork()", "ResetNetwork is of NEST 2: NEST 3 calls it ResetKernel"),
+        ("from nest import PrintNetwork", "PrintNetwork is of NEST 2: NEST 3 calls it PrintNodes"),
         (
             "nest.BeginSubnet()",
-            "BeginSubnet is of NEST 2: today there are no subnets: what `Create` returns",
+            "BeginSubnet is of NEST 2: NEST 3 has no subnets: what `Create` returns",
         ),
-        ('nest.sli_run("ResetKernel")', "sli_run is of NEST 2: today there is no SLI"),
-        ("import nest.topology as topology", "topology is of NEST 2: today it is a part of `nest`"),
-        ("nest.SetKernelStatus({'grng_seed': 12})", "grng_seed is of NEST 2: today it is rng_seed"),
-        ("nest.GetKernelStatus('time')", "time is of NEST 2: today it is biological_time"),
+        ('nest.sli_run("ResetKernel")', "sli_run is of NEST 2: NEST 3 has no SLI"),
+        (
+            "import nest.topology as topology",
+            "topology is of NEST 2: NEST 3 has it in `nest`",
+        ),
+        (
+            "nest.SetKernelStatus({'grng_seed': 12})",
+            "grng_seed is of NEST 2: NEST 3 calls it rng_seed",
+        ),
+        ("nest.GetKernelStatus('time')", "time is of NEST 2: NEST 3 calls it biological_time"),
         (
             'recorder.set({"to_file": True, "withtime": True})',
-            "to_file is of NEST 2: today it is record_to; "
-            "withtime is of NEST 2: today it is recorded always: leave it out",
+            "to_file is of NEST 2: NEST 3 calls it record_to; "
+            "withtime is of NEST 2: NEST 3 always records it: leave it out",
         ),
     ],
 )
@@ -120,7 +130,7 @@ def test_a_list_where_nest_3_takes_nodes_is_said(function: str, tmp_path: Path) 
 def test_a_plugin_that_cannot_be_imported_is_told_the_same(tmp_path: Path) -> None:
     (tmp_path / "brain.py").write_text("import nest\nnest.CreateLayer({})\n", "utf-8")
     with (
-        pytest.raises(PluginError, match=r"\(CreateLayer is of NEST 2: today it is Create\)"),
+        pytest.raises(PluginError, match=r"\(CreateLayer is of NEST 2: NEST 3 calls it Create\)"),
         PluginHarness(tmp_path / "brain.py") as harness,
     ):
         harness.run()

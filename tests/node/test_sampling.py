@@ -102,7 +102,7 @@ def test_an_image_without_pixels_is_told(width: int, height: int) -> None:
     sampler = Sampler()
     sampler.ask({"camera": {"image": True}})
     sampler.note("camera", Image(width=width, height=height, step=4 * width, encoding="rgba8"))
-    assert f"are no image of {width} x {height}" in sampler.ask({})["camera"]["fault"]
+    assert f"are not an image of {width} x {height}" in sampler.ask({})["camera"]["fault"]
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_they_apply_in_their_order(file: Path) -> None:
         ("nodes.robot.plugin", "1:1: /: is not of the form (nodes.NAME.KEY=VALUE)"),
         ("connections.robot.imu.snn.imu=1",
          "1:1: /: is not of the form (connections.SRC.OUT.DST.IN.KEY=VALUE)"),
-        ("nodes.robot.name.first=1", "1:1: /: 'first' leads nowhere: there is no object around it"),
+        ("nodes.robot.name.first=1", "1:1: /: 'first' cannot be set: there is no object around it"),
         ("nodes.robot.outputs.odom.type=x", "1:1: /: there is no 'odom' in /outputs"),
         ("budgets=1",
          "1:1: /: is not of the form"

@@ -59,7 +59,7 @@ def test_bytes_that_break_off_are_no_message(size: int) -> None:
     data = serialize_message(Image(data=array("B", range(100))))[:size]
     with pytest.raises(Exception, match="deserialize"):
         deserialize_message(data, Image)
-    with pytest.raises(WrongBytes, match=rf"^{size} bytes are no sensor_msgs/Image: "):
+    with pytest.raises(WrongBytes, match=rf"^{size} bytes are not a sensor_msgs/Image: "):
         message_codec(Image).decode(data)
 
 

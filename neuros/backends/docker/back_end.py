@@ -129,8 +129,8 @@ def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[N
     return [
         (
             "WARN",
-            f"resources of {', '.join(asking)}: this Docker engine has no control groups for them"
-            " (docker info), so they do not hold",
+            f"resources of {', '.join(asking)} have no effect: this Docker engine has no control"
+            " groups for them (docker info)",
         )
     ]
 
@@ -140,7 +140,7 @@ def _without_display(nodes: Sequence[Node], environ: Mapping[str, str]) -> Seque
     asking = [node.name for node in nodes if node.access.display]
     if not asking or environ.get("DISPLAY"):
         return ()
-    return [("WARN", f"{', '.join(asking)} asks for a display, and DISPLAY is not set: no windows")]
+    return [("WARN", f"no windows of {', '.join(asking)}: DISPLAY is not set")]
 
 
 def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:

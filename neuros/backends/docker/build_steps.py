@@ -61,8 +61,8 @@ _CAUSES = (
     ),
     (
         r"dockerfile parse error.*unknown flag: (?P<what>[\w-]+)",
-        "its Dockerfile uses the option --{what}, which this engine is too old for: install a newer"
-        " one, or write the step without",
+        "this engine is too old for the option --{what} in its Dockerfile: install a newer engine,"
+        " or remove the option",
     ),
     (
         r"Get \"?https?://(?P<what>[^/\"]+)|lookup (?P<also>\S+).* no such host",
@@ -181,7 +181,7 @@ class BuildSteps:
         python = python_in(self._engine, made, self._name)
         if not python.has_rclpy:
             raise EnvironmentFault(
-                f"image '{self._name}': rclpy was installed and does not load: run"
+                f"image '{self._name}': rclpy was installed, but does not load; to see why, run"
                 f" docker run --rm --entrypoint {python.path} {made[7:19]} -c 'import rclpy'"
             )
         return made, python
@@ -213,7 +213,7 @@ def pulled(engine: DockerClient, name: str, *, newest: bool) -> Any:
         remedy = "docker load it, or name one that the engine has with --base-image"
         with contextlib.suppress(APIError):
             engine.images.get(name)
-            remedy = "the one that the engine has is taken without --pull"
+            remedy = "leave out --pull to use the one that the engine has"
         raise EnvironmentFault(
             f"image '{name}' cannot be pulled ({error.explanation or error}): {remedy}"
         ) from error

@@ -106,7 +106,7 @@ class ImageBuilder:
                 return
             labels = {CONTAINER: name, **labels_of_python(python)}
             steps.finish(made, [added_tag(image)], labels)
-            self._report(f"{name}: what nodes need was added, as {added_tag(image)}", started_s)
+            self._report(f"{name}: built {added_tag(image)}, with what nodes need", started_s)
 
     def _steps(self, name: str) -> BuildSteps:
         log = self._wishes.logs / f"{name.replace('/', '_')}.log"
@@ -209,8 +209,8 @@ def _require_use(bases: Mapping[str, str], recipes: Iterable[Recipe]) -> None:
         if recipe is None:
             names = ", ".join(sorted(by_name)) or "none"
             raise UsageError(
-                f"--base-image {name}={base}: no container '{name}' is built here; those that are:"
-                f" {names}"
+                f"--base-image {name}={base}: no container '{name}' is built here (there are:"
+                f" {names})"
             )
         if not recipe.takes(base):
             raise UsageError(

@@ -45,16 +45,16 @@ def require_buildkit(
     begin = f"image '{image}': line {step.first} of its Dockerfile ({what})"
     if Abilities.of(engine.info()).is_rootless or not _is_here(engine):
         raise EnvironmentFault(
-            f"{begin} takes BuildKit, which fetches files from this machine, and cannot from a"
-            f" rootless engine or one elsewhere: write it without, {_BY_HAND}"
+            f"{begin} needs BuildKit, which cannot fetch files of this machine for a rootless"
+            f" engine or one on another machine: write the line without it, {_BY_HAND}"
         )
     version = str(engine.version()["Version"])
     numbers = tuple(map(int, re.findall(r"\d+", version)[:2]))
     if step.heredocs and numbers < _HEREDOCS_SINCE and not has_syntax_line(dockerfile):
         raise EnvironmentFault(
-            f"{begin} takes Docker Engine {_HEREDOCS_SINCE[0]} or newer, and this is {version}:"
-            " write its lines as one RUN, with && between them, or begin the Dockerfile with"
-            " '# syntax=docker/dockerfile:1', which a registry has"
+            f"{begin} needs Docker Engine {_HEREDOCS_SINCE[0]} or newer, and this is {version}:"
+            " write its lines as one RUN, with && between them, or, if the engine can reach a"
+            " registry, begin the Dockerfile with '# syntax=docker/dockerfile:1'"
         )
 
 

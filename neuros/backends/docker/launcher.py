@@ -49,7 +49,7 @@ from neuros.project.resources import memory_text
 _MOST_AT_ONCE = 16
 _OUT_OF_MEMORY = 128 + signal.SIGKILL
 _NOT_EXECUTED = (125, 126, 127)
-_STOPPED = "the Docker engine stopped it, as it does for `docker stop` and when it ends itself"
+_STOPPED = "the Docker engine stopped it: by `docker stop`, or because the engine itself ended"
 # The engine removes a container as soon as it has ended. If it cannot, its node has ended anyway.
 _REMOVAL_S = 2.0
 

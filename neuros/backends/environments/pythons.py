@@ -515,7 +515,7 @@ def why_no_files(error: OSError, cache: Path) -> str:
 
 def _there_is(versions: Sequence[str]) -> str:
     if list(versions) == ["none"]:
-        return "pip finds none of that name"
+        return "pip finds no package of that name"
     more = "..., " if len(versions) > _FEW else ""
     return f"there is {more}{', '.join(versions[-_FEW:])}"
 

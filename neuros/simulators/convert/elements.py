@@ -361,9 +361,9 @@ def parse(file: Path, report: Report) -> Element | Problem:
         line, column, text = builder.parser.CurrentLineNumber, 1, str(error)
     except expat.ExpatError as error:
         line, column = error.lineno, error.offset + 1
-        text = f"this is no XML: {expat.ErrorString(error.code)}"
+        text = f"this is not XML: {expat.ErrorString(error.code)}"
     except (ValueError, LookupError) as error:  # LookupError: of its encoding
-        text = f"this is no XML: {error}"
+        text = f"this is not XML: {error}"
     else:
         assert builder.root is not None, "expat reports an empty document itself"
         return builder.root

@@ -73,7 +73,7 @@ class Finder:
         """The file behind ``uri``; a folder is not found."""
         found = self.find(uri, here)
         if not found.is_file():
-            raise NotFound(f"'{uri}' is no file")
+            raise NotFound(f"'{uri}' is not a file")
         return found
 
     def _by_name(self, rest: str, here: Path, scheme: str) -> Iterator[Path]:

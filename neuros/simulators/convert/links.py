@@ -290,7 +290,7 @@ def add_joint_sensors(building: Building, link: Link, joint: Joint, *, is_turned
             end = ends[frame]
             place = Pose(place.position, np.eye(3) if end is None else end.pose.rotation)
         elif frame != "sensor":
-            settings.problem(f"'{frame}' is none of child, parent and sensor")
+            settings.problem(f"'{frame}' is not child, parent or sensor")
         # MuJoCo measures the force on the body that hangs; SDF, unless told otherwise, what the
         # child does to the parent.
         if (settings.text_of("measure_direction") == "parent_to_child") == is_turned:

@@ -173,7 +173,7 @@ class Dashboard:
             asked = await request.json()
             name, wanted = str(asked["page"]), wanted_of(asked["wanted"])
         except _NOT_UNDERSTOOD:
-            return JSONResponse({"error": "this is no question of a page"}, 400)
+            return JSONResponse({"error": "this is not a request of the dashboard's page"}, 400)
         is_there = self._pages.want(name, wanted)
         return Response(status_code=204 if is_there else 410)
 

@@ -232,18 +232,16 @@ def test_in_process_no_gain_is_promised_for_a_discard_limit(tmp_path: Path) -> N
     found = findings(tmp_path, backend="in-process")
     assert found.headline.startswith("One thread runs all hooks in turn (in-process); slow.use")
     assert found.trial is None
-    assert "at most 1.2 times as fast, since slow" in found.gains[0]
+    assert "up to 1.2 times as fast; then slow is the limit" in found.gains[0]
 
 
 def test_where_no_node_has_reported_that_is_said(tmp_path: Path) -> None:
     run = open_for_review(run_folder(tmp_path, {WIRE: 0}, {"fast": None, "slow": None}))
-    assert "cannot be told" in findings_of(run).headline
+    assert "not known" in findings_of(run).headline
 
 
 def test_a_run_that_keeps_time_is_as_fast_as_it_should_be(tmp_path: Path) -> None:
     nodes = {"clock": accounting(executing={"tick": 0.1}, idle=9.9)}
     found = findings_of(open_for_review(run_folder(tmp_path, {}, nodes)))
     assert found.headline.startswith("The clock of clock limits the speed: 99% of its time")
-    assert found.gains == (
-        "No discard limit holds this run up: without them it would gain nothing.",
-    )
+    assert found.gains == ("Discard limits do not slow this run down.",)

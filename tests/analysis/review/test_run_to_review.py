@@ -39,7 +39,7 @@ def test_of_a_run_that_was_cut_off_packets_are_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (None, "no folder that a run has left behind"),
+        (None, "not the folder of a run"),
         ('{"format": 2', "is broken"),
         ("[]", "is broken: it holds no object"),
         ('{"format": 3}', "has format 3, and this version of NeuROS reads format 2"),

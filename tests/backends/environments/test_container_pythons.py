@@ -254,7 +254,7 @@ NONE = "ERROR: Could not find a version that satisfies the requirement {} (from 
         ),
         (
             NONE.format("a", "none"),
-            "no a exists for Python 3.12 (pip finds none of that name)",
+            "no a exists for Python 3.12 (pip finds no package of that name)",
         ),
         (
             CONFLICT,

@@ -239,7 +239,7 @@ class TestDockerfiles:
         assert f"{bench.recipe}/Dockerfile does not begin from BASE_IMAGE: let it begin" in error
         code, _, error = bench.build("--base-image", "nothing=neuros_nest")
         assert (code, bench.tags) == (2, [])
-        assert "no container 'nothing' is built here; those that are: " in error
+        assert "no container 'nothing' is built here (there are: " in error
 
     def test_one_that_was_used_is_forgotten_when_the_dockerfile_takes_none_any_more(
         self, bench: Bench
@@ -290,7 +290,7 @@ class TestBuildKit:
             assert (code, bench.run("cat", "/tmp/seen")) == (0, "hello\n")
         else:
             assert (code, bench.tags) == (4, [])
-            assert "line 3 of its Dockerfile (RUN <<EOF) takes Docker Engine 23 or newer" in error
+            assert "line 3 of its Dockerfile (RUN <<EOF) needs Docker Engine 23 or newer" in error
             assert "as one RUN, with && between them" in error
 
 
@@ -408,7 +408,7 @@ class TestRegistries:
         with pytest.raises(EnvironmentFault, match=f"image '{name}' .*: docker load it, or name"):
             pulled(engine, name, newest=False)
         engine.images.get(images[1]).tag(name)
-        with pytest.raises(EnvironmentFault, match="the engine has is taken without --pull"):
+        with pytest.raises(EnvironmentFault, match="leave out --pull"):
             pulled(engine, name, newest=True)
         engine.images.remove(name)
 

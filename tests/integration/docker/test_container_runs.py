@@ -240,7 +240,7 @@ def test_a_display_that_is_not_there_is_said(bench: ContainerBench) -> None:
     bench.project({"a": RUNS}, a={"display": True})
     finished = bench.launch("--duration", "0.1", DISPLAY="")
     assert finished.exit_code == 0, finished.output
-    assert "a asks for a display, and DISPLAY is not set: no windows" in finished.said("neuros")
+    assert "no windows of a: DISPLAY is not set" in finished.said("neuros")
 
 
 def test_a_figure_has_a_window_on_the_display_that_may_be_closed(bench: ContainerBench) -> None:

@@ -58,7 +58,7 @@ def test_requirements_that_cannot_be_had_here(own: Recorded, tmp_path: Path) -> 
         XDG_CACHE_HOME=str(tmp_path / "cache"),
     )
     assert done.returncode == 4, done.stdout + done.stderr
-    assert f"in {own.run} 'mixer' ran in a container, a replay is a process" in done.stderr
+    assert f"in {own.run} 'mixer' ran in a container; a replay runs as a process" in done.stderr
     assert f"{container / 'requirements.txt'} is not satisfied here" in done.stderr
 
 

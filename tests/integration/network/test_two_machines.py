@@ -90,7 +90,7 @@ def test_without_multicast_who_is_there_first_names_the_other(
     peers = {"source": TO_RIGHT, "sink": TO_LEFT}
     second = "sink" if first == "source" else "source"
     with start(first, reach=peers[first]) as one:
-        one.wait_for(f"nodes elsewhere are still waited for: {second} (", FOUND_S)
+        one.wait_for(f"still waiting for nodes elsewhere: {second} (", FOUND_S)
         with start(second, reach=peers[second]) as other:
             ended = {second: other.finish(FOUND_S), first: one.finish()}
     assert_all_arrived(ended["source"], ended["sink"], 100)
@@ -98,8 +98,8 @@ def test_without_multicast_who_is_there_first_names_the_other(
 
 def test_without_network_a_run_is_not_found_from_another_machine(start: Start) -> None:
     with start("source") as source, start("sink", reach=()) as sink:
-        source.wait_for("nodes elsewhere are still waited for: sink (", FOUND_S)
-        sink.wait_for("nodes elsewhere are still waited for: source (", FOUND_S)
+        source.wait_for("still waiting for nodes elsewhere: sink (", FOUND_S)
+        sink.wait_for("still waiting for nodes elsewhere: source (", FOUND_S)
         source.signal(signal.SIGINT)
         sink.signal(signal.SIGINT)
         assert "found elsewhere" not in source.finish().output + sink.finish().output

@@ -88,7 +88,7 @@ def test_an_unknown_encoding_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     for encoding in ("klingon", "rot13", "utf-7"):
         head = f'<?xml version="1.0" encoding="{encoding}"?>'
         for suffix, text in (("sdf", SDF.format("")), ("urdf", URDF)):
-            assert "this is no XML: " in said(capsys, tmp_path, head + text, suffix)
+            assert "this is not XML: " in said(capsys, tmp_path, head + text, suffix)
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "NAN", "1e999"])
@@ -130,16 +130,16 @@ def test_pipes_are_no_descriptions_and_no_meshes(
 ) -> None:
     os.mkfifo(tmp_path / "pipe.sdf")
     assert main(["convert", str(tmp_path / "pipe.sdf")]) == 3
-    assert "pipe.sdf:1:1: /: cannot be read: it is no ordinary file" in capsys.readouterr().err
+    assert "pipe.sdf:1:1: /: cannot be read: it is not an ordinary file" in capsys.readouterr().err
     os.mkfifo(tmp_path / "pipe.stl")
     collision = "<mesh><uri>pipe.stl</uri></mesh>"
     link = f'<link name="l"><collision name="c"><geometry>{collision}</geometry></collision></link>'
-    assert "'pipe.stl' is no file" in said(capsys, tmp_path, SDF.format(link))
+    assert "'pipe.stl' is not a file" in said(capsys, tmp_path, SDF.format(link))
     os.mkfifo(tmp_path / "out.xml")
     (tmp_path / "good.sdf").write_text(SDF.format('<link name="l"/>'))
     out = str(tmp_path / "out.xml")
     assert main(["convert", str(tmp_path / "good.sdf"), "-o", out, "--force"]) == 2
-    assert "out.xml: is no file" in capsys.readouterr().err
+    assert "out.xml: is not a file" in capsys.readouterr().err
 
 
 def test_a_chain_of_frames_may_be_as_long_as_it_likes(tmp_path: Path) -> None:

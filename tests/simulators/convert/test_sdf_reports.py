@@ -35,8 +35,8 @@ def test_all_problems_are_reported_at_once(folder: Folder) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("<sdf><model>", "this is no XML: no element found"),
-        ("", "this is no XML: no element found"),
+        ("<sdf><model>", "this is not XML: no element found"),
+        ("", "this is not XML: no element found"),
         ("<robot/>", "an SDF file begins with <sdf>, not with <robot>"),
         ("<sdf version='1.9'/>", "there is neither a <world> nor a <model> in it"),
     ],

@@ -124,7 +124,7 @@ def test_a_folder_is_no_mesh(folder: Folder) -> None:
     (folder.path / "a.stl").mkdir()
     mesh = "<geometry><mesh><uri>a.stl</uri></mesh></geometry>"
     (problem,) = folder.problems(link("base", f'<collision name="hull">{mesh}</collision>'))
-    assert problem.endswith("'a.stl' is no file")
+    assert problem.endswith("'a.stl' is not a file")
 
 
 def test_links_of_one_model_collide_only_if_it_says_so(folder: Folder) -> None:

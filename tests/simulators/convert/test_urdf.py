@@ -104,7 +104,7 @@ def test_a_prefix_need_not_be_declared_as_for_others_that_read_urdf(folder: Fold
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("<robot", "this is no XML"),
+        ("<robot", "this is not XML"),
         ("<sdf/>", "a URDF file begins with <robot>, not with <sdf>"),
         ('<robot name="r"><joint name="j"/></robot>', "MuJoCo cannot compile it"),
     ],

@@ -90,7 +90,7 @@ def test_a_compressed_image_goes_through_as_it_is() -> None:
     ("packet", "why"),
     [
         (message(2, 2, "bayer_rggb8", bytes(4)), "encoding 'bayer_rggb8' are not shown"),
-        (message(2, 2, "rgb8", bytes(6)), "6 bytes are no image of 2 x 2"),
+        (message(2, 2, "rgb8", bytes(6)), "6 bytes are not an image of 2 x 2"),
         (Image(encoding="rgb8"), "no image of 0 x 0"),
     ],
 )
