@@ -89,6 +89,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "backends.docker": {"docker", "requests"},
     "backends.progress": {"tqdm"},
     "backends.environments.requirements": {"packaging"},
+    "api.export": {"yaml"},
     "api.run": {"pandas"},
     "api.sweep": {"tabulate"},
     "executors.pools": {"distributed"},

@@ -94,8 +94,8 @@ class Packets:
 def read_packets(run_folder: Path, connection: Connection) -> Packets:
     """The lists of a connection; what a killed node could not write any more is missing."""
     index = connection.index
-    sender = run_folder / connection.source_node / FOLDER
-    receiver = run_folder / connection.destination_node / FOLDER
+    sender = _node_folder(run_folder, connection.source_node) / FOLDER
+    receiver = _node_folder(run_folder, connection.destination_node) / FOLDER
     taken = _numbers(receiver / f"{index}.taken", np.int64)
     good = _up_to_first(taken < 1)
     damaged = () if good == len(taken) else (receiver / f"{index}.taken",)
@@ -110,6 +110,14 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         taken_ns=taken_ns[:both],
         damaged=damaged,
     )
+
+
+def _node_folder(run_folder: Path, node: str) -> Path:
+    """The folder of a node in a run folder, or in one that holds those of the parts of a run."""
+    own = run_folder / node
+    if (own / "node.json").exists():
+        return own
+    return next(run_folder.glob(f"*/{node}"), own)
 
 
 def packet_figures(packets: Packets, *, may_lose: bool) -> dict[str, Any]:

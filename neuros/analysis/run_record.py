@@ -96,8 +96,6 @@ def run_table(record: Mapping[str, Any]) -> str:
     """The record as text: connections, nodes, and times."""
     from tabulate import tabulate
 
-    from neuros.recording.system_load import load_table
-
     counts: tuple[str, ...] = _COUNTS
     if any(c.get("foreign") for c in record["connections"]):
         counts = (*counts, "foreign")
@@ -112,6 +110,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         if rows
     ]
     if "system_load" in record:
+        from neuros.recording.system_load import load_table  # images of nodes have no psutil
+
         parts.append(load_table(record["system_load"]))
     return "\n\n".join([*parts, _times(record)])
 
@@ -315,6 +315,24 @@ def open_run(folder: Path) -> PastRun:
     if "connections" not in run.record:
         raise EnvironmentFault(f"{folder / RUN_FILE} is broken: it has no connections")
     return run
+
+
+def open_whole(folder: Path) -> PastRun:
+    """Read a run folder, or one that holds those of all parts of a run: of it as a whole.
+
+    Raises as :func:`open_run`.
+    """
+    files = sorted(folder.glob(f"*/{RUN_FILE}"))
+    if (folder / RUN_FILE).exists() or not files:
+        return open_run(folder)
+    parts = [open_run(file.parent) for file in files]
+    connections: dict[str, dict[str, Any]] = {}
+    for figures in (each for part in parts for each in part.record["connections"]):
+        known = connections.setdefault(figures["connection"], {**figures})
+        known |= {key: value for key, value in figures.items() if known.get(key) is None}
+    ordered = sorted(connections.values(), key=lambda figures: figures["index"])
+    nodes = {name: node for part in parts for name, node in part.nodes.items()}
+    return PastRun(folder, {**parts[0].record, "connections": ordered, "nodes": nodes})
 
 
 def open_for_review(folder: Path) -> PastRun:

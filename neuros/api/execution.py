@@ -293,7 +293,13 @@ class Execution:
             listener=self._listener,
             wishes=self._wishes,
             duration_s=self._plan.request.end.wall_s,
-            peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
+            peers=Peers(
+                self._run_id,
+                self._plan.elsewhere,
+                self._files,
+                self._where_to_start(),
+                self._plan.request.peer_timeout,
+            ),
             waker=self._waker,
         )
 

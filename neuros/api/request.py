@@ -112,6 +112,15 @@ class Request(ProjectOptions):
         help="name the other machines, by address or name, where multicast does not reach them;"
         " implies --network",
     )
+    peer_timeout: int | None = option(
+        "--peer-timeout",
+        parse=positive_number,
+        metavar="SECONDS",
+        default_help="wait for ever",
+        page="network.md#how-it-ends",
+        help="end with exit code 4 if a node elsewhere that a connection leads to was not found"
+        " after this time",
+    )
     isolate: bool = option(
         "--isolate",
         default=False,
@@ -299,6 +308,56 @@ class LaunchOptions(Request):
         default=False,
         is_recorded=False,
         help="print what would be started, and start nothing",
+    )
+
+
+FORMS = ("compose", "swarm", "kubernetes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions(ProjectOptions):
+    """How to export a project: for which engine, and how its nodes find each other there."""
+
+    form: str = option(help="for which engine: compose, swarm or kubernetes", default="compose")
+    output: str | os.PathLike[str] | None = like(
+        Request,
+        "output",
+        default_help="<project>-<engine> in the current folder",
+        help="write the files into this folder, which must be new or empty",
+    )
+    duration: float | str | None = like(Request, "duration")
+    domain_id: int | None = like(Request, "domain_id", default_help="0")
+    peers: str | None = like(
+        Request,
+        "peers",
+        default_help="the names of the containers; with --host-network, multicast finds them",
+        help="name the machines that nodes look for each other on",
+    )
+    peer_timeout: int = option(
+        "--peer-timeout",
+        parse=positive_number,
+        metavar="SECONDS",
+        default=600,
+        help="let each node end with exit code 4 if the others were not found after this time;"
+        " images may have to be pulled first",
+    )
+    host_network: bool = option(
+        "--host-network",
+        default=False,
+        help="have containers use the network of their machine, not one of their own; not for"
+        " kubernetes",
+    )
+    registry: str | None = option(
+        "--registry",
+        metavar="PREFIX",
+        help="begin the names of images with this, as in registry.lab/robots, from where other"
+        " machines pull them",
+    )
+    volume_claim: str | None = option(
+        "--volume-claim",
+        metavar="NAME",
+        default_help="they go with the pods",
+        help="for kubernetes: keep run folders in this PersistentVolumeClaim",
     )
 
 

@@ -93,7 +93,7 @@ def _back_end_options(parsed: argparse.Namespace) -> dict[str, Any]:
 
 def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
-    with _signals_noted() as (signals, waker):
+    with signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
         from neuros.cli.environments import make_shown_environments
@@ -188,7 +188,7 @@ def _dry_run(plan: Plan) -> int:
 
 
 @contextmanager
-def _signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
+def signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
     """Collect SIGINT and SIGTERM instead of dying of them, until the run is cleaned up.
 
     Yields them, and a socket to which a byte goes for each, and whenever a child has ended.

@@ -341,7 +341,8 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     verify.description = (
         "Say whether two runs carried the same packets. If not, name the first difference:"
-        " connection, packet and, if both runs were recorded, field."
+        " connection, packet and, if both runs were recorded, field. The folder of a run that was"
+        " started in parts is one that holds their run folders."
     )
     verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
@@ -352,9 +353,9 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
 
 def _verify(options: argparse.Namespace) -> int:
     from neuros.analysis.difference import RecordedPackets, compare
-    from neuros.analysis.run_record import open_run
+    from neuros.analysis.run_record import open_whole
 
-    a, b = open_run(options.run_a), open_run(options.run_b)
+    a, b = open_whole(options.run_a), open_whole(options.run_b)
     recorded = RecordedPackets()
     verdict = compare(a, b, recorded)
     remarks = [*recorded.remarks, *verdict.remarks]

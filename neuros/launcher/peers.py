@@ -8,6 +8,7 @@ each knows for which it still waits; and the end of one is the end of all.
 from __future__ import annotations
 
 import json
+import math
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -116,13 +117,20 @@ class Peers:
         elsewhere: the nodes of the project that are not started here; none: there are no peers.
         files: the nodes that are.
         hint: what to add where nodes elsewhere are waited for.
+        timeout_s: how long they are waited for; ``None``: for ever.
     """
 
     def __init__(
-        self, run: str, elsewhere: Sequence[str], files: Sequence[NodeFile], hint: str = ""
+        self,
+        run: str,
+        elsewhere: Sequence[str],
+        files: Sequence[NodeFile],
+        hint: str = "",
+        timeout_s: float | None = None,
     ) -> None:
         self._elsewhere = elsewhere
         self._hint = hint
+        self._timeout_s = timeout_s
         here = {file.node.name for file in files}
         self._crossing = sorted(
             {c for file in files for c in file.connections if not _ends(c) <= here},
@@ -137,6 +145,7 @@ class Peers:
         self._run_of: dict[str, str] = {}
         self._gone_s: dict[str, float] = {}
         self._next_remark_s: float | None = None
+        self._give_up_s: float | None = None
         self._over_s: float | None = None
 
     # ------------------------------------------------------------------ speaking
@@ -242,6 +251,17 @@ class Peers:
         if self._missing and now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             yield "INFO", f"still waiting for nodes elsewhere: {self._names()}{self._hint}"
+
+    def overdue(self, now_s: float) -> str:
+        """Which nodes elsewhere were waited for too long, in a sentence; empty: none."""
+        if self._give_up_s is None:
+            self._give_up_s = now_s + (math.inf if self._timeout_s is None else self._timeout_s)
+        if not self._missing or now_s < self._give_up_s:
+            return ""
+        return (
+            f"not found elsewhere within {self._timeout_s:g} s: {self._names()}{self._hint}: has it"
+            " failed there, or does no network lead to it?"
+        )
 
     # ------------------------------------------------------------------ inside
 

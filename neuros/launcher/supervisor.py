@@ -314,6 +314,8 @@ class Supervisor:
             self._show(source.remarks(now_s))
         if self._detector.has_just_stalled(now_s):
             self._channels.send(control.Explain())
+        if overdue := self._peers.overdue(now_s):
+            self._shutdown.fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
         if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:

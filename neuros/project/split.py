@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.project.model import (
+    Budgets,
     Connection,
     Folders,
     Node,
@@ -127,10 +128,15 @@ def project_to_json(project: Project) -> dict[str, Any]:
     ]
     content["connections"] = [connection.keys for connection in project.connections]
     content |= names_to_json(project.names)
-    budgets = {**vars(project.budgets), "lost_packets": dict(project.budgets.lost_packets)}
-    if budgets := {key: value for key, value in budgets.items() if value not in (None, {})}:
+    if budgets := budgets_to_json(project.budgets):
         content["budgets"] = budgets
     return content
+
+
+def budgets_to_json(budgets: Budgets) -> dict[str, Any]:
+    """The budgets as a project file has them."""
+    values = {**vars(budgets), "lost_packets": dict(budgets.lost_packets)}
+    return {key: value for key, value in values.items() if value not in (None, {})}
 
 
 def translated(node: Node, translate: Callable[[Path], Path]) -> Node:

@@ -16,7 +16,7 @@ from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
 from neuros.backends.registered import choose
-from neuros.cli.launch import _signals_noted
+from neuros.cli.launch import signals_noted
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
@@ -352,7 +352,7 @@ def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
     handlers = [signal.getsignal(number) for number in heeded]
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as launch.py does
     try:
-        with _signals_noted() as (signals, _):
+        with signals_noted() as (signals, _):
             signal.raise_signal(signal.SIGINT)
             assert signals == [signal.SIGINT]
         signal.raise_signal(signal.SIGINT)

@@ -31,12 +31,12 @@ WAITS_S = 2.0
 class Launcher:
     """This launcher, with node ``a``; ``b`` and ``c`` are elsewhere, and ``a`` sends to ``b``."""
 
-    def __init__(self) -> None:
+    def __init__(self, timeout_s: float | None = None) -> None:
         file = NodeFile(
             Node("a", "", Path("/a.py")), (HERE_TO_THERE,), Folders(FOLDER, FOLDER, FOLDER)
         )
         self.said: list[PeerState] = []
-        self.peers = Peers("own", ["b", "c"], [file], " (hint)")
+        self.peers = Peers("own", ["b", "c"], [file], " (hint)", timeout_s)
         self.peers.speak_through(self._note)
 
     def _note(self, text: str) -> None:
@@ -97,6 +97,18 @@ def test_the_rest_of_a_run_before_this_one_is_not_heeded(launcher: Launcher) -> 
     assert launcher.peers.end(100.0) is None
     assert launcher.remarks(100.0) == []
     assert launcher.remarks(105.0) != []
+
+
+def test_nodes_elsewhere_are_waited_for_no_longer_than_asked() -> None:
+    launcher = Launcher(timeout_s=7)
+    assert [launcher.peers.overdue(now_s) for now_s in (100.0, 106.9)] == ["", ""]
+    assert launcher.peers.overdue(107.0).startswith("not found elsewhere within 7 s: b (hint): ")
+    launcher.hears("b", ELSEWHERE)
+    assert launcher.peers.overdue(200.0) == ""
+
+
+def test_without_a_limit_nodes_elsewhere_are_waited_for_for_ever(launcher: Launcher) -> None:
+    assert [launcher.peers.overdue(now_s) for now_s in (0.0, 1e9)] == ["", ""]
 
 
 def test_nor_is_what_is_none_of_ours(launcher: Launcher) -> None:

@@ -1,0 +1,480 @@
+"""A project as files for Docker Compose, Docker Swarm or Kubernetes, which then start its nodes.
+
+The folder that is written holds all that a run needs, but for the images that nodes run in::
+
+    compose.yaml, swarm.yaml or kubernetes.yaml
+    nodes.json         the node.json of every node: the configuration
+    Dockerfile         puts the folder image/ on top of the image of a container
+    image/             NeuROS, the project, its messages: what is /neuros in a container
+    runs/              where Compose has the run folders
+
+What a container starts is in :mod:`neuros.api.part`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neuros.api.part import parts_to_json
+from neuros.api.request import ExportOptions
+from neuros.backends.containers import bare_name
+from neuros.backends.docker.recipes import files_of, find_recipe
+from neuros.backends.placement import THREAD_VARIABLES
+from neuros.distribution import PACKAGE, WORKSPACE
+from neuros.errors import UsageError
+from neuros.project.model import Folders, Node, NodeFile, Project
+from neuros.project.resources import memory_text
+from neuros.project.split import split, translated
+
+ROOT = Path("/neuros")
+FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "lib/workspace", run=ROOT / "runs")
+"""What a node sees in its container; NeuROS finds its workspace beside itself."""
+
+NODES_FILE = "nodes.json"
+_LIBRARY, _MESSAGES = ROOT / "lib", ROOT / "messages"
+_RUN = "${RUN:-run}"
+_MOST_PIDS = 4096
+_STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
+_PROBE_S = 10
+_NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
+# What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
+_VENDORED = "tabulate"
+
+_DOCKERFILE = f"""\
+# The image of a container, and on top of it NeuROS and the project. It takes no network.
+ARG BASE
+FROM ${{{{BASE}}}}
+COPY image {ROOT}
+ENV HOME=/tmp XDG_CACHE_HOME=/tmp/.cache PYTHONUNBUFFERED=1 PYTHONPATH={{path}} {{threads}}
+USER 1000:1000
+WORKDIR {ROOT}
+ENTRYPOINT ["python3", "-m", "neuros.cli", "part", "{ROOT / NODES_FILE}"]
+"""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A node and its container.
+
+    Attributes:
+        name: of the service: that of the node, as DNS takes it.
+        base: the image that the node's container stands for.
+        image: what is built on it.
+        command: the arguments of ``neuros part`` behind ``nodes.json``.
+        run: its run folder.
+    """
+
+    node: Node
+    name: str
+    base: str
+    image: str
+    command: Sequence[str]
+    run: str
+
+
+class Export:
+    """A project on its way into a folder.
+
+    Args:
+        messages: the folders for Python's path of the built message packages that it needs.
+    """
+
+    def __init__(self, project: Project, messages: Sequence[Path], options: ExportOptions) -> None:
+        self.project = project
+        self.options = options
+        self._messages = messages
+        self.folder = Path(options.output or f"{slug(project.name)}-{options.form}").absolute()
+
+    @cached_property
+    def name(self) -> str:
+        """The name of the project, as DNS and image names take it."""
+        return slug(self.project.name)
+
+    @cached_property
+    def names(self) -> Mapping[str, str]:
+        """By node, the name of its service."""
+        found: dict[str, str] = {}
+        for index, node in enumerate(self.project.nodes):
+            name = slug(node.name)
+            found[node.name] = f"{name}-{index}" if name in found.values() else name
+        return found
+
+    @cached_property
+    def files(self) -> list[NodeFile]:
+        """The ``node.json`` of every node, with the paths that it sees."""
+        folders = [(self.project.folder, FOLDERS.project), (WORKSPACE, FOLDERS.workspace)]
+
+        def inside(path: Path) -> Path:
+            for here, there in sorted(folders, key=lambda pair: -len(pair[0].parts)):
+                if path.is_relative_to(here):
+                    return there / path.relative_to(here)
+            return path
+
+        files = split(self.project, lambda _: FOLDERS)
+        return [replace(file, node=translated(file.node, inside)) for file in files]
+
+    def parts(self, host_of: Callable[[str], str], run: str = _RUN) -> list[Part]:
+        """One for each node; ``host_of``: the host name of a service, for its peers."""
+        return [self._part(node, host_of, run) for node in self.project.nodes]
+
+    def _part(self, node: Node, host_of: Callable[[str], str], run: str) -> Part:
+        options, name = self.options, self.names[node.name]
+        folder = f"{FOLDERS.run}/{run}/{node.name}"
+        others = [host_of(each) for key, each in self.names.items() if key != node.name]
+        peers = options.peers or ("" if options.host_network else ",".join(others))
+        command = [node.name, "-d", str(options.domain_id or 0), "-o", folder]
+        command += ["--peer-timeout", str(options.peer_timeout)]
+        command += ["--peers", peers] if peers else []
+        duration = str(options.duration or "")
+        if duration and (node.owns_time or not duration.endswith("sim")):
+            command += ["--duration", duration]
+        recipe = find_recipe(node.container, self.project.folder)
+        base = recipe.tags[-1] if recipe else node.container
+        registry = f"{options.registry.rstrip('/')}/" if options.registry else ""
+        image = f"{registry}{self.name}-{slug(bare_name(node.container))}:{self._tag}"
+        return Part(node, name, base, image, command, folder)
+
+    @cached_property
+    def _tag(self) -> str:
+        """Changes with what is put into images."""
+        whole = hashlib.sha256(self._dockerfile.encode())
+        for file in files_of(self.folder / "image"):
+            whole.update(str(file.relative_to(self.folder)).encode())
+            whole.update(file.read_bytes())
+        return whole.hexdigest()[:12]
+
+    @property
+    def _dockerfile(self) -> str:
+        messages = [str(_MESSAGES / python.parent.name / "python") for python in self._messages]
+        threads = " ".join(f"{variable}=1" for variable in THREAD_VARIABLES)
+        path = os.pathsep.join([*messages, str(_LIBRARY)])
+        return _DOCKERFILE.format(path=path, threads=threads)
+
+    def write(self) -> Path:
+        """Write the folder; returns the file for the engine.
+
+        Raises:
+            UsageError: if the folder is taken or cannot be written, or a node needs what it
+                cannot have there.
+        """
+        form = FORMS[self.options.form]
+        self._check(form)
+        try:
+            self._make_folder()
+            self._copy()
+            (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
+            (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
+            content = json.dumps(parts_to_json(self.project, self.files), indent=2) + "\n"
+            (self.folder / NODES_FILE).write_text(content, "utf-8")
+            file = self.folder / form.file
+            documents = form.documents(self)
+            file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
+        except OSError as error:
+            raise UsageError(
+                f"{self.folder} cannot be written ({error.strerror}): name another folder with -o"
+            ) from error
+        return file
+
+    def _check(self, form: Form) -> None:
+        if self.options.host_network and form.file == "kubernetes.yaml":
+            raise UsageError("--host-network: Kubernetes gives each pod an address of its own")
+        for node in self.project.nodes:
+            for what in form.lacks:
+                if getattr(node.access, what):
+                    raise UsageError(
+                        f"node '{node.name}' asks for {what}, and {self.options.form} has none for"
+                        " its containers: export for compose, or run that node with"
+                        " `neuros launch -n`"
+                    )
+
+    def _make_folder(self) -> None:
+        folder = self.folder
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
+        for each in ("runs", "image/runs"):
+            (folder / each).mkdir(parents=True)
+        # Volumes begin as what the image has there, and whoever a container runs as writes to them.
+        (folder / "image/runs").chmod(0o1777)
+
+    def _copy(self) -> None:
+        image = self.folder / "image"
+        here = self.folder.resolve()
+
+        def left_out(folder: str, names: list[str]) -> Iterable[str]:
+            itself = [name for name in names if (Path(folder) / name).resolve() == here]
+            return {*_NOT_COPIED(folder, names), *itself}
+
+        shutil.copytree(self.project.folder, image / "project", ignore=left_out)
+        shutil.copytree(PACKAGE, image / "lib/neuros", ignore=_NOT_COPIED)
+        if WORKSPACE.is_dir():
+            shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=_NOT_COPIED)
+        spec = find_spec(_VENDORED)
+        for place in (spec.submodule_search_locations or ()) if spec else ():
+            shutil.copytree(place, image / "lib" / _VENDORED, ignore=_NOT_COPIED)
+        for python in self._messages:
+            folder = image / "messages" / python.parent.name
+            shutil.copytree(python.parent, folder, ignore=_NOT_COPIED)
+
+
+def slug(name: str) -> str:
+    """A name as DNS and image names take it: lower case, digits, and - between them."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "project"
+
+
+def export(project: Project, messages: Sequence[Path], options: ExportOptions) -> Path:
+    """Write a project for another engine; returns the file for it. Raises ``UsageError``."""
+    return Export(project, messages, options).write()
+
+
+# ------------------------------------------------------------------------------- the formats
+
+
+def _compose(export: Export) -> list[dict[str, Any]]:
+    services = {part.name: _compose_service(export, part) for part in export.parts(str)}
+    return [{"services": services}]
+
+
+def _compose_service(export: Export, part: Part) -> dict[str, Any]:
+    resources, access = part.node.resources, part.node.access
+    service: dict[str, Any] = {
+        **_service(part),
+        "restart": "no",
+        "tmpfs": ["/tmp:exec,mode=1777"],
+        # Who exports reads what nodes write, and may remove it.
+        "user": f"${{NEUROS_USER:-{os.getuid()}:{os.getgid()}}}",
+        "security_opt": ["no-new-privileges:true"],
+        "pids_limit": resources.pids or _MOST_PIDS,
+        "volumes": [f"./{NODES_FILE}:{ROOT / NODES_FILE}:ro", f"./runs:{FOLDERS.run}"],
+    }
+    if resources.mem_bytes is not None:
+        memory = memory_text(resources.mem_bytes)
+        service |= {"mem_limit": memory, "memswap_limit": memory}
+    if resources.cpus is not None:
+        service["cpus"] = resources.cpus
+    if access.devices:
+        service["devices"] = [f"{device}:{device}" for device in access.devices]
+    if access.gpus:
+        wanted = {"count": "all"} if access.gpus == ("all",) else {"device_ids": [*access.gpus]}
+        gpu = {"driver": "nvidia", "capabilities": ["gpu"], **wanted}
+        service["deploy"] = {"resources": {"reservations": {"devices": [gpu]}}}
+    if export.options.host_network:
+        service["network_mode"] = "host"
+    return service
+
+
+def _swarm(export: Export) -> list[dict[str, Any]]:
+    is_host = export.options.host_network
+    network = {"name": "host", "external": True} if is_host else {"driver": "overlay"}
+    return [
+        {
+            "version": "3.8",
+            "services": {part.name: _swarm_service(export, part) for part in export.parts(str)},
+            "networks": {"nodes": network},
+            "volumes": {"runs": {}},
+            "configs": {"nodes": {"file": f"./{NODES_FILE}"}},
+        }
+    ]
+
+
+def _swarm_service(export: Export, part: Part) -> dict[str, Any]:
+    resources = part.node.resources
+    limits: dict[str, Any] = {}
+    if resources.cpus is not None:
+        limits["cpus"] = f"{resources.cpus:g}"
+    if resources.mem_bytes is not None:
+        limits["memory"] = memory_text(resources.mem_bytes)
+    deploy: dict[str, Any] = {"replicas": 1, "restart_policy": {"condition": "none"}}
+    if not export.options.host_network:
+        deploy["endpoint_mode"] = "dnsrr"  # the address of the container, not one before it
+    if limits:
+        deploy["resources"] = {"limits": limits}
+    return {
+        **_service(part),
+        "networks": ["nodes"],
+        "tmpfs": ["/tmp"],
+        "configs": [{"source": "nodes", "target": str(ROOT / NODES_FILE), "mode": 0o444}],
+        "volumes": [f"runs:{FOLDERS.run}"],
+        "deploy": deploy,
+    }
+
+
+def _service(part: Part) -> dict[str, Any]:
+    """What a service of Compose and one of Swarm have in common."""
+    start_s = int(part.command[part.command.index("--peer-timeout") + 1])
+    return {
+        "image": part.image,
+        "build": {"context": ".", "args": {"BASE": part.base}},
+        "command": list(part.command),
+        "init": True,
+        "read_only": True,
+        "cap_drop": ["ALL"],
+        "stop_grace_period": f"{_STOP_S}s",
+        "healthcheck": {
+            "test": ["CMD", *_is_up(part)],
+            "interval": f"{_PROBE_S}s",
+            "start_period": f"{start_s}s",
+        },
+    }
+
+
+def _is_up(part: Part) -> list[str]:
+    """The command that succeeds while the launcher of a node listens to it."""
+    return ["test", "-S", f"{part.run}/control.sock"]
+
+
+def _kubernetes(export: Export) -> list[dict[str, Any]]:
+    app = {"app.kubernetes.io/name": "neuros", "app.kubernetes.io/instance": export.name}
+    content = json.dumps(parts_to_json(export.project, export.files), indent=2) + "\n"
+    hosts = {name: f"{export.name}-{name}-0.{export.name}" for name in export.names.values()}
+    return [
+        {
+            "apiVersion": "v1",
+            "kind": "ConfigMap",
+            "metadata": {"name": export.name, "labels": app},
+            "data": {NODES_FILE: content},
+        },
+        {
+            "apiVersion": "v1",
+            "kind": "Service",
+            "metadata": {"name": export.name, "labels": app},
+            # Each asks for the address of the others before any of them is ready.
+            "spec": {"clusterIP": "None", "publishNotReadyAddresses": True, "selector": app},
+        },
+        *(_job(export, part, app) for part in export.parts(hosts.__getitem__, run="run")),
+    ]
+
+
+def _job(export: Export, part: Part, app: Mapping[str, str]) -> dict[str, Any]:
+    labels = {**app, "app.kubernetes.io/component": part.name}
+    resources, gpus = part.node.resources, part.node.access.gpus
+    limits: dict[str, Any] = {}
+    if resources.cpus is not None:
+        limits["cpu"] = f"{resources.cpus:g}"
+    if resources.mem_bytes is not None:
+        limits["memory"] = f"{resources.mem_bytes}"
+    if gpus:
+        limits["nvidia.com/gpu"] = "1" if gpus == ("all",) else str(len(gpus))
+    probe = {"exec": {"command": _is_up(part)}, "periodSeconds": _PROBE_S}
+    start_s = export.options.peer_timeout
+    container = {
+        "name": "node",
+        "image": part.image,
+        "imagePullPolicy": "IfNotPresent",
+        "args": list(part.command),
+        "resources": {"limits": limits} if limits else {},
+        "startupProbe": {**probe, "failureThreshold": -(-start_s // _PROBE_S)},
+        "livenessProbe": probe,
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+        "volumeMounts": [
+            {"name": "nodes", "mountPath": str(ROOT / NODES_FILE), "subPath": NODES_FILE},
+            {"name": "runs", "mountPath": str(FOLDERS.run)},
+            {"name": "tmp", "mountPath": "/tmp"},
+        ],
+    }
+    claim = export.options.volume_claim
+    runs = {"persistentVolumeClaim": {"claimName": claim}} if claim else {"emptyDir": {}}
+    pod = {
+        "subdomain": export.name,
+        "restartPolicy": "Never",
+        "terminationGracePeriodSeconds": _STOP_S,
+        "securityContext": {
+            "runAsNonRoot": True,
+            "runAsUser": 1000,
+            "runAsGroup": 1000,
+            "fsGroup": 1000,
+        },
+        "containers": [container],
+        "volumes": [
+            {"name": "nodes", "configMap": {"name": export.name}},
+            {"name": "runs", **runs},
+            {"name": "tmp", "emptyDir": {}},
+        ],
+    }
+    return {
+        "apiVersion": "batch/v1",
+        "kind": "Job",
+        "metadata": {"name": f"{export.name}-{part.name}", "labels": labels},
+        "spec": {
+            "completionMode": "Indexed",  # gives the pod a host name that is known before
+            "completions": 1,
+            "parallelism": 1,
+            "backoffLimit": 0,
+            "template": {"metadata": {"labels": labels}, "spec": pod},
+        },
+    }
+
+
+@dataclass(frozen=True)
+class Form:
+    """A format.
+
+    Attributes:
+        documents: makes its YAML documents.
+        head: comment at the top of the file.
+        lacks: what nodes may ask for (``Access``), and do not get there.
+    """
+
+    file: str
+    documents: Callable[[Export], list[dict[str, Any]]]
+    head: str
+    lacks: tuple[str, ...]
+
+
+FORMS: Mapping[str, Form] = {
+    "compose": Form(
+        "compose.yaml",
+        _compose,
+        "# RUN=trial docker compose up --build; the run folders of its nodes are in runs/trial.\n",
+        ("display",),
+    ),
+    "swarm": Form(
+        "swarm.yaml",
+        _swarm,
+        "# docker compose -f swarm.yaml build && docker compose -f swarm.yaml push;"
+        " docker stack deploy -c swarm.yaml {name}\n",
+        ("devices", "gpus", "display"),
+    ),
+    "kubernetes": Form(
+        "kubernetes.yaml",
+        _kubernetes,
+        "# Build and push the images of the Dockerfile (docs/export.md), then: kubectl apply -f"
+        " kubernetes.yaml\n",
+        ("devices", "display"),
+    ),
+}
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes texts of several lines as blocks, and repeats what occurs twice."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
+    style = "|" if "\n" in text else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def _yaml(documents: Sequence[Mapping[str, Any]]) -> str:
+    text: str = yaml.dump_all(documents, Dumper=_Dumper, sort_keys=False, width=10_000)
+    return text

@@ -1,0 +1,110 @@
+"""One node of an exported project, where each container starts its own node.
+
+No launcher starts all nodes of an exported project: each container has a launcher for one node, and
+these launchers are peers (:mod:`neuros.launcher.peers`). The project has been checked when it was
+exported, so that a part needs its ``node.json`` files only, which lie in one file for all nodes.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuros.api.plan import Network, Plan, check_machine, chosen_network
+from neuros.api.request import Request
+from neuros.backends.process_launchers import PROCESS
+from neuros.backends.registered import Chosen
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.model import Budgets, NodeFile, Project
+from neuros.project.names import Names
+from neuros.project.split import budgets_to_json, node_file_to_json, node_files_from_json
+
+_AGAIN_S = 0.5
+
+
+def parts_to_json(project: Project, files: Sequence[NodeFile]) -> dict[str, Any]:
+    """The content of ``nodes.json``: the ``node.json`` of every node, and what is of none.
+
+    Args:
+        files: with the paths that nodes see in their containers.
+    """
+    return {
+        "project": project.name,
+        "file": str(files[0].folders.project / project.file.name),
+        "budgets": budgets_to_json(project.budgets),
+        "nodes": [node_file_to_json(file) for file in files],
+    }
+
+
+def parts_from_json(content: Mapping[str, Any]) -> Project:
+    """The inverse of :func:`parts_to_json`; raises ``KeyError`` for anything else."""
+    files = node_files_from_json(content["nodes"])
+    connections = {connection for file in files for connection in file.connections}
+    return Project(
+        name=content["project"],
+        nodes=tuple(file.node for file in files),
+        connections=tuple(sorted(connections, key=lambda connection: connection.index)),
+        file=Path(content["file"]),
+        budgets=Budgets(**content["budgets"]),
+        names=files[0].names if files else Names(),
+    )
+
+
+def read_parts(file: Path) -> Project:
+    """The project that was exported to a file.
+
+    Raises:
+        UsageError: if it is none.
+    """
+    try:
+        return parts_from_json(json.loads(file.read_text("utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        raise UsageError(
+            f"{file}: not what `neuros export` writes as nodes.json ({why}): export the project"
+            " again"
+        ) from error
+
+
+def part_plan(project: Project, network: Network, request: Request) -> Plan:
+    """The plan of a launcher that starts one node of the project, as a process of its container.
+
+    Raises:
+        UsageError: if there is no such node.
+        EnvironmentFault: if it cannot be run here.
+    """
+    known = {node.name for node in project.nodes}
+    for name in request.nodes:
+        if name not in known:
+            raise UsageError(f"no such node: {name}; the project has {', '.join(sorted(known))}")
+    # The engine, or Kubernetes, keeps the limits of nodes here: there is no notice that none does.
+    chosen = Chosen(PROCESS, PROCESS.prepare(project, [], {}))
+    plan = Plan(project, tuple(request.nodes), chosen, request, network=network)
+    check_machine(plan, {})
+    return plan
+
+
+def reach_peers(peers: str | None, timeout_s: float | None, signals: Sequence[int]) -> Network:
+    """The network with these peers, once all their names are known.
+
+    A container gets its name when it starts, and each may be the first.
+
+    Args:
+        timeout_s: seconds; ``None``: names that are not known at once are never waited for.
+        signals: a signal that arrives here ends the wait.
+
+    Raises:
+        UsageError: if one can be no name.
+        EnvironmentFault: if one is not known in time.
+    """
+    deadline_s = time.monotonic() + (timeout_s or 0.0)
+    while True:
+        try:
+            return chosen_network(True, peers)
+        except EnvironmentFault:
+            if signals or time.monotonic() >= deadline_s:
+                raise
+        time.sleep(_AGAIN_S)

@@ -1,0 +1,259 @@
+"""``neuros export``: what the files for Compose, Swarm and Kubernetes say of a project."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from neuros.api.export import export
+from neuros.api.part import part_plan, parts_to_json, reach_peers, read_parts
+from neuros.api.plan import Network
+from neuros.api.request import ExportOptions, Request
+from neuros.cli.main import main
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.load import load_project
+from neuros.project.model import Folders, Project
+from neuros.project.split import split
+
+OLDEST_KUBERNETES, NEWEST_KUBERNETES = "1.27", "1.37"
+PLUGIN = """
+from neuros.hooks import neuros_function
+
+@neuros_function({declared})
+def work(node, *packets):
+    pass
+"""
+EYES = {"name": "eyes", "type": "std_msgs/msg/Int32"}
+THROWER = {
+    "name": "The_Thrower",
+    "container": "neuros_python",
+    "plugin": "thrower.py",
+    "outputs": [EYES],
+    "environment": {"SEED": "1", "TABLE": "#table.txt"},
+    "resources": {"memory": "512m", "cpus": 1.5, "pids": 64},
+}
+COUNTER = {
+    "name": "counter",
+    "container": "neuros_mujoco",
+    "plugin": "counter.py",
+    "inputs": [EYES],
+}
+
+
+def project_in(folder: Path, **more: Any) -> Project:
+    """A thrower with limits, and a counter, in the folder ``dice``; ``more``: of the thrower."""
+    made = folder / "dice"
+    made.mkdir()
+    (made / "thrower.py").write_text(PLUGIN.format(declared='outputs="eyes"'))
+    (made / "counter.py").write_text(PLUGIN.format(declared='inputs="eyes"'))
+    (made / "table.txt").write_text("1 2 3")
+    (made / "runs").mkdir()
+    (made / "runs" / "large").write_text("what an earlier run has left")
+    connection = {"source_node": "The_Thrower", "source_output": "eyes", "discard_limit": 0,
+                  "destination_node": "counter", "destination_input": "eyes"}  # fmt: skip
+    content = {
+        "nodes": [{**THROWER, **more}, COUNTER],
+        "connections": [connection],
+        "budgets": {"tick_error_ms": 3, "lost_packets": {"The_Thrower.eyes -> counter.eyes": 0}},
+        "namespace": "/table",
+    }
+    (made / "project.json").write_text(json.dumps(content))
+    return load_project(made, workspace=folder).project
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Project:
+    return project_in(tmp_path)
+
+
+def exported(project: Project, form: str, **options: Any) -> list[dict[str, Any]]:
+    """The YAML documents that an export has written."""
+    folder = project.folder.parent / form
+    file = export(project, (), ExportOptions(form=form, output=folder, **options))
+    assert file.parent == folder
+    return list(yaml.safe_load_all(file.read_text("utf-8")))
+
+
+def services(project: Project, form: str, **options: Any) -> Mapping[str, Any]:
+    (document,) = exported(project, form, **options)
+    found: Mapping[str, Any] = document["services"]
+    return found
+
+
+def test_each_node_is_a_service_that_is_not_started_again_and_looks_for_the_others(
+    project: Project,
+) -> None:
+    for form in ("compose", "swarm"):
+        found = services(project, form, duration=3)
+        assert [*found] == ["the-thrower", "counter"]
+        command = " ".join(found["the-thrower"]["command"])
+        assert command.startswith("The_Thrower -d 0 ")
+        assert command.endswith(" --peer-timeout 600 --peers counter --duration 3")
+        assert "--peers the-thrower" in " ".join(found["counter"]["command"])
+        for service in found.values():
+            assert service["healthcheck"]["test"][:3] == ["CMD", "test", "-S"]
+    assert found["counter"]["deploy"]["restart_policy"] == {"condition": "none"}
+
+
+def test_compose_does_not_start_a_node_again_either(project: Project) -> None:
+    assert {each["restart"] for each in services(project, "compose").values()} == {"no"}
+
+
+def test_limits_of_a_node_are_those_of_its_container(project: Project) -> None:
+    thrower = services(project, "compose")["the-thrower"]
+    assert (thrower["mem_limit"], thrower["cpus"], thrower["pids_limit"]) == ("512m", 1.5, 64)
+    assert thrower["memswap_limit"] == thrower["mem_limit"]
+    limits = services(project, "swarm")["the-thrower"]["deploy"]["resources"]["limits"]
+    assert limits == {"cpus": "1.5", "memory": "512m"}
+    *_, job, _ = exported(project, "kubernetes")
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    assert container["resources"]["limits"] == {"cpu": "1.5", "memory": str(512 << 20)}
+
+
+def test_a_node_gets_no_right_that_it_has_no_need_of(project: Project) -> None:
+    for form in ("compose", "swarm"):
+        for service in services(project, form).values():
+            assert (service["cap_drop"], service["read_only"]) == (["ALL"], True)
+
+
+@pytest.mark.parametrize("version", [OLDEST_KUBERNETES, NEWEST_KUBERNETES])
+def test_what_kubernetes_gets_keeps_to_its_schemas(project: Project, version: str) -> None:
+    documents = exported(project, "kubernetes", volume_claim="runs")
+    assert [d["kind"] for d in documents] == ["ConfigMap", "Service", "Job", "Job"]
+    for document in documents:
+        kubernetes_validate.validate(document, version, strict=True)
+
+
+def test_pods_find_each_other_by_the_names_that_indexed_jobs_have_with_a_headless_service(
+    project: Project,
+) -> None:
+    configuration, service, thrower, counter = exported(project, "kubernetes")
+    assert service["spec"]["clusterIP"] == "None"
+    assert service["spec"]["publishNotReadyAddresses"]
+    for job, other in ((thrower, counter), (counter, thrower)):
+        pod = job["spec"]["template"]
+        assert service["spec"]["selector"].items() <= pod["metadata"]["labels"].items()
+        assert job["spec"]["completionMode"] == "Indexed"
+        assert (job["spec"]["backoffLimit"], pod["spec"]["restartPolicy"]) == (0, "Never")
+        assert pod["spec"]["subdomain"] == service["metadata"]["name"]
+        host = f"{other['metadata']['name']}-0.{service['metadata']['name']}"
+        assert f"--peers {host}" in " ".join(pod["spec"]["containers"][0]["args"])
+    assert json.loads(configuration["data"]["nodes.json"])["project"] == "dice"
+
+
+def test_the_folder_holds_all_that_images_get_and_nothing_of_earlier_runs(
+    project: Project,
+) -> None:
+    found = services(project, "compose", registry="registry.lab/robots/")
+    folder = project.folder.parent / "compose"
+    assert (folder / "image/project/table.txt").read_text() == "1 2 3"
+    assert not (folder / "image/project/runs").exists()
+    assert (folder / "image/lib/neuros/schema/project.schema.json").is_file()
+    assert "COPY image /neuros" in (folder / "Dockerfile").read_text()
+    assert found["counter"]["image"].startswith("registry.lab/robots/dice-neuros-mujoco:")
+    assert found["counter"]["build"]["args"] == {"BASE": "neuros_mujoco:latest"}
+
+
+def test_the_name_of_an_image_changes_with_what_is_in_it(tmp_path: Path) -> None:
+    project = project_in(tmp_path)
+    before = services(project, "compose")["counter"]["image"]
+    assert services(project, "swarm")["counter"]["image"] == before
+    (project.folder / "table.txt").write_text("4 5 6")
+    again = export(project, (), ExportOptions(form="compose", output=tmp_path / "again"))
+    assert yaml.safe_load(again.read_text("utf-8"))["services"]["counter"]["image"] != before
+
+
+def test_a_part_reads_the_project_that_was_exported(project: Project) -> None:
+    services(project, "compose")
+    found = read_parts(project.folder.parent / "compose" / "nodes.json")
+    thrower = found.node("The_Thrower")
+    assert thrower.plugin == Path("/neuros/project/thrower.py")
+    assert thrower.environment["TABLE"] == "/neuros/project/table.txt"
+    assert found.connections == project.connections
+    assert (found.budgets, found.names) == (project.budgets, project.names)
+    plan = part_plan(found, Network(True), Request(nodes=("counter",)))
+    assert (plan.names, plan.elsewhere) == (("counter",), ("The_Thrower",))
+
+
+def test_a_part_of_another_project_is_refused_by_name(project: Project) -> None:
+    with pytest.raises(UsageError, match="no such node: judge; the project has The_Thrower, count"):
+        part_plan(project, Network(True), Request(nodes=("judge",)))
+
+
+def test_a_file_that_is_no_export_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "nodes.json"
+    for text in ("", "[]", '{"nodes": []}', '{"nodes": [{}]}'):
+        file.write_text(text)
+        with pytest.raises(UsageError, match=r"nodes\.json: not what `neuros export` writes"):
+            read_parts(file)
+
+
+def test_every_node_survives_the_way_through_the_file(project: Project, tmp_path: Path) -> None:
+    folders = Folders(project.folder, tmp_path, tmp_path)
+    (tmp_path / "nodes.json").write_text(
+        json.dumps(parts_to_json(project, split(project, lambda _: folders)))
+    )
+    found = read_parts(tmp_path / "nodes.json")
+    assert found.nodes == project.nodes
+
+
+@pytest.mark.parametrize(
+    ("form", "wish", "named"),
+    [
+        ("swarm", {"devices": ["/dev/null"]}, "asks for devices, and swarm has none"),
+        ("swarm", {"gpus": "all"}, "asks for gpus, and swarm has none"),
+        ("kubernetes", {"display": True}, "asks for display, and kubernetes has none"),
+    ],
+)
+def test_what_an_engine_cannot_give_to_a_node_is_refused(
+    tmp_path: Path, form: str, wish: Mapping[str, Any], named: str
+) -> None:
+    project = project_in(tmp_path, **wish)
+    with pytest.raises(UsageError, match=f"node 'The_Thrower' {named}"):
+        exported(project, form)
+
+
+def test_devices_and_gpus_go_into_the_compose_file(tmp_path: Path) -> None:
+    project = project_in(tmp_path, devices=["/dev/null"], gpus=["0", "1"])
+    thrower = services(project, "compose")["the-thrower"]
+    assert thrower["devices"] == ["/dev/null:/dev/null"]
+    (gpu,) = thrower["deploy"]["resources"]["reservations"]["devices"]
+    assert gpu == {"driver": "nvidia", "capabilities": ["gpu"], "device_ids": ["0", "1"]}
+
+
+def test_a_machine_s_own_network_takes_no_names_of_containers(project: Project) -> None:
+    assert services(project, "compose", host_network=True)["counter"]["network_mode"] == "host"
+    (document,) = exported(project, "swarm", host_network=True, peers="10.0.0.7")
+    assert document["networks"] == {"nodes": {"name": "host", "external": True}}
+    assert "--peers 10.0.0.7" in " ".join(document["services"]["counter"]["command"])
+    with pytest.raises(UsageError, match="--host-network: Kubernetes gives each pod an address"):
+        exported(project, "kubernetes", host_network=True)
+
+
+def test_a_folder_with_anything_in_it_is_not_written_to(project: Project) -> None:
+    services(project, "compose")
+    with pytest.raises(UsageError, match="is not an empty folder; name a new one"):
+        exported(project, "compose")
+
+
+def test_an_invalid_project_is_not_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = project_in(tmp_path)
+    (project.folder / "counter.py").unlink()
+    assert main(["export", "compose", str(project.folder), "-o", str(tmp_path / "out")]) == 3
+    assert "counter.py" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_name_that_is_never_known_ends_the_wait_and_a_signal_does_at_once() -> None:
+    with pytest.raises(EnvironmentFault, match=r"the host 'nobody\.invalid' cannot be found"):
+        reach_peers("nobody.invalid", None, [])
+    with pytest.raises(EnvironmentFault):
+        reach_peers("nobody.invalid", 3600, [15])
