@@ -125,7 +125,7 @@ def test_a_back_end_that_is_not_installed_is_named() -> None:
 
 
 def test_a_node_that_is_started_by_hand_is_told_who_starts_it() -> None:
-    with pytest.raises(EnvironmentFault, match="started by `neuros launch`"):
+    with pytest.raises(EnvironmentFault, match="`neuros launch` starts it"):
         connect_by({})
 
 

@@ -55,7 +55,7 @@ def test_a_pipe_in_the_place_of_a_file_is_named(tmp_path: Path, name: str) -> No
     (tmp_path / name).unlink()
     os.mkfifo(tmp_path / name)
     begin_s = time.monotonic()
-    with pytest.raises(ProjectError, match="no ordinary file"):
+    with pytest.raises(ProjectError, match="not an ordinary file"):
         load_project(tmp_path / "project.json", workspace=tmp_path, reads_plugins=True)
     assert time.monotonic() - begin_s < PROMPT_S
 
