@@ -84,8 +84,8 @@ def draw_vehicle() -> None:
             (Path(folder) / name).write_text(text, "utf-8")
         model = mujoco.MjModel.from_xml_path(f"{folder}/vehicle/vehicle.xml")
         data = mujoco.MjData(model)
-        data.mocap_pos[0] = 1.0, 0.5, 0.15
-        view, target = (220.0, -25.0, 2.2), (0.4, 0.1, 0.0)
+        data.mocap_pos[0] = 0.8, 0.35, 0.15
+        view, target = (35.0, -30.0, 1.5), (0.35, 0.1, 0.1)
         render(model, data, view, target, FIGURES / "tutorial_vehicle.png")
         launch = [sys.executable, "-m", "neuros.cli", "launch", "vehicle", "-o", "run"]
         subprocess.run([*launch, "--backend", "process"], cwd=folder, check=True)
