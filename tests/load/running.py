@@ -101,7 +101,7 @@ def run(
         if limit == 0
     )
     judge_latency(load, [each["ages_ms"] for each in told.values() if "ages_ms" in each])
-    judge_memory(load, [each for each in memory if each])
+    judge_memory(load, while_all_live(memory))
     return load
 
 
@@ -116,15 +116,25 @@ def busy_processes(count: int) -> Iterator[None]:
         yield
 
 
-def _private_bytes(mark: str) -> int:
-    """The memory that the processes of a run share with none, the launcher's included."""
-    total = 0
+def _private_bytes(mark: str) -> tuple[int, int]:
+    """How many processes a run has, with the launcher, and the memory they share with none."""
+    count = total = 0
     for process in psutil.process_iter():
         # One may end, or another may be of a user who cannot be looked at.
         with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get("LOAD_MARK") == mark:
                 total += process.memory_full_info().uss
-    return total
+                count += 1
+    return count, total
+
+
+def while_all_live(samples: Sequence[tuple[int, int]]) -> list[int]:
+    """The memory at the moments with as many processes as at most moments.
+
+    Containers start, and are removed, over many seconds on a busy machine.
+    """
+    usual = statistics.mode(count for count, _ in samples) if samples else 0
+    return [total for count, total in samples if count == usual]
 
 
 def _seen(told: Mapping[str, Any], source: str, destination: str) -> Mapping[str, Any]:

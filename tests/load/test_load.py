@@ -13,7 +13,15 @@ import pytest
 
 from containers import require_containers
 
-from .running import BACKENDS, Load, count_problems, judge_latency, judge_memory, run
+from .running import (
+    BACKENDS,
+    Load,
+    count_problems,
+    judge_latency,
+    judge_memory,
+    run,
+    while_all_live,
+)
 from .shapes import LARGEST_BYTES, SHAPES, Shape
 
 _PACKETS = 3000
@@ -66,3 +74,9 @@ def test_what_grows_is_noticed() -> None:
     assert flat.problems == []
     assert slower.problems == ["latency grew from 1.00 to 5.00 ms"]
     assert larger.problems[0].startswith("memory grew from ")
+
+
+def test_memory_is_that_of_moments_at_which_all_nodes_live() -> None:
+    starting, running, removed = [(1, 30), (9, 400)], [(18, 700)] * 20, [(2, 50)] * 9
+    assert while_all_live([*starting, *running, *removed]) == [700] * 20
+    assert while_all_live([]) == []
