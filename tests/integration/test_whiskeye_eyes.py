@@ -21,7 +21,7 @@ pytestmark = pytest.mark.needs("OpenGL")
 
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 SECONDS = 1
-TIMEOUT_S = 120.0
+TIMEOUT_S = 400.0
 
 
 def started(
@@ -110,7 +110,7 @@ def test_five_runs_and_all_back_ends_carry_the_same_packets(weights, tmp_path, c
     require_containers(*IMAGES)
     # In containers the nodes see the folder of their project alone.
     project = Path(shutil.copytree(WHISKEYE, tmp_path / "whiskeye"))
-    settings = {"robot__DURATION": 4, "snn__GATE": 9, "pcn__WEIGHTS": shutil.copy(weights, project)}
+    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__WEIGHTS": shutil.copy(weights, project)}
     runs = []
     with nothing_left(tmp_path):
         for number, backend in enumerate(("process",) * 5 + ("in-process", "docker")):
