@@ -23,7 +23,7 @@ from neuros.installation.machine import offscreen_opengl
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples/4_neurorobotics/whiskeye"
 DURATION_S, FRAME_S, PERIOD_S = 8.0, 0.1, 0.02
 RATE_RAD_S, SPEED_M_S, BIAS_RAD_S = 1.0, 0.2, 0.1
-PEAK_PA, WIDTH_RAD, LEAD_S, GATE = 120.0, math.radians(30), 0.06, 0.12  # as in prediction.json
+PEAK_PA = 300.0  # as in prediction.json
 EYE, OUTSIDE = (60, 80), (300, 400)  # height and width, pixels
 SHOWN_S = 5.0  # in the picture
 
@@ -140,40 +140,35 @@ def make_film(weights: Path, film: Path, picture: Path) -> None:
     """Write both files, from the weights of a run of ``training.json``."""
     os.environ.setdefault("MUJOCO_GL", offscreen_opengl())
     sys.path.insert(0, str(EXAMPLE))
-    from head_direction import NEURONS_PER_RING, HeadDirectionNetwork
+    from correction import GATE, CorrectedIntegrator
+    from head_direction import NEURONS_PER_RING
     from PIL import Image
     from predictive_coding import PredictiveCodingNetwork
-    from views import HEIGHT, WIDTH, heading_of, view_of
+    from views import heading_of, picture_of, view_of
 
     with np.load(weights) as file:
-        network = PredictiveCodingNetwork.of_weights(dict(file))
-    ring: Any = HeadDirectionNetwork(seed=1)
-    ring.settle()
+        learnt = dict(file)
+    network = PredictiveCodingNetwork.of_weights(learnt)
+    rings = CorrectedIntegrator(1, BIAS_RAD_S, PEAK_PA, GATE)
+    ring: Any = rings.corrected
     ring._reader = spikes = SpikeTee(ring._reader, 2 * NEURONS_PER_RING)
     robot, panels, frames = Robot(), Panels(NEURONS_PER_RING), []
-    vision_rad, is_believed, since_s = 0.0, False, 0.0
     for step in range(1, round(DURATION_S / PERIOD_S) + 1):
-        rate_rad_s = robot.advance() + BIAS_RAD_S
-        if is_believed:
-            target_rad = vision_rad + rate_rad_s * (since_s + LEAD_S)
-            ring.correct(target_rad, PEAK_PA, WIDTH_RAD)
-        ring.step(rate_rad_s, PERIOD_S)
-        since_s += PERIOD_S
+        rate_rad_s, stamp_ns = robot.advance(), round(step * PERIOD_S * 1e9)
         if step % round(FRAME_S / PERIOD_S):
+            rings.integrate(stamp_ns, rate_rad_s)
             continue
         eyes = [robot.seen(camera) for camera in ("cam0", "cam1")]
         packets = [
             SimpleNamespace(data=each.tobytes(), height=EYE[0], width=EYE[1]) for each in eyes
         ]
-        view = view_of(*packets)[None]
-        codes, errors = network.infer(view)
-        vision_rad, is_believed, since_s = heading_of(codes[0]), errors[0, 0] <= GATE, 0.0
-        halves = network.predicted(view)[0].reshape(2, HEIGHT, WIDTH, 3)
-        # A view has no light: it is shown with that of the pictures.
-        light, contrast = np.mean(eyes), np.std(eyes)
-        shown = np.clip(light + contrast * np.hstack(list(halves)), 0, 255).astype(np.uint8)
+        codes, ((error, *_),), (predicted,) = network.infer(view_of(*packets)[None])
+        vision_rad = heading_of(codes[0])
+        rings.vision.see(stamp_ns, vision_rad, error, error * float(learnt["rad_per_error"]))
+        ring_rad, _ = rings.integrate(stamp_ns, rate_rad_s)
+        shown = picture_of(predicted, *packets)
         images = {"eyes": np.hstack(eyes), "predicted": shown, "outside": robot.from_outside()}
-        told_rad = {"truth": robot.heading_rad, "vision": vision_rad, "ring": ring.heading_rad}
+        told_rad = {"truth": robot.heading_rad, "vision": vision_rad, "ring": ring_rad}
         frames.append(panels.drawn(images, spikes.taken(), ring._zero_rad, told_rad))
     pictures = [Image.fromarray(frame) for frame in frames]
     pictures[round(SHOWN_S / FRAME_S)].save(picture)

@@ -22,16 +22,16 @@ def run_all(
     backend: str,
     say: Callable[[str], None],
 ) -> bool:
-    """Run each part ``repeat`` times, every other time in the opposite order.
+    """Run each part ``repeat`` times, every other time in the opposite order; what trains first.
 
     Returns:
         whether all of them went well. Ctrl+C leaves those that had ended.
     """
     is_good = True
-    total = repeat * len(names)
-    for done in range(total):
-        turn, place = divmod(done, len(names))
-        name = names[-1 - place] if turn % 2 else names[place]
+    orders = [names[:: -1 if turn % 2 else 1] for turn in range(repeat)]
+    order = [name for each in orders for name in sorted(each, key=lambda name: name != kind.trains)]
+    total = len(order)
+    for done, name in enumerate(order):
         entry = _run(experiment, kind, name, backend, partial(_say, say, f"{done + 1}/{total}"))
         is_good &= not entry.failure
     return is_good

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from benchmarks.reproduce import headdirection
-from benchmarks.reproduce.experiment import Entry
-from benchmarks.reproduce.headdirection import PARTS, SERIES, TRAINING, WAYS
+from benchmarks.reproduce import headdirection, running
+from benchmarks.reproduce.experiment import Entry, Experiment
+from benchmarks.reproduce.headdirection import KIND, LEARNING, PARTS, SERIES, TRAINING, WAYS
 from benchmarks.reproduce.kinds import WEIGHTS, Reading
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.tables import Table
@@ -25,10 +26,20 @@ def run_folder(folder: Path, simulated_s: float) -> Path:
     return folder
 
 
-def prediction(folder: Path, name: str, alone: float, corrected: float, s: float = 60.0) -> Reading:
+def prediction(
+    folder: Path,
+    name: str,
+    alone: float,
+    corrected: float,
+    s: float = 60.0,
+    learnt: float | None = None,
+) -> Reading:
     """A run in which the errors of the rings are so many degrees RMS; vision has none."""
     run = run_folder(folder / name, s)
     (run / "visualiser").mkdir()
+    if learnt is not None:
+        (run / "snn").mkdir()
+        (run / "snn/results.json").write_text(json.dumps({"learnt_bias_rad_s": learnt}))
     sizes = {"uncorrected": alone, "vision": 0.0, "corrected": corrected}
     told = {
         series: {"samples": 2, "rms_deg": size, "max_deg": 2 * size}
@@ -66,7 +77,10 @@ def verdicts(sections: list[Section]) -> list[str]:
 @pytest.fixture
 def good(tmp_path: Path) -> dict[str, list[Reading]]:
     runs = {name: (205.9 if bias else 1.8, 1.7) for name, (_, bias) in WAYS.items()}
-    found = {name: [prediction(tmp_path, name, *sizes)] for name, sizes in runs.items()}
+    found = {
+        name: [prediction(tmp_path, name, *sizes, learnt=0.092 if name in LEARNING else None)]
+        for name, sizes in runs.items()
+    }
     return {TRAINING: [training(tmp_path)], **found}
 
 
@@ -74,15 +88,17 @@ def test_every_part_has_a_row_and_what_was_published_stands_below(good, tmp_path
     sections = [*headdirection.show(good, tmp_path)]
     correction = table(sections, "correction")
     titles = [row[0] for row in correction.rows]
-    assert titles[:5] == [PARTS[name] for name in WAYS]
-    assert titles[5:] == ["published, NeuROS 1.0", "published, Stentiford et al. 2022"]
+    assert titles[:7] == [PARTS[name] for name in WAYS]
+    assert titles[7:] == ["published, NeuROS 1.0", "published, Stentiford et al. 2022"]
     alone, corrected = (f"{SERIES[name]}: RMS, deg" for name in ("uncorrected", "corrected"))
     columns = [correction.headers.index(each) for each in (alone, corrected)]
-    assert [[row[column] for column in columns] for row in correction.rows[4:]] == [
+    assert [[row[column] for column in columns] for row in correction.rows[6:]] == [
         ["205.90", "1.70"],
         ["5.40", "–"],
         ["–", "5.20"],
     ]
+    learnt = [row[-1] for row in correction.rows]
+    assert learnt == ["–"] * 5 + ["0.0920"] * 2 + ["–"] * 2
     assert table(sections, "training").rows[0][2:5] == ["1474", "53", "3.00"]
     pictures = [picture for section in sections for picture in section.figures]
     assert [each.name for each in pictures] == ["correction_error.png", "correction_rms.png"]
@@ -91,9 +107,10 @@ def test_every_part_has_a_row_and_what_was_published_stands_below(good, tmp_path
 
 def test_what_is_wanted_is_judged_by_every_run(good, tmp_path):
     assert verdicts([*headdirection.show(good, tmp_path)]) == [
-        "yes (3 of 3)",
-        "yes (3 of 3)",
-        "yes (3 of 3)",
+        "yes (5 of 5)",
+        "yes (5 of 5)",
+        "yes (5 of 5)",
+        "yes (2 of 2)",
         "yes (2 of 2)",
         "yes (1 of 1)",
         "yes (1 of 1)",
@@ -105,10 +122,15 @@ def test_one_run_that_has_it_not_is_counted(good, tmp_path):
     good["left_biased"].append(prediction(tmp_path / "2", "left_biased", 59.0, 7.6))
     good["right"] = [prediction(tmp_path / "2", "right", 1.4, 1.8)]
     good[TRAINING] = [training(tmp_path / "2", places=(1.8, 1.7))]
-    assert verdicts([*headdirection.show(good, tmp_path)])[:6] == [
-        "no (3 of 4)",
-        "no (3 of 4)",
-        "no (3 of 4)",
+    good["right_learning"] = [
+        prediction(tmp_path / "2", "right_learning", 205.9, 1.7, learnt=0.1099)
+    ]
+    good["left_learning"] = [prediction(tmp_path / "2", "left_learning", 205.9, 1.7, learnt=0.1101)]
+    assert verdicts([*headdirection.show(good, tmp_path)])[:7] == [
+        "no (5 of 6)",
+        "no (5 of 6)",
+        "no (5 of 6)",
+        "no (1 of 2)",
         "no (1 of 2)",
         "yes (1 of 1)",
         "no (0 of 1)",
@@ -118,11 +140,20 @@ def test_one_run_that_has_it_not_is_counted(good, tmp_path):
 def test_what_was_not_run_is_not_judged_and_shorter_runs_are_named(tmp_path):
     runs = {"left_biased": [prediction(tmp_path, "left_biased", 3.0, 1.0, s=2.0)]}
     sections = [*headdirection.show(runs, tmp_path)]
-    assert verdicts(sections) == ["no (0 of 1)", "yes (1 of 1)", "yes (1 of 1)", *["–"] * 4]
+    assert verdicts(sections) == ["no (0 of 1)", "yes (1 of 1)", "yes (1 of 1)", *["–"] * 5]
     assert "Some runs here were shorter" in sections[-1].text[0]
 
 
 # ------------------------------------------------------------------ weights
+
+
+def test_each_repetition_trains_before_it_predicts(tmp_path, monkeypatch):
+    made: list[str] = []
+    kind = replace(KIND, run=lambda name, *_: made.append(name), read=lambda *_: None)
+    monkeypatch.setattr(running, "load_before", lambda: 0.0)
+    experiment = Experiment.begin(tmp_path / "new", "headdirection", 1.0)
+    assert running.run_all(experiment, kind, [TRAINING, "left", "right"], 2, "process", print)
+    assert made == [TRAINING, "left", "right", TRAINING, "right", "left"]
 
 
 def weights(experiment: Path, number: int) -> Path:
@@ -132,14 +163,15 @@ def weights(experiment: Path, number: int) -> Path:
     return file
 
 
-def test_the_first_training_run_gives_the_weights_unless_they_were_given(tmp_path):
+def test_the_training_run_of_the_same_seed_gives_the_weights_unless_they_were_given(tmp_path):
     with pytest.raises(UsageError, match="has no weights: run the part training, or give"):
         headdirection.run("left", tmp_path / "runs/left-1", 1.0, "process")
     weights(tmp_path, 10)
-    second = weights(tmp_path, 2)
-    assert headdirection._weights(tmp_path) == second
+    second, third = (weights(tmp_path, number) for number in (2, 3))
+    assert headdirection._weights(tmp_path, 3) == third
+    assert headdirection._weights(tmp_path, 1) == second, "without one, those of the first"
     (tmp_path / WEIGHTS).touch()
-    assert headdirection._weights(tmp_path) == tmp_path / WEIGHTS
+    assert headdirection._weights(tmp_path, 3) == tmp_path / WEIGHTS
 
 
 @pytest.mark.parametrize(

@@ -180,12 +180,16 @@ def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none
         pcn.run()
         nothing, seen = pcn.received("odom_correction", "snn")
         (error,) = pcn.received("prediction_error")
+        (view,) = pcn.received("predicted_view")
     assert math.isnan(nothing.vector.z)
     assert nothing.vector.x == math.inf
     assert (nothing.header.stamp.nanosec, seen.header.stamp.nanosec) == (1, 2)
     assert error.vector.x == seen.vector.x > 0
     assert seen.vector.y == pytest.approx(0.5 * seen.vector.x)
     assert abs(seen.vector.z) <= math.pi
+    assert (view.header.stamp.nanosec, view.height, view.width, view.step) == (2, 60, 160, 480)
+    assert len(view.data) == view.height * view.step
+    assert np.std(view.data) > 1
 
 
 def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(weights):

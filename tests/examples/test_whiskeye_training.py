@@ -57,6 +57,16 @@ def test_a_view_does_not_depend_on_the_light(load):
     assert not np.allclose(view_of(picture(0.9), picture(0.3)), view, atol=0.5)
 
 
+def test_a_view_is_shown_as_the_pictures_of_both_eyes_that_it_was_made_of(load):
+    views = load("views")
+    eyes = picture(0.3), picture(0.9)
+    shown = views.picture_of(views.view_of(*eyes), *eyes)
+    assert shown.shape == (60, 160, 3)
+    for half, eye in zip(np.hsplit(shown, 2), eyes, strict=True):
+        pixels = np.frombuffer(eye.data, np.uint8).reshape(60, 80, 3)
+        assert np.abs(half.astype(float) - pixels).max() < 30  # a block of pixels has one colour
+
+
 def test_the_network_tells_headings_that_it_has_not_learnt_and_knows_what_it_has_not_seen(
     load, examples
 ):
@@ -65,8 +75,8 @@ def test_the_network_tells_headings_that_it_has_not_learnt_and_knows_what_it_has
     learnt = np.arange(VIEWS) % 4 != 0
     errors = list(network.learn(seen[learnt], codes[learnt], 30))
     assert errors[-1] < errors[0] / 5
-    told, error = network.infer(seen[~learnt])
-    missed = seen[~learnt] - network.predicted(seen[~learnt])
+    told, error, predicted = network.infer(seen[~learnt])
+    missed = seen[~learnt] - predicted
     assert np.allclose(np.mean(np.square(missed), axis=1), error[:, 0], atol=1e-6)
     heading_of = load("views").heading_of
     assert off_deg([heading_of(each) for each in told], headings[~learnt]).max() < 10

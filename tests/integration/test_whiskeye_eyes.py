@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from launching import BACKENDS, EXAMPLES, Finished, launch
+
+from containers import IMAGES, nothing_left, require_containers
+from neuros.cli.main import main
 
 for needed in ("mujoco", "nest", "matplotlib"):
     pytest.importorskip(needed)
@@ -16,17 +21,19 @@ pytestmark = pytest.mark.needs("OpenGL")
 
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 SECONDS = 1
-TIMEOUT_S = 120.0
+TIMEOUT_S = 400.0
 
 
-def started(variant: str, backend: str, cwd: Path, **settings: object) -> Finished:
+def started(
+    variant: str, backend: str, cwd: Path, *flags: str, project: Path = WHISKEYE, **settings: object
+) -> Finished:
     """Run a project to its end, without windows; ``node__NAME=value`` sets an environment value."""
-    arguments = []
+    arguments = [*flags]
     for name, value in settings.items():
         node, variable = name.split("__", 1)
         arguments += ["--set", f"nodes.{node}.environment.{variable}={value}"]
     options = {"cwd": cwd, "timeout_s": TIMEOUT_S, "NEUROS_GUI": "0"}
-    run = launch(WHISKEYE / f"{variant}.json", "--backend", backend, *arguments, **options)
+    run = launch(project / f"{variant}.json", "--backend", backend, *arguments, **options)
     assert run.exit_code == 0, run.output
     return run
 
@@ -72,6 +79,16 @@ def test_training_learns_the_same_weights_on_every_back_end_and_tells_the_figure
     assert "views learnt" in trained[BACKENDS[0]].output
 
 
+@pytest.mark.skipif(
+    importlib.util.find_spec("tensorflow") is not None, reason="TensorFlow is in this environment"
+)
+def test_in_one_process_without_tensorflow_it_says_what_is_missing(tmp_path):
+    run = launch(WHISKEYE / "training_tensorflow.json", "--backend", "in-process", cwd=tmp_path)
+    assert run.exit_code == 4
+    assert "container 'neuros_tensorflow' (node trainer) needs tensorflow-cpu" in run.output
+    assert "use --backend process" in run.output
+
+
 def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
     tables = []
     for backend in BACKENDS:
@@ -86,6 +103,25 @@ def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path)
         assert errors["uncorrected"]["samples"] == 50 * SECONDS
         assert errors["uncorrected"]["rms_deg"] != errors["corrected"]["rms_deg"]
     assert tables[0] == tables[1]
+
+
+@pytest.mark.acceptance
+def test_five_runs_and_all_back_ends_carry_the_same_packets(weights, tmp_path, capsys):
+    require_containers(*IMAGES)
+    # In containers the nodes see the folder of their project alone.
+    project = Path(shutil.copytree(WHISKEYE, tmp_path / "whiskeye"))
+    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__WEIGHTS": shutil.copy(weights, project)}
+    runs = []
+    with nothing_left(tmp_path):
+        for number, backend in enumerate(("process",) * 5 + ("in-process", "docker")):
+            cwd = tmp_path / str(number)
+            cwd.mkdir()
+            run = started("prediction", backend, cwd, "--digests", project=project, **settings)
+            runs.append(run.run_folder)
+    first, *others = runs
+    for other in others:
+        assert main(["verify", str(first), str(other)]) == 0, other
+        assert "identical: " in capsys.readouterr().out
 
 
 @pytest.mark.acceptance

@@ -23,7 +23,7 @@ STRICT: dict[str, tuple[str, ...]] = {
     "2_synchronisation/voting": (),
     "4_neurorobotics/whiskeye/strict.json": ("--duration", "4sim"),
     "4_neurorobotics/whiskeye/custom_messages.json": ("--duration", "4sim"),
-    "4_neurorobotics/predictive_coding": ("--duration", "4sim"),
+    "4_neurorobotics/whiskeye/room.json": ("--duration", "4sim"),
 }
 """The examples that keep the conditions of docs/deterministic_runs.md, with how they end."""
 

@@ -13,11 +13,12 @@ from heading_error import compare, heading_error, yaw_of
 from views import stamp_ns
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
-from neuros.visualise import VisualiseLines, VisualiseRotations
+from neuros.visualise import VisualiseImages, VisualiseLines, VisualiseRotations
 
 COLOURS = {"uncorrected": "C0", "vision": "C2", "corrected": "C3"}
 NAMES = {"uncorrected": "ring alone", "vision": "vision alone", "corrected": "corrected ring"}
 TRUTH, SURPRISE = "true heading", "prediction error of the view"
+PREDICTED = "what the network predicts for the left and the right eye"
 
 
 class Headings:
@@ -32,6 +33,8 @@ class Headings:
             self.angles.add_radians(NAMES[name], colour)
         self.surprise = VisualiseLines(SURPRISE, None, y_label="mean square", below=self.angles)
         self.surprise.add_line(SURPRISE)
+        self.views = VisualiseImages("predicted view", below=self.angles)
+        self.views.add_image(PREDICTED)
 
     def keep(self, name, packet):
         stamp, heading_rad = stamp_ns(packet), packet.vector.z
@@ -71,6 +74,11 @@ def show_corrected(node, estimate):
 @neuros_function(inputs="prediction_error")
 def show_prediction_error(node, error):
     node.get_user_data().surprise.plot(SURPRISE, error.vector.x, stamp_ns(error) * 1e-9)
+
+
+@neuros_function(inputs="predicted_view")
+def show_predicted_view(node, view):
+    node.get_user_data().views.plot(PREDICTED, view, stamp_ns(view) * 1e-9)
 
 
 @neuros_finalise()

@@ -63,7 +63,7 @@ class Learner:
 
     def _errors(self, views, headings_rad):
         """RMS and median error in degrees, and the median prediction error of the views."""
-        codes, errors = self.predictor.network.infer(views.astype(np.float32))
+        codes, errors, _ = self.predictor.network.infer(views.astype(np.float32))
         told_rad = np.array([heading_of(code) for code in codes])
         off_deg = np.abs(np.degrees(np.angle(np.exp(1j * (told_rad - headings_rad)))))
         return {
@@ -80,18 +80,17 @@ def start(node):
 
 @neuros_function(
     inputs=["left_eye", "right_eye", "heading"],
-    outputs=["odom_correction", Optional("prediction_error")],
+    outputs=["odom_correction", Optional("prediction_error"), Optional("predicted_view")],
 )
 def look(node, left, right, heading):
     learner = node.get_user_data()
     if learner.name(stamp_ns(heading), heading.vector.z):
         before, after = learner.learn()
         report(node, learner, before, after)
-    view = view_of(left, right) if left.height else None
-    correction, error = learner.predictor.packets(node, left.header, view)
-    if error is not None and correction.vector.x > float(os.environ.get("GATE", "0.12")):
-        learner.keep(stamp_ns(left), view)
-    return correction, error
+    packets = learner.predictor.packets(node, left, right)
+    if left.height and packets[0].vector.x > float(os.environ.get("GATE", "0.12")):
+        learner.keep(stamp_ns(left), view_of(left, right))
+    return packets
 
 
 def report(node, learner, before, after):

@@ -5,18 +5,20 @@ For each pair of pictures it sends ``odom_correction``: the heading in ``vector.
 whether to trust it; in ``vector.y`` how far the heading is off at such an error, as one standard
 deviation in radians, which the training measured at views that it had held out. And it sends
 ``prediction_error``: ``x``, ``y`` and ``z`` are the mean squared errors of view, first and second
-layer. For a pair without pixels the heading is NaN: nothing was seen.
+layer; and ``predicted_view``: what it expects to see there, both eyes side by side. For a pair
+without pixels the heading is NaN, and there is nothing else: nothing was seen.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from array import array
 from pathlib import Path
 
 import numpy as np
 from predictive_coding import PredictiveCodingNetwork
-from views import heading_of, stamp_ns, view_of
+from views import heading_of, picture_of, stamp_ns, view_of
 
 from neuros.errors import NodeError
 from neuros.hooks import Optional, neuros_function, neuros_initialise
@@ -62,20 +64,25 @@ class Predictor:
             what = f"'{named}' cannot be read ({error})" if named else "is not set"
             raise NodeError(f"WEIGHTS {what}: {HOW}") from error
 
-    def packets(self, node, header, view):
-        """``odom_correction`` and ``prediction_error`` for a view; ``None``: there was none."""
+    def packets(self, node, left, right):
+        """All outputs for a pair of pictures; of one without pixels ``odom_correction`` alone."""
         correction = node.make_packet("odom_correction")
-        correction.header = header
-        if view is None:
+        correction.header = left.header
+        if not left.height:
             correction.vector.x, correction.vector.z = math.inf, math.nan
-            return correction, None
-        codes, errors = self.network.infer(view[None])
+            return correction, None, None
+        codes, errors, predicted = self.network.infer(view_of(left, right)[None])
         correction.vector.x, correction.vector.z = float(errors[0, 0]), heading_of(codes[0])
         correction.vector.y = self._rad_per_error * correction.vector.x
         error = node.make_packet("prediction_error")
-        error.header = header
+        error.header = left.header
         error.vector.x, error.vector.y, error.vector.z = map(float, errors[0])
-        return correction, error
+        pixels = picture_of(predicted[0], left, right)
+        view = node.make_packet("predicted_view")
+        view.header, view.encoding = left.header, "rgb8"
+        view.height, view.width, view.step = *pixels.shape[:2], 3 * pixels.shape[1]
+        view.data = array("B", pixels.tobytes())
+        return correction, error, view
 
 
 @neuros_initialise()
@@ -85,12 +92,9 @@ def start(node):
 
 @neuros_function(
     inputs=["left_eye", "right_eye"],
-    outputs=[Optional("odom_correction"), Optional("prediction_error")],
+    outputs=[Optional(name) for name in ("odom_correction", "prediction_error", "predicted_view")],
 )
 def look(node, left, right):
     predictor, eyes = node.get_user_data()
     pairs = eyes.pairs(left, right)
-    if not pairs:
-        return None
-    left, right = pairs[-1]
-    return predictor.packets(node, left.header, view_of(left, right) if left.height else None)
+    return predictor.packets(node, *pairs[-1]) if pairs else None

@@ -91,24 +91,30 @@ class PredictiveCodingNetwork:
             rate = first * (last / first) ** (epoch / max(1, epochs - 1))
             order = self._rng.permutation(len(views))
             batches = np.array_split(order, max(1, len(order) // BATCH))
-            errors = [self._learn_batch(views[some], codes[some], adam, rate) for some in batches]
+            errors = []
+            for some in batches:
+                rises, error = self._rises(views[some], codes[some])
+                adam.climb(rises, rate)
+                errors.append(error)
             yield float(np.mean(errors))
         self._learn_to_read(views, codes)
 
-    def infer(self, views: Floats) -> tuple[Floats, Floats]:
-        """Codes ``(n, codes)`` of views ``(n, pixels)``, and errors ``(n, 3)``.
+    @property
+    def computed_by(self) -> str:
+        """The library, and what it computes on."""
+        return "NumPy on the processor"
+
+    def infer(self, views: Floats) -> tuple[Floats, Floats, Floats]:
+        """Codes ``(n, codes)`` of views ``(n, pixels)``, errors ``(n, 3)``, and predicted views.
 
         The errors are the mean squared ones of the view and of the two layers above it: how well
-        the network knows what it sees. The first is large for what it never saw.
+        the network knows what it sees. The first is large for what it never saw. The predicted
+        views ``(n, pixels)`` are what it expects to see for the causes that it infers.
         """
         layers = self._see(views - self._mean)
-        errors = np.stack([np.mean(np.square(e), axis=1) for e in self._errors(layers)], axis=1)
-        return _readable(layers) @ self._read, errors
-
-    def predicted(self, views: Floats) -> Floats:
-        """What it expects to see for the causes that it infers of views ``(n, pixels)``; alike."""
-        layers = self._see(views - self._mean)
-        return _active(layers[1]) @ self._down[0] + self._mean
+        missed = self._errors(layers)
+        errors = np.stack([np.mean(np.square(each), axis=1) for each in missed], axis=1)
+        return _readable(layers) @ self._read, errors, views - missed[0]
 
     def _drawn(self, causes: int, predicted: int) -> Floats:
         drawn = self._rng.normal(0.0, 1.0 / np.sqrt(causes), (causes, predicted))
@@ -140,13 +146,14 @@ class PredictiveCodingNetwork:
                 cause += speed
         return [views, *causes]
 
-    def _learn_batch(self, views: Floats, codes: Floats, adam: _Adam, rate: float) -> float:
+    def _rises(self, views: Floats, codes: Floats) -> tuple[list[Floats], float]:
+        """How fast the energy falls with each weight, at the causes of some views; view error."""
         layers = self._see(views, codes, LEARNING_STEPS)
         errors = self._errors(layers)
         missed = codes - _active(layers[-1]) @ self._code
         rises = [_active(above).T @ e for above, e in zip(layers[1:], errors, strict=True)]
-        adam.climb([*rises, CODE_WEIGHT * (_active(layers[-1]).T @ missed)], rate)
-        return float(np.mean(np.square(errors[0])))
+        rises.append(CODE_WEIGHT * (_active(layers[-1]).T @ missed))
+        return rises, float(np.mean(np.square(errors[0])))
 
     def _learn_to_read(self, views: Floats, codes: Floats) -> None:
         """Let the code be predicted from the causes that the view alone brings about."""

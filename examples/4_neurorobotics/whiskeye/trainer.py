@@ -26,9 +26,14 @@ PROGRESS_S = 5.0
 
 
 class Examples:
-    """What has been gathered: views, headings in rad, positions in m."""
+    """What has been gathered, and the class of the network that is to learn it.
 
-    def __init__(self):
+    Attributes:
+        views, headings_rad, positions_m: of each example, in order.
+    """
+
+    def __init__(self, network_class=PredictiveCodingNetwork):
+        self.network_class = network_class
         self.views, self.headings_rad, self.positions_m = [], [], []
 
 
@@ -59,7 +64,8 @@ def train(node, examples):
     parts = split(headings_rad, np.array(examples.positions_m))
     learnt_views, learnt_rad = views[parts.learnt], headings_rad[parts.learnt]
     codes = np.array([code_of(heading) for heading in learnt_rad])
-    network = PredictiveCodingNetwork(PIXELS, CODES, derive_seed(seed, node.name))
+    network = examples.network_class(PIXELS, CODES, derive_seed(seed, node.name))
+    node.get_logger().info(f"learns {len(codes)} views with {network.computed_by}")
     began_s = said_s = perf_counter()
     for epoch, error in enumerate(network.learn(learnt_views, codes, epochs), 1):
         if perf_counter() - said_s > PROGRESS_S or epoch == epochs:
@@ -67,13 +73,14 @@ def train(node, examples):
             node.get_logger().info(
                 f"epoch {epoch} of {epochs}: view error {error:.3f}, {said_s - began_s:.0f} s"
             )
-    figures = {"seed": seed, "epochs": epochs, "training_s": perf_counter() - began_s}
+    figures = {"seed": seed, "epochs": epochs, "computed_by": network.computed_by}
+    figures["training_s"] = perf_counter() - began_s
     figures["views"] = {"learnt": int(parts.learnt.sum())}
     squares = []
     for name in ("headings", "places"):
         held = getattr(parts, name)
         figures["views"][name] = int(held.sum())
-        found, errors = network.infer(views[held])
+        found, errors, _ = network.infer(views[held])
         told = {
             "network": np.array([heading_of(code) for code in found]),
             "nearest_neighbour": nearest_neighbour(learnt_views, learnt_rad, views[held]),

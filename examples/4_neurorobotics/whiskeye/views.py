@@ -26,8 +26,19 @@ def view_of(left: Any, right: Any) -> Floats:
 
     Mean 0 and standard deviation 1 over both, ``(1152,)``.
     """
-    small = np.concatenate([_averaged(image) for image in (left, right)])
+    small = _averaged(left, right)
     return ((small - small.mean()) / (small.std() + 1e-6)).astype(np.float32)
+
+
+def picture_of(view: Floats, left: Any, right: Any) -> NDArray[np.uint8]:
+    """A view ``(1152,)`` as a picture, both eyes side by side: as large and light as these images.
+
+    Of images of 80 x 60 pixels it is ``(60, 160, 3)``.
+    """
+    small = _averaged(left, right)
+    pixels = np.clip(small.mean() + small.std() * view, 0, 255).astype(np.uint8)
+    eyes = np.hstack(list(pixels.reshape(2, HEIGHT, WIDTH, 3)))
+    return eyes.repeat(left.height // HEIGHT, axis=0).repeat(left.width // WIDTH, axis=1)
 
 
 def code_of(heading_rad: float) -> Floats:
@@ -45,7 +56,11 @@ def stamp_ns(packet: Any) -> int:
     return packet.header.stamp.sec * 1_000_000_000 + packet.header.stamp.nanosec
 
 
-def _averaged(image: Any) -> NDArray[np.float64]:
-    pixels = np.frombuffer(image.data, dtype=np.uint8).reshape(image.height, image.width, 3)
-    blocks = pixels.reshape(HEIGHT, image.height // HEIGHT, WIDTH, image.width // WIDTH, 3)
-    return blocks.mean(axis=(1, 3)).ravel()
+def _averaged(*images: Any) -> NDArray[np.float64]:
+    """Mean colours of blocks of pixels, 16 x 12 of each image, one after the other."""
+    small = []
+    for image in images:
+        pixels = np.frombuffer(image.data, dtype=np.uint8)
+        blocks = (HEIGHT, image.height // HEIGHT, WIDTH, image.width // WIDTH, 3)
+        small.append(pixels.reshape(blocks).mean(axis=(1, 3)).ravel())
+    return np.concatenate(small)
