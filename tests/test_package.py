@@ -17,6 +17,8 @@ import pytest
 
 from neuros.backends.environments.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
+from neuros.installation.packages import find_uv, run_installs
+from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ("containers", "examples", "schema", "workspace")
@@ -157,7 +159,7 @@ class TestInstalled:
 def test_three_commands_lead_to_a_robot_that_moves(
     version: tuple[int, int], wheel: Path, tmp_path: Path
 ) -> None:
-    """In an empty environment, with all that it needs from the index."""
+    """In an empty environment, with what it needs from the index; ``.ci/bare`` does it with pip."""
     python = find_python(version, os.environ)
     if python is None:
         pytest.skip(f"there is no Python {version} on this machine")
@@ -165,7 +167,11 @@ def test_three_commands_lead_to_a_robot_that_moves(
     environ.pop("VIRTUAL_ENV", None)
     run(python, "-m", "venv", tmp_path / "venv", cwd=tmp_path, environ=environ)
     environ["PATH"] = f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{environ['PATH']}"
-    run("pip", "install", f"{wheel}[mujoco,nest,plot]", cwd=tmp_path, environ=environ)
+    made, wanted = tmp_path / "venv", [[f"{wheel}[mujoco,nest,plot]"]]
+    progress = Progress(sys.stdout)
+    uv = find_uv(Path(sys.executable), environ)
+    log = tmp_path / "log"
+    assert not run_installs(made / "bin" / "python", uv, wanted, made, log, progress, environ)
     run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
     command = ("neuros", "launch", "whiskeye", "--backend", "process", "-o", "run")
     assert "head-direction error: RMS" in run(*command, cwd=tmp_path, environ=environ)

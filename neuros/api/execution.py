@@ -193,7 +193,7 @@ class Execution:
     def _how_to_look(self) -> str:
         """The commands that show the topics of the run, to be copied."""
         own = f"to look into it: neuros topic list {self._run_id[:8]}"
-        if self._plan.back_end.is_one_process or self._plan.request.isolate:
+        if self._plan.request.isolate:
             return own
         return f"{own}, or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
 

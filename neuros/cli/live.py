@@ -1,7 +1,7 @@
 """``neuros topic`` and ``neuros logs``: look into a run from another terminal, without ROS 2.
 
 What packets hold is sampled by the nodes, as for the dashboard, and comes over the control channel:
-so it is the same on every back end, and nothing of it is on the ROS graph.
+so it is the same on every back end, with --isolate, too.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Topic:
     """What packets of a run go through.
 
     Attributes:
-        name: on the ROS graph; topics of connections are there unless all nodes share a process.
+        name: on the ROS graph.
         connection: ``a.out -> b.in``; ``None`` for an external topic.
         node, port: who samples its packets, and under which name; ``None``: nobody in this run.
     """
