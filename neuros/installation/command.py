@@ -113,7 +113,7 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
     parser.add_argument(
         "--test",
         action="store_true",
-        help="then run all checks and tests, for which root installs packages of Debian",
+        help="then run all checks and tests; root first installs the Debian packages for them",
     )
     _add_container_options(parser)
     options = parser.parse_args(arguments)
@@ -132,14 +132,14 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
 
 def _add_container_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
-        "containers", "Where Docker is, the images that nodes run in are built, too."
+        "containers", "If there is a Docker engine, the images that nodes run in are built, too."
     )
     which = group.add_mutually_exclusive_group()
     which.add_argument(
         "--containers",
         nargs="+",
         metavar="NAME",
-        help="build these: NeuROS's, images of your own, or all that a project (a folder) needs"
+        help="images to build: NeuROS's, your own, or all that a project (a folder) needs"
         " (default: neuros_python, neuros_mujoco, neuros_nest)",
     )
     which.add_argument("--no-containers", action="store_true", help="build none")

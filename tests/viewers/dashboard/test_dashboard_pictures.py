@@ -91,7 +91,7 @@ def test_a_compressed_image_goes_through_as_it_is() -> None:
     [
         (message(2, 2, "bayer_rggb8", bytes(4)), "encoding 'bayer_rggb8' are not shown"),
         (message(2, 2, "rgb8", bytes(6)), "6 bytes are not an image of 2 x 2"),
-        (Image(encoding="rgb8"), "no image of 0 x 0"),
+        (Image(encoding="rgb8"), "not an image of 0 x 0"),
     ],
 )
 def test_what_cannot_be_shown_is_told(packet: Image, why: str) -> None:
