@@ -454,7 +454,7 @@ FORMS: Mapping[str, Form] = {
 }
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # it has no types
     """Writes texts of several lines as blocks, and repeats what occurs twice."""
 
     def ignore_aliases(self, data: Any) -> bool:
