@@ -78,6 +78,8 @@ NEEDS = {
     "slurmctld": Need(_daemon("slurmctld"), ("slurmctld",)),
     "slurmd": Need(_daemon("slurmd"), ("slurmd",)),
     "sbatch": Need(_program("sbatch"), ("slurm-client",)),
+    "docker": Need(_program("docker"), ("docker.io",)),
+    "docker-compose": Need(_program("docker-compose"), ("docker-compose",)),
     "ip": Need(_program("ip"), ("iproute2",)),
     "iptables": Need(_program("iptables"), ("iptables",)),
 }

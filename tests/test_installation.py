@@ -58,9 +58,12 @@ class TestMachine:
     def test_another_implementation_is_told_which_one_to_use(self) -> None:
         assert "this is PyPy 3.12" in fault_of(replace(SUPPORTED, implementation="PyPy"))
 
+    def test_for_arm_the_package_index_is_asked(self) -> None:
+        replace(SUPPORTED, processor="aarch64").require_support()
+
     def test_another_processor_is_told_to_use_docker(self) -> None:
-        fault = fault_of(replace(SUPPORTED, processor="aarch64"))
-        assert "this is Linux on aarch64: use Docker, docker run " in fault
+        fault = fault_of(replace(SUPPORTED, processor="riscv64"))
+        assert "this is Linux on riscv64: use Docker, docker run " in fault
 
     def test_another_system_is_told_to_use_docker(self) -> None:
         fault = fault_of(replace(SUPPORTED, system="Darwin", processor="arm64", glibc=()))
@@ -94,6 +97,15 @@ class TestExplanations:
         assert explanation is not None
         assert sentence in explanation
         assert "\n" not in explanation
+
+    def test_a_package_that_the_index_has_not_for_this_processor_is_named(self) -> None:
+        explanation = explain_failure(
+            "cause: Because ros-rclpy==7.1.6 has no wheels with a matching platform tag (e.g.,"
+            " `manylinux_2_28_aarch64`) and you require ros-rclpy==7.1.6, we can conclude that your"
+            " requirements are unsatisfiable."
+        )
+        assert explanation is not None
+        assert "no ros-rclpy for this processor (aarch64): use Docker, docker run" in explanation
 
     def test_what_is_not_known_is_not_guessed(self) -> None:
         assert explain_failure("something new") is None

@@ -303,16 +303,14 @@ def _swarm_service(export: Export, part: Part) -> dict[str, Any]:
     return {
         **_service(part),
         "networks": ["nodes"],
-        "tmpfs": ["/tmp"],
         "configs": [{"source": "nodes", "target": str(ROOT / NODES_FILE), "mode": 0o444}],
-        "volumes": [f"runs:{FOLDERS.run}"],
+        "volumes": [f"runs:{FOLDERS.run}", {"type": "tmpfs", "target": "/tmp"}],
         "deploy": deploy,
     }
 
 
 def _service(part: Part) -> dict[str, Any]:
     """What a service of Compose and one of Swarm have in common."""
-    start_s = int(part.command[part.command.index("--peer-timeout") + 1])
     return {
         "image": part.image,
         "build": {"context": ".", "args": {"BASE": part.base}},
@@ -321,17 +319,16 @@ def _service(part: Part) -> dict[str, Any]:
         "read_only": True,
         "cap_drop": ["ALL"],
         "stop_grace_period": f"{_STOP_S}s",
-        "healthcheck": {
-            "test": ["CMD", *_is_up(part)],
-            "interval": f"{_PROBE_S}s",
-            "start_period": f"{start_s}s",
-        },
+        "healthcheck": {"test": ["CMD", *_is_up(part)], "interval": f"{_PROBE_S}s"},
     }
 
 
 def _is_up(part: Part) -> list[str]:
-    """The command that succeeds while the launcher of a node listens to it."""
-    return ["test", "-S", f"{part.run}/control.sock"]
+    """The command that succeeds while the launcher of a node listens to it, and before it does.
+
+    Swarm tells others the address of a healthy container only, and each waits for the others.
+    """
+    return ["sh", "-c", f"test ! -e {part.run} || test -S {part.run}/control.sock"]
 
 
 def _kubernetes(export: Export) -> list[dict[str, Any]]:
@@ -366,16 +363,13 @@ def _job(export: Export, part: Part, app: Mapping[str, str]) -> dict[str, Any]:
         limits["memory"] = f"{resources.mem_bytes}"
     if gpus:
         limits["nvidia.com/gpu"] = "1" if gpus == ("all",) else str(len(gpus))
-    probe = {"exec": {"command": _is_up(part)}, "periodSeconds": _PROBE_S}
-    start_s = export.options.peer_timeout
     container = {
         "name": "node",
         "image": part.image,
         "imagePullPolicy": "IfNotPresent",
         "args": list(part.command),
         "resources": {"limits": limits} if limits else {},
-        "startupProbe": {**probe, "failureThreshold": -(-start_s // _PROBE_S)},
-        "livenessProbe": probe,
+        "livenessProbe": {"exec": {"command": _is_up(part)}, "periodSeconds": _PROBE_S},
         "securityContext": {
             "allowPrivilegeEscalation": False,
             "readOnlyRootFilesystem": True,
@@ -460,7 +454,7 @@ FORMS: Mapping[str, Form] = {
 }
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # it has no types
     """Writes texts of several lines as blocks, and repeats what occurs twice."""
 
     def ignore_aliases(self, data: Any) -> bool:

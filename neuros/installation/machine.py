@@ -24,7 +24,10 @@ _OPENGL = {
     "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),),
 }
 
-_DOCKER = 'docker run --rm -it --platform linux/amd64 -v "$PWD":/neuros -w /neuros python:3.12 bash'
+IN_DOCKER = (
+    'docker run --rm -it --platform linux/amd64 -v "$PWD":/neuros -w /neuros python:3.12 bash'
+)
+"""A shell where there are packages; on another processor it is emulated, which takes long."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +54,20 @@ class Machine:
         )
 
     def require_support(self) -> None:
-        """Raise ``EnvironmentFault`` where no packages exist."""
-        if self.system != "Linux" or self.processor != "x86_64":
+        """Raise ``EnvironmentFault`` where no packages can exist.
+
+        Which ones exist for ARM (aarch64), the package index knows when they are installed.
+        """
+        if self.system != "Linux" or self.processor not in ("x86_64", "aarch64"):
             raise EnvironmentFault(
-                "the Python packages of ROS 2 exist for Linux on x86_64 only, and this is "
-                f"{self.system} on {self.processor}: use Docker, {_DOCKER}"
+                "the Python packages of ROS 2 exist for Linux on 64-bit processors of the kinds"
+                f" x86_64 and aarch64 at most, and this is {self.system} on {self.processor}: use"
+                f" Docker, {IN_DOCKER}"
             )
         if self.glibc < (2, 28):
             raise EnvironmentFault(
                 "the Python packages of ROS 2 need glibc 2.28 or newer (Debian 10, Ubuntu 20.04), "
-                f"which this system does not have: use Docker, {_DOCKER}"
+                f"which this system does not have: use Docker, {IN_DOCKER}"
             )
         if self.implementation != "CPython" or not OLDEST <= self.python <= NEWEST:
             raise EnvironmentFault(

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import other_python, system_install
+from neuros.installation.machine import IN_DOCKER, other_python, system_install
 from neuros.installation.progress import Progress
 
 LOG = "neuros-install.log"
@@ -49,6 +49,10 @@ _IN_UV = {
     "client-cert": "SSL_CLIENT_CERT",
     "proxy": "HTTPS_PROXY",
 }
+_NOT_FOR_PROCESSOR = (
+    r"(?P<package>[\w.-]+?)(==\S+)?\s+has\s+no\s+wheels\s+with\s+a\s+matching\s+platform\s+tag"
+    r"\s+\(e\.g\.,\s+`\w*?_(?P<platform>[a-z]\w*)`\)"
+)
 _DISK_IS_FULL = "No space left on device|Disk quota exceeded"
 _OF_NO_EFFECT = {
     *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
@@ -197,8 +201,8 @@ def run_installs(
     elif uv and in_uv is not None:
         command = [str(uv), *_UV_INSTALL, "--python", str(python)]
         output = _run_each(command, calls, folder, log, progress, {**environ, **in_uv})
-        if output is None or re.search(_DISK_IS_FULL, output):
-            return output
+        if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
+            return output  # pip would not find more
         progress.step(f"uv failed: trying pip (log: {log})")
     return _run_each([str(python), *PIP_INSTALL], calls, folder, log, progress, environ)
 
@@ -318,10 +322,15 @@ def explain_failure(text: str) -> str | None:
             " use another index (export PIP_INDEX_URL=https://pypi.org/simple), or, if you trust"
             " this one, install.py --newest, which does without lock files"
         )
+    if match := re.search(_NOT_FOR_PROCESSOR, text):
+        return (
+            f"the package index has no {match['package']} for this processor ({match['platform']}):"
+            f" use Docker, {IN_DOCKER}"
+        )
     sentence = explain_machine(text)
     if sentence is None and re.search("No matching distribution|Could not find a version", text):
         return (
-            f"a package does not exist for this Python: run {other_python()} install.py"
+            f"a package does not exist for this Python or processor: run {other_python()} install.py"
             " (with --wheelhouse: or it is not in there; with an index of your own: --newest takes"
             " the versions that it has)"
         )
