@@ -112,6 +112,14 @@ class Request(ProjectOptions):
         help="name the other machines, by address or name, where multicast does not reach them;"
         " implies --network",
     )
+    deployment: str | os.PathLike[str] | None = option(
+        "--deployment",
+        metavar="FILE",
+        is_recorded=False,
+        page="deployment.md",
+        help="run nodes on the machines that this file names for them, which are reached by ssh;"
+        " the others run here, and so does everything else",
+    )
     isolate: bool = option(
         "--isolate",
         default=False,

@@ -65,6 +65,7 @@ COMMANDS = {
     "reproduce": Command("checkout", "make the published experiments again"),
     "node": Command("node"),
     "import-plugin": Command("projects"),
+    "agent": Command("agent"),
     "recorder": Command("recorder"),
     "replayed": Command("replay"),
     "dashboard": Command("views"),
