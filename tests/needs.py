@@ -78,6 +78,8 @@ NEEDS = {
     "slurmctld": Need(_daemon("slurmctld"), ("slurmctld",)),
     "slurmd": Need(_daemon("slurmd"), ("slurmd",)),
     "sbatch": Need(_program("sbatch"), ("slurm-client",)),
+    "sshd": Need(_daemon("sshd"), ("openssh-server",)),
+    "ssh": Need(_program("ssh"), ("openssh-client",)),
     "ip": Need(_program("ip"), ("iproute2",)),
     "iptables": Need(_program("iptables"), ("iptables",)),
 }

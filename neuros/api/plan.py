@@ -220,7 +220,7 @@ def make_plan(
         _check_deployment(request)
         file = load_deployment(Path(request.deployment), project)
         nodes = [node for node in nodes if node.name not in file.places]
-        wanted, network = _ON_MACHINES, Network(bool(file.hosts))
+        wanted, network = _ON_MACHINES, Network(bool(file.places))
     chosen = choose(wanted, project, nodes, request.backend_options or {})
     if request.deployment is not None:
         machines = Machines(

@@ -305,7 +305,7 @@ class Agent:
                     return True
             if how is not None:
                 del self._processes[name]
-                self._pump.send(NodeEnded(name, how))
+                self._pump.send_last(NodeEnded(name, how))
         return has_sent
 
     def _send(self, chunk: Chunk) -> None:

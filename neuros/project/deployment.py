@@ -48,7 +48,7 @@ class DeploymentFile:
     """A checked deployment.
 
     Attributes:
-        hosts: the machines besides this one on which nodes run, by name.
+        hosts: the machines besides this one, by name.
         places: by node, the name of its host; none: it runs here.
         here: what the file says of this machine.
         timeout_s: a machine that has given no sign of life for so long counts as gone.
@@ -59,6 +59,11 @@ class DeploymentFile:
     places: Mapping[str, str]
     here: Host = field(default_factory=lambda: Host(HERE))
     timeout_s: float = TIMEOUT_S
+
+    @property
+    def used(self) -> list[Host]:
+        """The machines besides this one on which nodes run."""
+        return [host for name, host in self.hosts.items() if name in self.places.values()]
 
 
 def load_deployment(path: Path, project: Project | None = None) -> DeploymentFile:
@@ -78,10 +83,9 @@ def load_deployment(path: Path, project: Project | None = None) -> DeploymentFil
         raise ProjectError(problems)
     hosts = {name: _host(name, each) for name, each in (root.plain.get("hosts") or {}).items()}
     places = {node: host for node, host in root.plain.get("nodes", {}).items() if host != HERE}
-    used = {name: host for name, host in hosts.items() if name in places.values()}
     timeout_s = float(root.plain.get("timeout_s", TIMEOUT_S))
-    here = hosts.get(HERE, Host(HERE))
-    return DeploymentFile(path.absolute(), used, places, here, timeout_s)
+    here = hosts.pop(HERE, Host(HERE))
+    return DeploymentFile(path.absolute(), hosts, places, here, timeout_s)
 
 
 def _host(name: str, keys: Mapping[str, object]) -> Host:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,15 @@ class Side:
     def host(self) -> Host:
         return self.machine.host
 
+    def described(self) -> str:
+        """What is known of it, in a line."""
+        ready, clock = self.ready, self.machine.clock
+        return (
+            f"{self.host.ssh or ' '.join(self.host.through)}: {ready.machine}, Python"
+            f" {ready.python}, NeuROS {ready.version}, at {self.address}; round trip"
+            f" {1e3 * clock.round_trip_s:.1f} ms, clock {clock.unix_s:+.3f} s"
+        )
+
 
 class Machines(Deployment):
     """Nodes on several machines.
@@ -100,13 +109,18 @@ class Machines(Deployment):
         Raises:
             EnvironmentFault: with all that went wrong; none of them is held any more then.
         """
-        hosts = list(self.file.hosts.values())
+        hosts = self.file.used
+        held: list[Machine] = []
         with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
-            work = [threads.submit(self._side, host, log) for host in hosts]
+            work = [threads.submit(self._side, host, log, held) for host in hosts]
             try:
-                faults = [fault for each in work if (fault := each.exception())]
-            finally:  # Ctrl+C
-                self.sides = [each.result() for each in work if not each.exception()]
+                wait(work)
+            except BaseException:  # Ctrl+C
+                for machine in tuple(held):
+                    machine.close()
+                raise
+        faults = [fault for each in work if (fault := each.exception())]
+        self.sides = [each.result() for each in work if not each.exception()]
         if faults:
             self.close()
             others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
@@ -151,18 +165,8 @@ class Machines(Deployment):
         if not self.sides:
             return faults
         with ThreadPoolExecutor(len(self.sides), "neuros-machines") as threads:
-            for side, left in zip(
-                self.sides,
-                threads.map(lambda side: side.machine.finish(is_enough), self.sides),
-                strict=True,
-            ):
-                side.left = left
-                if side.machine.fault:
-                    faults.append(side.machine.fault)
-                if left is not None:
-                    faults += [f"{side.host.name}: {problem}" for problem in left.problems]
-                elif not side.machine.lost:
-                    faults.append(f"not all that nodes have left on {side.host.name} came here")
+            for found in threads.map(lambda side: _bring_home(side, is_enough), self.sides):
+                faults += found
         return faults
 
     def node_there(self, file: NodeFile, side: Side) -> NodeFile:
@@ -188,8 +192,9 @@ class Machines(Deployment):
         node = translated(file.node, move)
         return replace(file, node=node, folders=there, messages=side.messages)
 
-    def _side(self, host: Host, log: Log) -> Side:
+    def _side(self, host: Host, log: Log, held: list[Machine]) -> Side:
         machine = Machine(host, self.file.timeout_s, log)
+        held.append(machine)
         try:
             ready = machine.greet()
             names = tuple(node for node, place in self.places.items() if place == host.name)
@@ -290,6 +295,20 @@ class NodeElsewhere:
 
     def kill(self) -> None:
         self.side.machine.signal(self.name, "KILL")
+
+
+def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
+    """Have what the nodes have left there sent here; returns what could not be had."""
+    machine, was_lost = side.machine, bool(side.machine.lost)
+    side.left = machine.finish(is_enough)
+    machine.move_times(side.nodes)
+    faults = [machine.fault] if machine.fault else []
+    if side.left is not None:
+        faults += [f"{side.host.name}: {problem}" for problem in side.left.problems]
+    elif not was_lost:
+        why = f": {machine.lost}" if machine.lost else ""
+        faults.append(f"not all that nodes have left on {side.host.name} came here{why}")
+    return faults
 
 
 def _texts(run: Path) -> dict[str, str]:

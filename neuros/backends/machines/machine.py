@@ -55,6 +55,8 @@ _MOST_UNSENT_BYTES = 1 << 20
 _LOOK_S = 0.05
 _COMMAND_NOT_FOUND = 127
 _ENDS_S = 5.0
+_PACKET_LOG = "packets"  # of a node, in its folder
+_EXITS_S = 0.5
 _SAID_LAST_BYTES = 2000
 
 Log = Callable[[str, str], None]
@@ -85,6 +87,7 @@ class Machine:
         self._run: Path | None = None
         self._ends: dict[str, str] = {}
         self._fault = ""
+        self._is_closed = False
         self._answers: list[Message] = []
         self._arrived = threading.Condition()
         command = agent_command(host)
@@ -214,8 +217,21 @@ class Machine:
         finally:
             self.close()
 
+    def move_times(self, nodes: Sequence[str]) -> None:
+        """Have the packet logs that came from there on the clock of this machine."""
+        if self._run is None:
+            return
+        for node in nodes:
+            try:
+                self.clock.log_here(self._run / node / _PACKET_LOG)
+            except OSError as error:
+                self._fault = self._fault or f"the packet log of {node} cannot be moved: {error}"
+
     def close(self) -> None:
-        """Hang up; the agent ends what is left."""
+        """Hang up; the agent ends what is left. Any thread."""
+        with self._arrived:
+            self._is_closed = True
+            self._arrived.notify_all()
         self._pump.end()
         if self._pump is not threading.current_thread():
             self._pump.join(_ENDS_S)
@@ -240,6 +256,8 @@ class Machine:
             case NodeEnded(node, how):
                 self._ends[node] = how
             case _:
+                if isinstance(message, Finished):
+                    self._pump.end()  # that it hangs up now is no fault
                 with self._arrived:
                     self._answers.append(message)
                     self._arrived.notify_all()
@@ -263,15 +281,17 @@ class Machine:
     def _lose(self, reason: str) -> None:
         code = None
         with contextlib.suppress(subprocess.TimeoutExpired):
-            code = self._process.wait(1.0)
+            code = self._process.wait(_EXITS_S)
         if code is None:
             self._process.kill()  # it would go on trying for minutes
-        self._errors.join(1.0)
+        self._errors.join(_EXITS_S)
         said = self._errors.last
         if code == _COMMAND_NOT_FOUND:
             said += f": name the command neuros there in /hosts/{self.host.name}/neuros"
         with self._arrived:
             self.lost = f"{reason} ({said})" if said else reason
+            if self._run is not None:
+                self.lost += f"; what nodes have written there is in {self.folders.run} there"
             self._arrived.notify_all()
 
     def _connect(self) -> ControlStream:
@@ -289,8 +309,8 @@ class Machine:
         end_s = None if limit_s is None else time.monotonic() + limit_s
         with self._arrived:
             while not self._answers:
-                if self.lost:
-                    raise self._failed(self.lost)
+                if self.lost or self._is_closed:
+                    raise self._failed(self.lost or "it is not needed any more")
                 if is_enough() or (end_s is not None and time.monotonic() > end_s):
                     raise self._failed("it did not answer in time")
                 self._arrived.wait(_LOOK_S)

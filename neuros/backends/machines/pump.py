@@ -12,6 +12,7 @@ import selectors
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 from neuros.control import Message
@@ -65,6 +66,7 @@ class Pump(threading.Thread):
         self._lock = threading.Lock()
         self._unsent = bytearray()
         self._rest = b""
+        self._last: deque[Message] = deque()
         self._links: dict[int, _Link] = {}
         self._count = 0
         self._listener: ControlListener | None = None
@@ -85,6 +87,11 @@ class Pump(threading.Thread):
         """Send it, now or later. Any thread."""
         with self._lock:
             self._unsent += encode(message)
+        self._wake()
+
+    def send_last(self, message: Message) -> None:
+        """Send it after all that has been said on control connections by now. Any thread."""
+        self._last.append(message)
         self._wake()
 
     @property
@@ -109,7 +116,7 @@ class Pump(threading.Thread):
         reason = ""
         next_s = 0.0
         try:
-            while not reason and not (self._is_ending and not self._unsent):
+            while not reason and not (self._is_ending and not (self._unsent or self._last)):
                 now_s = time.monotonic()
                 if now_s >= next_s:
                     next_s = now_s + BEAT_S
@@ -118,14 +125,16 @@ class Pump(threading.Thread):
         except Exception as error:  # else nobody would know that nothing is carried any more
             reason = f"{type(error).__name__}: {error}"
         finally:
+            if reason and not self._is_ending:
+                self._lose(reason)  # before anybody sees that control connections have ended
             for link in tuple(self._links):
                 self._hang_up(link)
             self._selector.close()
+            self._waker.close()
+            self._woken.close()
             for descriptor in {self._read_from, self._write_to}:
                 with contextlib.suppress(OSError):
                     os.close(descriptor)
-        if reason and not self._is_ending:
-            self._lose(reason)
 
     def _turn(self, wait_s: float) -> str:
         """One look at everything; returns why the other end is gone, empty while it is there."""
@@ -142,6 +151,7 @@ class Pump(threading.Thread):
         for number, link in tuple(self._links.items()):
             if link.fileno() in ready:
                 self._relay(number, link)
+        self._send_last()
         if self._write_to in ready and (reason := self._write()):
             return reason
         silent_s = time.monotonic() - self.heard_s
@@ -195,6 +205,8 @@ class Pump(threading.Thread):
             case Closed(number):
                 self._hang_up(number)
             case _:
+                for link in self._links.values():
+                    link.flush()  # what came before is heard before
                 self._take(message)
 
     def _write(self) -> str:
@@ -209,6 +221,16 @@ class Pump(threading.Thread):
         return ""
 
     # ------------------------------------------------------------------ control connections
+
+    def _send_last(self) -> None:
+        count = len(self._last)
+        if not count:
+            return
+        for number, link in tuple(self._links.items()):
+            while number in self._links and self._relay(number, link):
+                pass
+        for _ in range(count):
+            self.send(self._last.popleft())
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -229,12 +251,14 @@ class Pump(threading.Thread):
         self._links[number] = link = _Link(stream)
         self._selector.register(link, selectors.EVENT_READ)
 
-    def _relay(self, number: int, link: _Link) -> None:
-        text, is_open = link.read()
+    def _relay(self, number: int, link: _Link) -> bool:
+        """Pass on what was said; returns whether there may be more right now."""
+        text, size, is_open = link.read()
         if text:
             self.send(Said(number, text))
         if not is_open:
             self._part(number)
+        return is_open and size > 0
 
     def _part(self, number: int) -> None:
         self._hang_up(number)
@@ -263,17 +287,17 @@ class _Link:
     def fileno(self) -> int:
         return self.stream.fileno()
 
-    def read(self) -> tuple[str, bool]:
-        """The lines that have come, and whether there may be more."""
+    def read(self) -> tuple[str, int, bool]:
+        """The lines that have come, how many bytes came, and whether it is still open."""
         try:
             data = self.stream.recv(_READ_BYTES)
         except BlockingIOError:
-            return "", True
+            return "", 0, True
         except OSError:
-            return "", False
+            return "", 0, False
         whole, line_feed, rest = (self._rest + data).rpartition(b"\n")
         self._rest = rest
-        return (whole + line_feed).decode("utf-8", "replace"), bool(data)
+        return (whole + line_feed).decode("utf-8", "replace"), len(data), bool(data)
 
     def flush(self) -> bool:
         """Write what goes through now; False if there is nobody to take it."""
