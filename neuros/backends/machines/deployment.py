@@ -8,6 +8,7 @@ run folder.
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -150,7 +151,7 @@ class Machines(Deployment):
     def as_here(self, text: str, folders: Folders) -> str:
         for side in self.sides:
             for name, there in vars(side.machine.folders).items():
-                text = text.replace(str(there), str(getattr(folders, name)))
+                text = _renamed(text, str(there), str(getattr(folders, name)))
         return self._inner.as_here(text, folders)
 
     def record(self) -> Mapping[str, Any]:
@@ -309,6 +310,11 @@ def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
         why = f": {machine.lost}" if machine.lost else ""
         faults.append(f"not all that nodes have left on {side.host.name} came here{why}")
     return faults
+
+
+def _renamed(text: str, there: str, here: str) -> str:
+    """Text with a path there as the one here; with a colon before it, it is meant to be there."""
+    return re.sub(rf"(?<![\w/.:]){re.escape(there)}\b", lambda _: here, text)
 
 
 def _texts(run: Path) -> dict[str, str]:

@@ -291,7 +291,8 @@ class Machine:
         with self._arrived:
             self.lost = f"{reason} ({said})" if said else reason
             if self._run is not None:
-                self.lost += f"; what nodes have written there is in {self.folders.run} there"
+                where = f"{self.host.ssh or self.host.name}:{self.folders.run}"
+                self.lost += f"; what has not come from there is in {where}"
             self._arrived.notify_all()
 
     def _connect(self) -> ControlStream:
