@@ -142,23 +142,21 @@ class TestClock:
     @pytest.fixture
     def clock(self) -> ClockOffset:
         clock = ClockOffset()
-        now_s = time.monotonic()
-        clock.take(Pong(now_s, now_s + 1000.0, time.time()))
-        clock.monotonic_s = 1000.0
+        clock.take(Pong(5.0, 1005.0, 2e9 + 0.5), 5.0, 2e9)
         return clock
 
     def test_the_fastest_answer_tells_how_far_it_is_ahead(self) -> None:
         clock = ClockOffset()
-        for late_s in (0.5, 0.01, 0.2):
-            now_s = time.monotonic()
-            clock.take(Pong(now_s - late_s, now_s - late_s / 2 + 1000.0, time.time()))
-        assert clock.round_trip_s == pytest.approx(0.01, abs=0.005)
-        assert clock.monotonic_s == pytest.approx(1000.0, abs=0.005)
+        for late_s, ahead_s in ((0.5, 1000.2), (0.01, 1000.0), (0.25, 999.9)):
+            sent_s, there_s = 50.0, 50.0 + late_s / 2 + ahead_s
+            clock.take(Pong(sent_s, there_s, 2e9 - late_s / 2 - 3.0), sent_s + late_s, 2e9)
+        assert clock.round_trip_s == pytest.approx(0.01)
+        assert clock.monotonic_s == pytest.approx(1000.0)
+        assert clock.unix_s == pytest.approx(-3.0)
 
     def test_processes_of_one_machine_have_one_clock(self) -> None:
         clock = ClockOffset()
-        now_s = time.monotonic()
-        clock.take(Pong(now_s - 0.1, now_s - 0.06, time.time()))
+        clock.take(Pong(50.0, 50.06, 2e9), 50.1, 2e9)
         assert clock.monotonic_s == 0.0
 
     def test_what_nodes_report_is_on_the_clock_of_this_machine(self, clock: ClockOffset) -> None:

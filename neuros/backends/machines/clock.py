@@ -7,7 +7,6 @@ a message takes there and back.
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,9 +43,8 @@ class ClockOffset:
     monotonic_s: float = 0.0
     unix_s: float = 0.0
 
-    def take(self, pong: Pong) -> None:
-        """An answer; the fastest one says most."""
-        now_s, now_unix_s = time.monotonic(), time.time()
+    def take(self, pong: Pong, now_s: float, now_unix_s: float) -> None:
+        """An answer that arrives now, by the clocks of this machine; the fastest says most."""
         round_trip_s = now_s - pong.sent_s
         if round_trip_s < self.round_trip_s:
             self.round_trip_s = round_trip_s

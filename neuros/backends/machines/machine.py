@@ -248,7 +248,7 @@ class Machine:
         """A message of the agent; in the thread of the pump."""
         match message:
             case Pong():
-                self.clock.take(message)
+                self.clock.take(message, time.monotonic(), time.time())
             case Chunk():
                 self._keep(message)
             case Remark(severity, text):

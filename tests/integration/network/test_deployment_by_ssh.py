@@ -38,6 +38,7 @@ NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
 ENDLESS = ("--set", "nodes.source.environment.COUNT=0")
 UP_S = 60.0  # on a machine that does many other things
+PATIENCE_S = 600.0
 TIMEOUT_S = 5.0
 GONE_S = 6.0
 """What docs/deployment.md promises, beside the time-out."""
@@ -311,9 +312,9 @@ def test_the_doctor_looks_at_both_machines(
     inside = machines.inside("left", tmp_path)
     done = subprocess.run([*inside, str(NEUROS), *command], capture_output=True, check=False)
     found = {each["subject"]: each for each in json.loads(done.stdout)}
-    assert found["right"]["state"] == "ok"
+    assert found["right"]["state"] == "good"
     assert "at 192.0.2.2; round trip" in found["right"]["text"]
-    assert found["right: ROS 2"]["state"] == "ok"
+    assert found["right: ROS 2"]["state"] == "good"
     assert found["delivery"]["text"].startswith("right: packets arrived: 20 of 20")
 
 
@@ -345,7 +346,7 @@ def test_whiskeye_with_its_physics_on_the_other_machine(
     file.write_text(json.dumps({**json.loads(file.read_text()), "nodes": {"robot": "right"}}))
     options = ("--deployment", str(file), "--record")
     with machines.start("left", WHISKEYE, *options, cwd=tmp_path) as running:
-        finished = running.finish(2 * UP_S)
+        finished = running.finish(PATIENCE_S)
     assert finished.exit_code == 0, finished.output
     imu = finished.connection("robot.imu -> snn.imu")
     assert imu["sent"] == imu["consumed"] >= 990
