@@ -210,7 +210,7 @@ class TestPump:
         node.close()
         ends.agent.send_last(NodeEnded("eye", "exit code 0"))
         ends.wait_for(lambda: ends.to_launcher)
-        # What a node has said before it ended is there when its end is known.
+        supervisor.setblocking(False)  # what it has said before is there when its end is known
         assert supervisor.recv(100) == b"last words\n"
         assert supervisor.recv(100) == b""
         supervisor.close()

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from launching import Finished, Running, start
+from launching import Finished, Running, launch, start
 
 STREAM = Path(__file__).parent / "network" / "stream"
 NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
-ENDED_S = 60.0  # on a machine that does many other things
+ENDED_S = 120.0  # on a machine that does many other things
 
 
 @pytest.fixture
@@ -70,3 +70,14 @@ def test_one_command_starts_nodes_elsewhere_and_brings_home_all_they_leave(
     assert finished.connection(CONNECTION)["latency_ms"]["p50"] > 0
     assert left_there(tmp_path) == []
     assert len(trees_there(tmp_path)) == 1
+
+
+def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(
+    project: Path, tmp_path: Path
+) -> None:
+    file = str(deployment(tmp_path))
+    finished = launch(project, "--deployment", file, "--dry-run", cwd=tmp_path, timeout_s=ENDED_S)
+    assert finished.exit_code == 0, finished.output
+    assert "process source: " in finished.output
+    assert "process sink on other\n" in finished.output
+    assert not list((tmp_path / "elsewhere").iterdir())

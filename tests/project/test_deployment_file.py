@@ -89,5 +89,5 @@ def test_what_is_no_json_is_told_with_its_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ProjectError, match="absent.json"):
+    with pytest.raises(ProjectError, match=r"absent\.json"):
         load_deployment(tmp_path / "absent.json", PROJECT)

@@ -49,7 +49,7 @@ from neuros.project.deployment import Host
 from neuros.project.model import Folders
 
 _SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
-_CONNECT_S = 30.0
+_CONNECT_S = 60.0
 _CONTENT_BYTES = 1 << 18
 _MOST_UNSENT_BYTES = 1 << 20
 _LOOK_S = 0.05

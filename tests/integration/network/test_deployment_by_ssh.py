@@ -82,7 +82,9 @@ def deployed(machines: TwoMachines, server: SshServer, tmp_path: Path) -> Iterat
     file = tmp_path / "deployment.json"
     file.write_text(json.dumps(content))
 
-    def launch(*arguments: str) -> Running:
+    def launch(*arguments: str, **changes: float) -> Running:
+        if changes:
+            file.write_text(json.dumps({**content, **changes}))
         options = ("--deployment", str(file), *arguments)
         return machines.start("left", project, *options, cwd=tmp_path)
 
@@ -97,8 +99,8 @@ def left_there(server: SshServer) -> list[str]:
 
 
 def test_one_command_runs_a_project_on_two_machines(deployed: Deployed, server: SshServer) -> None:
-    with deployed("--record") as running:
-        finished = running.finish(UP_S)
+    with deployed("--record", timeout_s=2 * UP_S) as running:  # however busy this machine is
+        finished = running.finish(2 * UP_S)
     assert finished.exit_code == 0, finished.output
     books = finished.connection(CONNECTION)
     assert (books["sent"], books["received"], books["lost"]) == (100, 100, 0)
@@ -108,8 +110,8 @@ def test_one_command_runs_a_project_on_two_machines(deployed: Deployed, server: 
     assert f"recorded 100 packets on 1 topic: {finished.run_folder}/bag" in finished.output
     # Its clock is a day ahead; what it reports is on the clock of this machine nevertheless.
     assert min(received["ages_s"]) > APART_S / 2
-    assert 0 < books["latency_ms"]["p50"] <= books["latency_ms"]["max"] < 1e3 * UP_S
-    assert finished.record["running_s"] < UP_S
+    assert 0 < books["latency_ms"]["p50"] <= books["latency_ms"]["max"] < 2e3 * UP_S
+    assert finished.record["running_s"] < 2 * UP_S
     assert left_there(server) == []
 
 
