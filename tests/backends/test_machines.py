@@ -206,13 +206,14 @@ class TestPump:
         assert supervisor.recv(100) == b'{"kind": "hello"}\n'
         supervisor.sendall(b'{"kind": "stop"}\n')
         assert node.recv(100) == b'{"kind": "stop"}\n'
-        node.sendall(b"last words\n")
+        words = b"last words\n" * 10_000  # more than is read at once
+        node.sendall(words)
         node.close()
-        ends.agent.send_last(NodeEnded("eye", "exit code 0"))
-        ends.wait_for(lambda: ends.to_launcher)
+        end = NodeEnded("eye", "exit code 0")
+        ends.agent.send_last(end)
+        ends.wait_for(lambda: end in ends.to_launcher)
         supervisor.setblocking(False)  # what it has said before is there when its end is known
-        assert supervisor.recv(100) == b"last words\n"
-        assert supervisor.recv(100) == b""
+        assert b"".join(iter(lambda: supervisor.recv(1 << 16), b"")) == words
         supervisor.close()
 
     def test_who_hangs_up_is_missed_at_once(self, ends: Ends) -> None:

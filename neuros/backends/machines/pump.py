@@ -22,6 +22,7 @@ from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
 
 BEAT_S = 1.0
+_CLOSED = "the connection was closed"
 _READ_BYTES = 1 << 16
 _MOST_UNTOLD_BYTES = 1 << 20
 """A control connection whose other end takes nothing is hung up on from here on."""
@@ -182,7 +183,7 @@ class Pump(threading.Thread):
         except OSError as error:
             return str(error.strerror)
         if not data:
-            return "the connection was closed"
+            return _CLOSED
         self.heard_s = time.monotonic()
         *lines, self._rest = (self._rest + data).split(b"\n")
         try:
@@ -215,6 +216,8 @@ class Pump(threading.Thread):
                 written = os.write(self._write_to, self._unsent[:_READ_BYTES])
             except BlockingIOError:
                 return ""
+            except BrokenPipeError:
+                return _CLOSED
             except OSError as error:
                 return str(error.strerror)
             del self._unsent[:written]
