@@ -1,8 +1,5 @@
-"""All seams of NeuROS on one page.
-
-The engine (:mod:`neuros.engine`) knows nothing of ROS, processes or physics. The rest of
-the world stands behind these protocols: an adapter implements one (layer 4), the runtime and the
-supervisor use it (layer 5), the command line picks it (layer 6).
+"""All seams of NeuROS on one page: an adapter implements one (layer 4), the runtime and the
+supervisor use it (layer 5), the command line picks it. The engine knows none of what is behind.
 """
 
 from __future__ import annotations
@@ -489,6 +486,10 @@ class Deployment(ABC):
     def logs(self, run_folder: Path) -> Mapping[str, Path]:
         """Logs besides those of the nodes, by what is shown of their origin."""
         return {}
+
+    def finish(self, is_enough: Callable[[], bool]) -> Sequence[str]:
+        """Bring here what the nodes have left elsewhere, until ``is_enough()``; returns faults."""
+        return ()
 
     def record(self) -> Mapping[str, Any]:
         """What ``run.json`` is to have of it, ready for JSON; asked for when the run is over."""

@@ -13,20 +13,26 @@ from needs import cannot_run, require
 
 _APART = 'mount -t tmpfs tmpfs /dev/shm && hostname "$0" && '
 _HOLD = "echo ready && exec cat"
+APART_S = 100_000
+"""How far the monotonic clock of a machine with a clock of its own is ahead."""
 
 
 class Machine:
     """A machine called ``name``.
 
     Apart from this one it has a network without any cable, shared memory and its name to itself;
-    else it is this one, but for what is mounted.
+    else it is this one, but for what is mounted. With a clock of its own, its monotonic time began
+    :data:`APART_S` seconds earlier.
 
     Raises:
         RuntimeError: if that is impossible here (root in a container may not).
     """
 
-    def __init__(self, name: str, *, is_apart: bool = False) -> None:
+    def __init__(self, name: str, *, is_apart: bool = False, has_own_clock: bool = False) -> None:
         namespaces = ["--mount", *(["--uts", "--net"] if is_apart else [])]
+        self._has_own_clock = has_own_clock
+        if has_own_clock:  # children of the holder are in it, and what is run inside
+            namespaces += ["--time", f"--monotonic={APART_S}"]
         # It reads until the test closes the pipe, or has ended in whatever way.
         self._holder = subprocess.Popen(
             ["unshare", *namespaces, "sh", "-c", _APART * is_apart + _HOLD, name],
@@ -47,7 +53,9 @@ class Machine:
 
     def inside(self, folder: Path = Path("/")) -> list[str]:
         """The command that executes the one behind it there, with the same process id."""
-        return ["nsenter", f"--target={self.pid}", "--mount", "--uts", "--net", f"--wd={folder}"]
+        clock = [f"--time=/proc/{self.pid}/ns/time_for_children"] if self._has_own_clock else []
+        spaces = ["--mount", "--uts", "--net", *clock]
+        return ["nsenter", f"--target={self.pid}", *spaces, f"--wd={folder}"]
 
     def run(self, *command: str) -> None:
         """Run a command there, which must succeed."""

@@ -80,6 +80,8 @@ NEEDS = {
     "sbatch": Need(_program("sbatch"), ("slurm-client",)),
     "docker": Need(_program("docker"), ("docker.io",)),
     "docker-compose": Need(_program("docker-compose"), ("docker-compose",)),
+    "sshd": Need(_daemon("sshd"), ("openssh-server",)),
+    "ssh": Need(_program("ssh"), ("openssh-client",)),
     "ip": Need(_program("ip"), ("iproute2",)),
     "iptables": Need(_program("iptables"), ("iptables",)),
 }

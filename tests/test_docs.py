@@ -24,6 +24,7 @@ from neuros.errors import NeurosError
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
 from neuros.options import Option
 from neuros.options import options_of as declared_options
+from neuros.project.deployment import load_deployment
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -196,7 +197,7 @@ def json_projects(page: Path) -> Iterator[dict[str, Any]]:
     nodes, projects = [], []
     for body in blocks(page, "json"):
         content = json.loads(body)
-        if "nodes" in content:
+        if isinstance(content.get("nodes"), list):
             projects.append(content)
         elif "container" in content:
             nodes.append(content)
@@ -221,6 +222,15 @@ def test_every_project_shown_is_valid(tmp_path: Path) -> None:
         except NeurosError as error:
             wrong.append(f"{named(page)}: {error}")
     assert not wrong
+
+
+def test_every_deployment_shown_is_valid(tmp_path: Path) -> None:
+    shown = [json.loads(body) for page in PAGES for body in blocks(page, "json")]
+    deployments = [content for content in shown if isinstance(content.get("nodes"), dict)]
+    assert deployments
+    for content in deployments:
+        (tmp_path / "deployment.json").write_text(json.dumps(content))
+        load_deployment(tmp_path / "deployment.json")
 
 
 def test_every_code_block_says_its_language() -> None:

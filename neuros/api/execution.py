@@ -76,6 +76,14 @@ class Execution:
         self._wishes = wishes
         self._views = views
         self._run_id = os.urandom(8).hex()
+        try:
+            self._prepare(stream)
+        except BaseException:
+            plan.deployment.finish(lambda: True)
+            raise
+
+    def _prepare(self, stream: TextIO | None) -> None:
+        plan, signals = self._plan, self._signals
         check_observation(monitors_load=plan.request.monitor_system_load)
         self._recording_plan = recording_of(plan, os.environ)
         if plan.request.isolate and plan.back_end.has_own_network:
@@ -124,6 +132,7 @@ class Execution:
 
     def cancel(self) -> None:
         """Give up what it holds, in the place of :meth:`run`."""
+        self._plan.deployment.finish(lambda: True)
         self._domain.release()
 
     def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:
@@ -149,9 +158,11 @@ class Execution:
             outcome.reason = f"not started: {error}"
             raise
         finally:
+            before = len(self._signals)
+            left_behind = self._plan.deployment.finish(lambda: len(self._signals) > before)
             recorded = None if recording is None else recording.finish(self._signals)
             observed, faults = observation.finish()
-            for fault in (*outcome.faults, *faults):
+            for fault in (*outcome.faults, *left_behind, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
             if self._views is not None:
                 self._views.finish()
@@ -175,6 +186,7 @@ class Execution:
                 "options": recorded_values(self._plan.request),
                 **observed,
             }
+            _add_load_elsewhere(record)
             if recording is not None and recorded is not None:
                 for problem in recording.report(recorded, record):
                     outcome.fail(problem, EXIT_ENVIRONMENT)
@@ -280,6 +292,7 @@ class Execution:
             self._plan.project.names.namespace,
             self._plan.back_end.is_one_process,
             self._listener.address,
+            elsewhere=self._plan.places,
         )
 
     def _supervisor(self, reaper: Reaper) -> Supervisor:
@@ -322,6 +335,15 @@ class Execution:
             "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # the only one that the wheels bring
             "ROS_LOG_DIR": str(self.folder),
         }
+
+
+def _add_load_elsewhere(record: dict[str, Any]) -> None:
+    """The nodes of other machines, in percent of a core there."""
+    own = record.get("system_load")
+    for machine in record.get("machines", {}).values():
+        load = machine["system_load"]
+        if own and load:
+            own["processes"] |= {name: load["processes"].get(name) for name in machine["nodes"]}
 
 
 def _check_reach(recording: RecordingPlan | None) -> None:

@@ -55,7 +55,7 @@ class Observation:
         self._git = GitState(project.folder)
         self._monitor: LoadMonitor | None = None
         if monitors_load:
-            self._monitor = _monitor(run_id, run_folder, names, is_one_process=is_one_process)
+            self._monitor = load_monitor(run_id, run_folder, names, is_one_process=is_one_process)
             self._monitor.start()
 
     def finish(self) -> tuple[dict[str, Any], list[str]]:
@@ -74,9 +74,10 @@ class Observation:
         return record, [] if failure is None else [failure]
 
 
-def _monitor(
+def load_monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
+    """What writes the system load of a run of this machine."""
     from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadMonitor, LoadTable
 
     groups = [HOST] if is_one_process else list(names)

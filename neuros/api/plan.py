@@ -10,9 +10,11 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from pathlib import Path
 
 from neuros.api.request import Request
 from neuros.backends.environments.pythons import Pythons, require_one_python
+from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import without_mark
 from neuros.backends.placement import place, usable_cores
 from neuros.backends.reaper import Reaper
@@ -23,6 +25,7 @@ from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
+from neuros.project.deployment import load_deployment
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
@@ -35,6 +38,8 @@ from neuros.transport.dds_profile import (
 )
 
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
+_ON_MACHINES = "process"
+"""The back end of nodes on other machines, and of all nodes of a deployment."""
 _LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
 
 
@@ -140,6 +145,16 @@ class Plan:
         return [*self.chosen.notices, *self.deployment.notices]
 
     @property
+    def places(self) -> Mapping[str, str]:
+        """The machine of each node that does not run on this one."""
+        return self.deployment.places if isinstance(self.deployment, Machines) else {}
+
+    @property
+    def nodes_here(self) -> list[Node]:
+        """The nodes that are to be started on this machine."""
+        return [node for node in self.nodes if node.name not in self.places]
+
+    @property
     def is_partial(self) -> bool:
         """Whether there are such nodes."""
         return bool(self.elsewhere)
@@ -151,7 +166,9 @@ class Plan:
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         has_external_topics = any(port.external_topic is not None for port in ports)
         is_named = bool(self.project.names.namespace)  # who wants one is among others
-        return self.is_partial or self.network.is_wide or has_external_topics or is_named
+        # A launcher tells the domain to all machines of its deployment.
+        is_open = self.is_partial or (self.network.is_wide and not self.places)
+        return is_open or has_external_topics or is_named
 
     def node_files(self, folders: Folders) -> list[NodeFile]:
         """One ``node.json`` per node that is to be started."""
@@ -187,11 +204,11 @@ class Plan:
 def make_plan(
     project: Project, messages: Messages, request: Request, *, is_tried: bool = True
 ) -> Plan:
-    """Put together what is asked for.
+    """Put together what is asked for; with a deployment, reach its machines and prepare them.
 
     Args:
         messages: the message packages of the project.
-        is_tried: whether it is to run on this machine, or only to be described.
+        is_tried: whether it is to run, or only to be described.
 
     Raises:
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
@@ -199,7 +216,18 @@ def make_plan(
     network = chosen_network(request.network, request.peers)
     names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
-    chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
+    wanted, machines = request.backend or AUTO, None
+    if request.deployment is not None:
+        _check_deployment(request)
+        file = load_deployment(Path(request.deployment), project)
+        nodes = [node for node in nodes if node.name not in file.places]
+        wanted, network = _ON_MACHINES, Network(bool(file.places))
+    chosen = choose(wanted, project, nodes, request.backend_options or {})
+    if request.deployment is not None:
+        machines = Machines(
+            file, project, chosen.deployment, monitors_load=request.monitor_system_load
+        )
+        chosen = replace(chosen, deployment=machines)
     back_end = chosen.back_end
     if back_end.is_one_process:
         _check_reach(project, names, back_end)
@@ -218,7 +246,31 @@ def make_plan(
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
+        if machines is not None:
+            machines.connect(_say)
+            plan = replace(plan, network=replace(network, peers=machines.peers))
     return plan
+
+
+def _check_deployment(request: Request) -> None:
+    """A deployment says itself where nodes run, and how these reach each other."""
+    others = {
+        "-n": request.nodes,
+        "--network": request.network,
+        "--peers": request.peers,
+        "--isolate": request.isolate,
+        "--backend": request.backend not in (None, AUTO, _ON_MACHINES),
+    }
+    if given := [option for option, value in others.items() if value]:
+        raise UsageError(
+            f"--deployment with {', '.join(given)}: the deployment file says where nodes run (in"
+            " processes) and how they reach each other; leave that out"
+        )
+
+
+def _say(severity: str, text: str) -> None:
+    """What is going on on other machines, before there is a console."""
+    print(f"neuros: {'' if severity == 'INFO' else 'warning: '}{text}", file=sys.stderr, flush=True)
 
 
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
@@ -252,7 +304,7 @@ def _check_cores(plan: Plan) -> None:
     problems = [
         f"{display_name(node.file)}:{line}:{column}: {pointer}: node '{node.name}' asks for"
         f" {_cores_in_words(missing)}"
-        for node in plan.nodes
+        for node in plan.nodes_here
         if (missing := set(node.affinity) - usable)
         for pointer in [f"{node.pointer}/affinity"]
         for line, column in [place_of(node.file, pointer)]

@@ -191,7 +191,11 @@ class Project:
                 "isolate: a Python program cannot give a run a network of its own: use"
                 " backend='docker', or `neuros launch --isolate`"
             )
-        make_environments(plan.pythons, messages, sys.stderr)
+        try:
+            make_environments(plan.pythons, messages, sys.stderr)
+        except BaseException:
+            plan.deployment.finish(lambda: True)
+            raise
         return LiveRun(plan, is_shown=options.show)
 
     def _load(self) -> Loaded:

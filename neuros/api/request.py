@@ -121,6 +121,14 @@ class Request(ProjectOptions):
         help="end with exit code 4 if a node elsewhere that a connection leads to was not found"
         " after this time",
     )
+    deployment: str | os.PathLike[str] | None = option(
+        "--deployment",
+        metavar="FILE",
+        is_recorded=False,
+        page="deployment.md",
+        help="run nodes on the machines that this file names for them, which are reached by ssh;"
+        " the others run here, and so does everything else",
+    )
     isolate: bool = option(
         "--isolate",
         default=False,

@@ -38,6 +38,7 @@ class Session:
         launcher: process id, and when that process started (clock ticks since boot): later
             processes may have the same number.
         control: address of its control channel.
+        elsewhere: the machine of each node that runs on another one.
         user: number of the user whose run it is: that of its reaper, whatever that says.
     """
 
@@ -51,6 +52,7 @@ class Session:
     namespace: str = ""
     is_one_process: bool = False
     control: str = ""
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
     user: int = field(default_factory=os.getuid)
 
     @property
@@ -71,6 +73,7 @@ class Session:
         if self.is_one_process and processes.alive():
             there = set(self.nodes)
         up = "running" if self.is_led else "ending"
+        there.update(self.elsewhere)  # a run whose launcher does not hear of one of them ends
         return {node: up if node in there else "not running" for node in self.nodes}
 
     def interrupt(self) -> None:
@@ -140,4 +143,6 @@ def _harmless(value: Any) -> Any:
     """A value whose texts do nothing to a terminal."""
     if isinstance(value, str):
         return clean(value, keep_colours=False)
+    if isinstance(value, dict):
+        return {_harmless(key): _harmless(each) for key, each in value.items()}
     return [_harmless(each) for each in value] if isinstance(value, list) else value

@@ -35,7 +35,7 @@ def make_shown_environments(
     """
     for notice in pythons.notices:
         print(f"neuros: {notice}", file=sys.stderr)
-    heeding = nullcontext() if are_made(pythons, messages) else _signals_interrupt(signals)
+    heeding = nullcontext() if are_made(pythons, messages) else signals_interrupt(signals)
     try:
         with heeding:
             make_environments(pythons, messages, _Output())
@@ -68,7 +68,7 @@ class _Output:
 
 
 @contextmanager
-def _signals_interrupt(signals: list[int]) -> Iterator[None]:
+def signals_interrupt(signals: list[int]) -> Iterator[None]:
     """Let what ends a run end this at once, by ``KeyboardInterrupt``."""
 
     def interrupt(number: int, _: FrameType | None) -> None:

@@ -12,7 +12,7 @@ import socket
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -96,12 +96,18 @@ def _launch(parsed: argparse.Namespace) -> int:
     with signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
-        from neuros.cli.environments import make_shown_environments
+        from neuros.cli.environments import make_shown_environments, signals_interrupt
 
         options = parsed_as(LaunchOptions, parsed)
         options = replace(options, backend_options=_back_end_options(parsed))
         project, messages = load_with_messages(parsed)
-        plan = make_plan(project, messages, options, is_tried=not options.dry_run)
+        # To reach other machines, and to prepare them, may take minutes.
+        heeding = nullcontext() if options.deployment is None else signals_interrupt(signals)
+        try:
+            with heeding:
+                plan = make_plan(project, messages, options, is_tried=not options.dry_run)
+        except KeyboardInterrupt:
+            return 130 if signals[:1] == [signal.SIGINT] else 143
         if options.dry_run:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):

@@ -73,6 +73,7 @@ COMMANDS = {
     "node": Command("node"),
     "part": Command("export"),
     "import-plugin": Command("projects"),
+    "agent": Command("agent"),
     "recorder": Command("recorder"),
     "replayed": Command("replay"),
     "dashboard": Command("views"),

@@ -118,11 +118,16 @@ def _rows(session: Session) -> Iterator[_RunningNode]:
             _user_name(session.user),
             session.project,
             prefix + node,
-            session.backend,
+            _where(session, node),
             session.since,
             state,
             session.folder,
         )
+
+
+def _where(session: Session, node: str) -> str:
+    machine = session.elsewhere.get(node)
+    return f"{session.backend} on {machine}" if machine else session.backend
 
 
 def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -275,16 +276,26 @@ def add_doctor(doctor: argparse.ArgumentParser) -> None:
     doctor.add_argument(
         "--no-delivery", action="store_true", help="only look: start no nodes and no containers"
     )
+    doctor.add_argument(
+        "--deployment",
+        type=Path,
+        metavar="FILE",
+        help="check the machines of a deployment file, too, and that packets arrive between each of"
+        " them and this one",
+    )
     add_format(doctor)
     doctor.set_defaults(command=_doctor)
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from neuros.doctor.checks import findings
+    from neuros.doctor.checks import deployment_findings, findings
     from neuros.ports import State
 
-    found = []
-    for finding in findings(os.environ, proves=not options.no_delivery):
+    found, proves = [], not options.no_delivery
+    looked_at = [findings(os.environ, proves=proves)]
+    if options.deployment is not None:
+        looked_at.append(deployment_findings(options.deployment, proves=proves))
+    for finding in chain.from_iterable(looked_at):
         found.append(finding)
         if options.format != JSON:
             print(finding, flush=True)  # the proofs take seconds

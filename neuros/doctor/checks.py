@@ -7,24 +7,27 @@ images, the other answers with what it has read in them.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from neuros.api.loading import load_with_messages
 from neuros.backends.domain import choose_domain
+from neuros.backends.machines.deployment import Machines
 from neuros.backends.placement import usable_cores
 from neuros.backends.registered import BACK_ENDS
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine
 from neuros.ports import Finding, State
+from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
 from neuros.registry import Part, Registry
 from neuros.simulators.registered import SIMULATORS, installed
@@ -63,6 +66,42 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
             )
         else:
             yield prove_delivery(back_end.name)
+
+
+def deployment_findings(path: Path, *, proves: bool) -> Iterator[Finding]:
+    """All findings about the machines of a deployment file, one after another.
+
+    Raises:
+        ProjectError: with all problems of the file.
+    """
+    project = load_with_messages(PROJECT)[0].project
+    file = load_deployment(path)
+    inner = BACK_ENDS.load("process").prepare(project, (), {})
+    for host in file.hosts.values():
+        machines = Machines(replace(file, places={"eye": host.name}), project, inner)
+        try:
+            machines.connect(lambda severity, text: None)
+            (side,) = machines.sides
+            yield Finding.good(host.name, side.described())
+            for state, subject, text, remedy in side.machine.examine():
+                yield Finding(State(state), f"{host.name}: {subject}", text, remedy)
+        except EnvironmentFault as fault:
+            yield Finding.bad(host.name, str(fault))
+            continue
+        finally:
+            machines.close()
+        if proves:
+            yield _prove_between(path, host.name)
+
+
+def _prove_between(path: Path, host: str) -> Finding:
+    """Prove delivery between this machine and another one of a deployment file."""
+    hosts = json.loads(path.read_text("utf-8"))["hosts"]
+    used = {name: keys for name, keys in hosts.items() if name in (host, HERE)}
+    with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
+        alone = Path(folder) / "deployment.json"
+        alone.write_text(json.dumps({"hosts": used, "nodes": {"eye": host}}), "utf-8")
+        return prove_delivery("process", options=("--deployment", str(alone)), where=host)
 
 
 def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:
@@ -146,13 +185,20 @@ def _gpu() -> Finding:
     return Finding.good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))
 
 
-def prove_delivery(backend: str, project: Path = PROJECT) -> Finding:
-    """Run the project on a back end; it ends by itself when all images have come back."""
-    subject = "delivery"
+def prove_delivery(
+    backend: str, project: Path = PROJECT, *, options: Sequence[str] = (), where: str = ""
+) -> Finding:
+    """Run the project on a back end; it ends by itself when all images have come back.
+
+    Args:
+        options: further ones of ``neuros launch``.
+        where: what the finding is about, if not the back end.
+    """
+    subject, name = "delivery", where or backend
     with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
         run = Path(folder) / "run"
         command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
-        command += ["--backend", backend, "-o", str(run)]
+        command += ["--backend", backend, "-o", str(run), *options]
         with subprocess.Popen(
             command,
             cwd=folder,
@@ -167,14 +213,14 @@ def prove_delivery(backend: str, project: Path = PROJECT) -> Finding:
                 launcher.terminate()
                 output, _ = launcher.communicate()
                 return Finding.bad(
-                    subject, f"{backend}: no end after {_DELIVERY_TIMEOUT_S:g} s", _last(output)
+                    subject, f"{name}: no end after {_DELIVERY_TIMEOUT_S:g} s", _last(output)
                 )
             except BaseException:
                 launcher.terminate()
                 raise
         if launcher.returncode:
-            return Finding.bad(subject, f"{backend}: failed", _last(output))
-        return _judge(backend, read_run_file(run))
+            return Finding.bad(subject, f"{name}: failed", _last(output))
+        return _judge(name, read_run_file(run))
 
 
 def _judge(backend: str, record: dict[str, object]) -> Finding:

@@ -38,10 +38,10 @@ _KINDS = {
 
 def violations(parsed: ParsedProject) -> list[Problem]:
     """Everything in the files of a project that violates the schema."""
-    found = _violations_of(parsed.root, "project")
+    found = violations_in(parsed.root, "project")
     for node in parsed.nodes:
         if node.source is not parsed.root.source:
-            found += _violations_of(node, "node")
+            found += violations_in(node, "node")
     return found
 
 
@@ -83,7 +83,8 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
     )
 
 
-def _violations_of(element: Element, name: str) -> list[Problem]:
+def violations_in(element: Element, name: str) -> list[Problem]:
+    """Everything in a document that violates the schema of that name."""
     errors = _validator(name).iter_errors(element.plain)
     found = (problem for error in errors for problem in _sentences(error, element))
     return [*islice(found, MOST_PROBLEMS)]
@@ -115,7 +116,7 @@ def _validator(name: str, part: str = "") -> Any:
         is_number = isinstance(instance, (int, float)) and not isinstance(instance, bool)
         return is_number and (isinstance(instance, int) or math.isfinite(instance))
 
-    schemas = {key: schema(key) for key in ("project", "node", "run")}
+    schemas = {key: schema(key) for key in ("project", "node", "run", "deployment")}
     for content in schemas.values():
         del content["$schema"]  # where a reference leads to one, it would undo what is extended
     registry = Registry().with_resources(

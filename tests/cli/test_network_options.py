@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from neuros.api.plan import chosen_network
+from neuros.api.loading import workspaces_of
+from neuros.api.plan import chosen_network, make_plan
+from neuros.api.request import Request
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.messages.needed import Messages
+from neuros.project.model import Node, Project
 from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES_VARIABLE
 
 RANGE, PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
@@ -47,3 +53,19 @@ def test_what_can_be_no_host_is_wrong_usage(nonsense: str) -> None:
 def test_a_name_that_nobody_knows_is_a_fault_of_the_machine() -> None:
     with pytest.raises(EnvironmentFault, match=r"the host 'robot\.invalid' cannot be found"):
         chosen_network(False, "robot.invalid")
+
+
+@pytest.mark.parametrize(
+    ("option", "given"),
+    [
+        ("-n", Request(deployment="x", nodes=["a"])),
+        ("--network", Request(deployment="x", network=True)),
+        ("--peers", Request(deployment="x", peers="10.0.0.7")),
+        ("--isolate", Request(deployment="x", isolate=True)),
+        ("--backend", Request(deployment="x", backend="in-process")),
+    ],
+)
+def test_with_a_deployment_nothing_else_says_where_nodes_run(option: str, given: Request) -> None:
+    project = Project("toy", (Node("a", "neuros_python", Path("a.py")),), (), Path("project.json"))
+    with pytest.raises(UsageError, match=f"--deployment with {option}"):
+        make_plan(project, Messages(workspaces_of(Path("project.json")), ()), given)

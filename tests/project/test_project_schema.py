@@ -12,7 +12,7 @@ from referencing import Registry, Resource
 
 from neuros.project.validate import SCHEMA_FOLDER, schema
 
-SCHEMAS = {name: schema(name) for name in ("project", "node")}
+SCHEMAS = {name: schema(name) for name in ("project", "node", "deployment")}
 REGISTRY: Registry[Any] = Registry().with_resources(
     (content["$id"], Resource.from_contents(content)) for content in SCHEMAS.values()
 )
@@ -38,7 +38,8 @@ KEYS = [(f"{name}:{path}", part) for name in SCHEMAS for path, part in keys_of(S
 
 def resolved(part: dict[str, Any]) -> dict[str, Any]:
     while "$ref" in part:
-        resolver = REGISTRY.resolver(SCHEMAS["node"]["$id"])
+        name = "deployment" if part["$ref"].endswith("/host") else "node"
+        resolver = REGISTRY.resolver(SCHEMAS[name]["$id"])
         part = {**resolver.lookup(part["$ref"]).contents, **part}
         part.pop("$ref")
     return part
@@ -79,6 +80,7 @@ def test_the_package_has_the_schemas_of_the_project() -> None:
     top = Path(__file__).resolve().parents[2] / "schema"
     assert SCHEMA_FOLDER.resolve() == top
     assert sorted(file.name for file in SCHEMA_FOLDER.glob("*.json")) == [
+        "deployment.schema.json",
         "node.schema.json",
         "project.schema.json",
         "run.schema.json",

@@ -81,6 +81,10 @@ class TwoMachines:
         inside = self._machines[side].inside(folder)
         return start(project, *arguments, cwd=folder, through=inside, **environment)
 
+    def inside(self, side: str, folder: Path) -> list[str]:
+        """The command that executes the one behind it on one of them."""
+        return self._machines[side].inside(folder)
+
     def containers(self) -> list[str]:
         """What the engines have, running or not."""
         found: list[str] = []

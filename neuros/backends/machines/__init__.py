@@ -1,0 +1,1 @@
+"""A run on several machines: agents there, reached by ``ssh``, run the nodes."""

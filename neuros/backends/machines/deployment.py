@@ -1,0 +1,373 @@
+"""A back end whose nodes are on several machines, as a deployment file says.
+
+Nodes of this machine are the back end's own. Others are run by the agents of theirs; to the
+supervisor they look like any: it hears of them over the control channel, and their files are in the
+run folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from neuros.backends.control_sockets import connect
+from neuros.backends.machines.machine import Log, Machine
+from neuros.control import CONTROL_VARIABLE
+from neuros.control.machines import Finished, Ready, Start
+from neuros.distribution import WORKSPACE
+from neuros.errors import EnvironmentFault
+from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
+from neuros.project.deployment import DeploymentFile, Host
+from neuros.project.model import Folders, NodeFile, Project
+from neuros.project.split import node_file_to_json, split, translated
+
+_PEERS = "ROS_STATIC_PEERS"
+_ANY_PORT = 9
+_MUCH_S = 0.1
+"""Clocks that are further apart than this are worth a warning."""
+
+
+@dataclass
+class Side:
+    """A machine of a deployment, connected and prepared.
+
+    Attributes:
+        nodes: those that it runs.
+        address: at which others reach it; ``here``: at which it reaches this machine.
+        messages: folders of the message packages that were built there.
+        sent: how many files it had to be sent.
+    """
+
+    machine: Machine
+    nodes: tuple[str, ...]
+    ready: Ready
+    address: str = ""
+    here: str = ""
+    messages: tuple[Path, ...] = ()
+    sent: int = 0
+    left: Finished | None = None
+
+    @property
+    def host(self) -> Host:
+        return self.machine.host
+
+    def described(self) -> str:
+        """What is known of it, in a line."""
+        ready, clock = self.ready, self.machine.clock
+        return (
+            f"{self.host.ssh or ' '.join(self.host.through)}: {ready.machine}, Python"
+            f" {ready.python}, NeuROS {ready.version}, at {self.address}; round trip"
+            f" {1e3 * clock.round_trip_s:.1f} ms, clock {clock.unix_s:+.3f} s"
+        )
+
+
+class Machines(Deployment):
+    """Nodes on several machines.
+
+    Args:
+        file: which node runs where.
+        inner: what starts those of this machine.
+        monitors_load: whether the others are to write their system load.
+    """
+
+    def __init__(
+        self,
+        file: DeploymentFile,
+        project: Project,
+        inner: Deployment,
+        *,
+        monitors_load: bool = False,
+    ) -> None:
+        self.file = file
+        self.monitors_load = monitors_load
+        self.sides: list[Side] = []
+        self.project = project
+        self.notices = inner.notices
+        self._inner = inner
+
+    @property
+    def places(self) -> Mapping[str, str]:
+        """The machine of each node that is not here."""
+        return self.file.places
+
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """The addresses of the other machines."""
+        return tuple(dict.fromkeys(side.address for side in self.sides))
+
+    def connect(self, log: Log) -> None:
+        """Reach all machines and get them ready, side by side.
+
+        Args:
+            log: takes lines for the user, in any thread.
+
+        Raises:
+            EnvironmentFault: with all that went wrong; none of them is held any more then.
+        """
+        hosts = self.file.used
+        held: list[Machine] = []
+        with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
+            work = [threads.submit(self._side, host, log, held) for host in hosts]
+            try:
+                wait(work)
+            except BaseException:  # Ctrl+C
+                for machine in tuple(held):
+                    machine.close()
+                raise
+        faults = [fault for each in work if (fault := each.exception())]
+        self.sides = [each.result() for each in work if not each.exception()]
+        if faults:
+            self.close()
+            others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
+            raise others[0] if others else EnvironmentFault("\n".join(map(str, faults)))
+        for side in self.sides:
+            ahead_s = side.machine.clock.unix_s
+            if abs(ahead_s) > _MUCH_S:
+                log(
+                    "WARN",
+                    f"the clock of {side.host.name} is {abs(ahead_s):.1f} s"
+                    f" {'ahead of' if ahead_s > 0 else 'behind'} that of this machine, and so are"
+                    " the times in its logs and recordings: set it (chrony, systemd-timesyncd)",
+                )
+
+    def close(self) -> None:
+        """Hang up on all machines, whose agents then end what is left."""
+        for side in self.sides:
+            side.machine.close()
+        self.sides = []
+
+    def launcher(self, program: NodeProgram) -> Launcher:
+        return _Launcher(self, self._inner.launcher(program), program)
+
+    def logs(self, run_folder: Path) -> Mapping[str, Path]:
+        return self._inner.logs(run_folder)
+
+    def as_here(self, text: str, folders: Folders) -> str:
+        for side in self.sides:
+            for name, there in vars(side.machine.folders).items():
+                text = _renamed(text, str(there), str(getattr(folders, name)))
+        return self._inner.as_here(text, folders)
+
+    def record(self) -> Mapping[str, Any]:
+        return {
+            **self._inner.record(),
+            "deployment": str(self.file.file),
+            "machines": {side.host.name: _record(side) for side in self.sides},
+        }
+
+    def finish(self, is_enough: Callable[[], bool]) -> Sequence[str]:
+        faults = [*self._inner.finish(is_enough)]
+        if not self.sides:
+            return faults
+        with ThreadPoolExecutor(len(self.sides), "neuros-machines") as threads:
+            for found in threads.map(lambda side: _bring_home(side, is_enough), self.sides):
+                faults += found
+        return faults
+
+    def node_there(self, file: NodeFile, side: Side) -> NodeFile:
+        """A node with all paths as it sees them on its machine."""
+        there = side.machine.folders
+        built = {_package(python): python.parent for python in side.messages}
+        pairs = [
+            (file.folders.project, there.project),
+            (file.folders.workspace, there.workspace),
+            *(
+                (python.parent, built[_package(python)])
+                for python in file.messages
+                if _package(python) in built
+            ),
+        ]
+
+        def move(path: Path) -> Path:
+            for here, moved in sorted(pairs, key=lambda pair: -len(pair[0].parts)):
+                if path.is_relative_to(here):
+                    return moved / path.relative_to(here)
+            return path
+
+        node = translated(file.node, move)
+        return replace(file, node=node, folders=there, messages=side.messages)
+
+    def _side(self, host: Host, log: Log, held: list[Machine]) -> Side:
+        machine = Machine(host, self.file.timeout_s, log)
+        held.append(machine)
+        try:
+            ready = machine.greet()
+            names = tuple(node for node, place in self.places.items() if place == host.name)
+            side = Side(machine, names, ready)
+            side.address = _address(host, ready)
+            side.here = _own_address(self.file.here, side.address)
+            side.sent = machine.place(self.project.folder)
+            folders = Folders(self.project.folder, WORKSPACE, Path())
+            files = [f for f in split(self.project, lambda _: folders) if f.node.name in names]
+            side.messages = machine.prepare(
+                [node_file_to_json(self.node_there(file, side)) for file in files]
+            )
+        except BaseException:
+            machine.close()
+            raise
+        return side
+
+
+class _Launcher:
+    """Starts each node where it belongs (:class:`neuros.ports.Launcher`)."""
+
+    def __init__(self, machines: Machines, inner: Launcher, program: NodeProgram) -> None:
+        self._machines = machines
+        self._inner = inner
+        self._program = program
+
+    def start(
+        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+    ) -> Sequence[RunningNode]:
+        """Start all nodes or none. Raises ``EnvironmentFault``."""
+        places, sides = self._machines.places, self._machines.sides
+        try:
+            for side in sides:
+                self._begin(side, nodes, environment)
+            for side in sides:
+                side.machine.await_started()
+            here = [file for file in nodes if file.node.name not in places]
+            started = [*self._inner.start(here, environment)]
+        except BaseException:
+            self._machines.close()
+            raise
+        return [*started, *(NodeElsewhere(side, name) for side in sides for name in side.nodes)]
+
+    def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
+        """One line per process."""
+        places, hosts = self._machines.places, self._machines.file.hosts
+        here = [file for file in nodes if file.node.name not in places]
+        elsewhere = [file.node.name for file in nodes if file.node.name in places]
+        return [
+            *self._inner.describe(here),
+            *(f"process {name} on {hosts[places[name]]}" for name in elsewhere),
+        ]
+
+    def _begin(self, side: Side, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> None:
+        run = nodes[0].folders.run
+        files = [file for file in nodes if file.node.name in side.nodes]
+        others = [side.here, *(each.address for each in self._machines.sides if each is not side)]
+        if self._program.reaper:
+            self._program.reaper.watch(side.machine.pid)
+        side.machine.begin(
+            Start(
+                environment["NEUROS_RUN_ID"],
+                self._machines.project.name,
+                side.host.name,
+                tuple(node_file_to_json(self._machines.node_there(f, side)) for f in files),
+                _texts(run),
+                {**environment, _PEERS: ";".join(dict.fromkeys(others))},
+                tuple(self._program.options),
+                {name: c for name, c in self._program.cores.items() if name in side.nodes},
+                self._machines.monitors_load,
+            ),
+            run,
+            lambda: connect(environment[CONTROL_VARIABLE]),
+        )
+
+
+@dataclass
+class NodeElsewhere:
+    """A node on another machine (:class:`neuros.ports.RunningNode`)."""
+
+    side: Side
+    name: str
+    names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.names = (self.name,)
+
+    def poll(self) -> str | None:
+        """``None`` while it runs, then how it ended, in words."""
+        return self.side.machine.end_of(self.name)
+
+    @property
+    def is_abandoned(self) -> bool:
+        return bool(self.side.machine.lost)
+
+    def terminate(self) -> None:
+        self.side.machine.signal(self.name, "TERM")
+
+    def kill(self) -> None:
+        self.side.machine.signal(self.name, "KILL")
+
+
+def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
+    """Have what the nodes have left there sent here; returns what could not be had."""
+    machine, was_lost = side.machine, bool(side.machine.lost)
+    side.left = machine.finish(is_enough)
+    machine.move_times(side.nodes)
+    faults = [machine.fault] if machine.fault else []
+    if side.left is not None:
+        faults += [f"{side.host.name}: {problem}" for problem in side.left.problems]
+    elif not was_lost:
+        why = f": {machine.lost}" if machine.lost else ""
+        faults.append(f"not all that nodes have left on {side.host.name} came here{why}")
+    return faults
+
+
+def _renamed(text: str, there: str, here: str) -> str:
+    """Text with a path there as the one here; with a colon before it, it is meant to be there."""
+    return re.sub(rf"(?<![\w/.:]){re.escape(there)}\b", lambda _: here, text)
+
+
+def _texts(run: Path) -> dict[str, str]:
+    """What lies in a run folder before the nodes start: the project, the plan of the recording."""
+    return {path.name: path.read_text("utf-8") for path in run.glob("*.json")}
+
+
+def _package(python: Path) -> str:
+    """The message package of a folder for Python's path, ``<package>-<key>/python``."""
+    return python.parent.name.rpartition("-")[0]
+
+
+def _record(side: Side) -> dict[str, Any]:
+    clock = side.machine.clock
+    load = None if side.left is None else side.left.load
+    return {
+        "reached_by": side.host.ssh or " ".join(side.host.through),
+        "name": side.ready.name,
+        "address": side.address,
+        "nodes": list(side.nodes),
+        "python": side.ready.python,
+        "architecture": side.ready.machine,
+        "files_sent": side.sent,
+        "clock_ahead_s": clock.unix_s if clock.is_known else None,
+        "round_trip_s": clock.round_trip_s if clock.is_known else None,
+        "lost": side.machine.lost,
+        "system_load": load,
+    }
+
+
+def _address(host: Host, ready: Ready) -> str:
+    """The IPv4 address at which other machines reach one. Raises ``EnvironmentFault``."""
+    known = host.address or (ready.reached_at if host.ssh else "")
+    for name in (known, ready.name):
+        with contextlib.suppress(OSError):
+            if name:
+                found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
+                return str(found[0][4][0])
+    raise EnvironmentFault(
+        f"{host}: it is not known at which address nodes reach it ('{known or ready.name}' has no"
+        f" IPv4 address here): give one in /hosts/{host.name}/address"
+    )
+
+
+def _own_address(here: Host, address: str) -> str:
+    """The IPv4 address of this machine, as one at that address sees it."""
+    if here.address:
+        return _address(here, Ready("", "", "", ""))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((address, _ANY_PORT))  # sends nothing: the kernel chooses the way
+        except OSError as error:
+            raise EnvironmentFault(
+                f"there is no way to {address} ({error.strerror}), where nodes are to be reached"
+            ) from error
+        return str(probe.getsockname()[0])

@@ -1,0 +1,373 @@
+"""Another machine of a run: the launcher's end of the connection to the agent there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import subprocess
+import threading
+import time
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from neuros.backends.machines.clock import ClockOffset
+from neuros.backends.machines.mirror import write_chunk
+from neuros.backends.machines.pump import Pump
+from neuros.backends.machines.trees import scan
+from neuros.backends.node_command import without_mark
+from neuros.control import Message
+from neuros.control.machines import (
+    FROM_AGENT,
+    Chunk,
+    Content,
+    Examine,
+    Examined,
+    Finish,
+    Finished,
+    Lacking,
+    NodeEnded,
+    Place,
+    Placed,
+    Pong,
+    Prepare,
+    Prepared,
+    Ready,
+    Refused,
+    Remark,
+    SignalNode,
+    Start,
+    Started,
+    Took,
+)
+from neuros.distribution import WORKSPACE, __version__
+from neuros.errors import EnvironmentFault
+from neuros.ports import ControlStream
+from neuros.project.deployment import Host
+from neuros.project.model import Folders
+
+_SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
+_CONNECT_S = 60.0
+_CONTENT_BYTES = 1 << 18
+_MOST_UNSENT_BYTES = 1 << 20
+_LOOK_S = 0.05
+_COMMAND_NOT_FOUND = 127
+_ENDS_S = 5.0
+_PACKET_LOG = "packets"  # of a node, in its folder
+_EXITS_S = 0.5
+_SAID_LAST_BYTES = 2000
+
+Log = Callable[[str, str], None]
+_Kind = TypeVar("_Kind", bound=Message)
+
+
+class Machine:
+    """A machine on which an agent runs nodes of a project.
+
+    Args:
+        host: how it is reached.
+        timeout_s: after so long without a sign of life it counts as gone.
+        log: takes lines for the user, as ``(severity, text)``; in any thread.
+
+    Attributes:
+        lost: why it cannot be reached any more, empty while it can.
+        clock: how far its clocks are off.
+    """
+
+    def __init__(self, host: Host, timeout_s: float, log: Log) -> None:
+        self.host = host
+        self.lost = ""
+        self.clock = ClockOffset()
+        self._timeout_s = timeout_s
+        self._log = log
+        self._folders: Folders | None = None
+        self._control: Callable[[], ControlStream] | None = None
+        self._run: Path | None = None
+        self._ends: dict[str, str] = {}
+        self._fault = ""
+        self._is_closed = False
+        self._answers: list[Message] = []
+        self._arrived = threading.Condition()
+        command = agent_command(host)
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=without_mark(os.environ),
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise self._failed(f"{command[0]} cannot be started ({error.strerror})") from error
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._errors = _LastWords(self._process)
+        self._pump = Pump(
+            os.dup(self._process.stdout.fileno()),
+            os.dup(self._process.stdin.fileno()),
+            FROM_AGENT,
+            host.name,
+            self._take,
+            self._lose,
+            connect=self._connect,
+            translate=self.clock.text_here,
+        )
+        # The pump alone has them, so that the agent sees the end when it closes them.
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._pump.start()
+
+    # ------------------------------------------------------------------ before the run
+
+    def greet(self) -> Ready:
+        """Wait until the agent is up.
+
+        Raises:
+            EnvironmentFault: if it does not come up, or is of another version.
+        """
+        ready = self._await(Ready, _CONNECT_S)
+        if ready.version != __version__:
+            raise self._failed(
+                f"NeuROS {ready.version} is installed there, and {__version__} here: install the"
+                " same version on both"
+            )
+        self._pump.timeout_s = self._timeout_s
+        return ready
+
+    def place(self, project: Path) -> int:
+        """Have the project and the workspace there; returns the number of files sent.
+
+        Raises:
+            EnvironmentFault: if that is impossible.
+        """
+        trees = {"project": (scan(project.name or "project", project), project)}
+        trees["workspace"] = (scan("workspace", WORKSPACE), WORKSPACE)
+        self._pump.send(Place(trees["project"][0], trees["workspace"][0], self._timeout_s))
+        lacking = self._await(Lacking).digests
+        paths = {
+            file.digest: folder / file.path
+            for tree, folder in trees.values()
+            for file in tree.files
+        }
+        for digest in lacking:
+            self._send_content(digest, paths[digest])
+        placed = self._await(Placed)
+        self._folders = Folders(Path(placed.project), Path(placed.workspace), Path(placed.run))
+        return len(lacking)
+
+    @property
+    def folders(self) -> Folders:
+        """The folders of the project there."""
+        assert self._folders is not None
+        return self._folders
+
+    def prepare(self, nodes: Sequence[Mapping[str, object]]) -> tuple[Path, ...]:
+        """Have environments and message packages made there; returns the folders of these.
+
+        Raises:
+            EnvironmentFault: with all that failed.
+        """
+        self._pump.send(Prepare(tuple(nodes)))
+        return tuple(map(Path, self._await(Prepared).messages))
+
+    def examine(self) -> Sequence[tuple[str, str, str, str]]:
+        """What ``neuros doctor`` finds there. Raises ``EnvironmentFault``."""
+        self._pump.send(Examine())
+        return self._await(Examined).findings
+
+    # ------------------------------------------------------------------ the run
+
+    @property
+    def pid(self) -> int:
+        """Of the program that reaches it, which leads a session of its own."""
+        return self._process.pid
+
+    def begin(self, start: Start, run: Path, control: Callable[[], ControlStream]) -> None:
+        """Start the nodes; ``control`` connects to the supervisor. :meth:`await_started` waits."""
+        self._run, self._control = run, control
+        self._pump.send(start)
+
+    def await_started(self) -> None:
+        """Until all nodes have been started. Raises ``EnvironmentFault``."""
+        self._await(Started)
+
+    def signal(self, node: str, name: str) -> None:
+        """Send a signal to the process of a node."""
+        self._pump.send(SignalNode(node, name))
+
+    def end_of(self, node: str) -> str | None:
+        """How the process of a node has ended, ``None`` while it runs."""
+        if node in self._ends:
+            return self._ends[node]
+        return f"{self.host.name} cannot be reached any more: {self.lost}" if self.lost else None
+
+    def finish(self, is_enough: Callable[[], bool]) -> Finished | None:
+        """Have all that the nodes have left sent here; ``None`` if it did not come."""
+        if self.lost or self._run is None:
+            self.close()
+            return None
+        self._pump.send(Finish())
+        try:
+            return self._await(Finished, is_enough=is_enough)
+        except EnvironmentFault:
+            return None
+        finally:
+            self.close()
+
+    def move_times(self, nodes: Sequence[str]) -> None:
+        """Have the packet logs that came from there on the clock of this machine."""
+        if self._run is None:
+            return
+        for node in nodes:
+            try:
+                self.clock.log_here(self._run / node / _PACKET_LOG)
+            except OSError as error:
+                self._fault = self._fault or f"the packet log of {node} cannot be moved: {error}"
+
+    def close(self) -> None:
+        """Hang up; the agent ends what is left. Any thread."""
+        with self._arrived:
+            self._is_closed = True
+            self._arrived.notify_all()
+        self._pump.end()
+        if self._pump is not threading.current_thread():
+            self._pump.join(_ENDS_S)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_ENDS_S)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self._errors.join(_ENDS_S)
+
+    # ------------------------------------------------------------------ inside
+
+    def _take(self, message: Message) -> None:
+        """A message of the agent; in the thread of the pump."""
+        match message:
+            case Pong():
+                self.clock.take(message, time.monotonic(), time.time())
+            case Chunk():
+                self._keep(message)
+            case Remark(severity, text):
+                self._log(severity, f"{self.host.name}: {text}")
+            case NodeEnded(node, how):
+                self._ends[node] = how
+            case _:
+                if isinstance(message, Finished):
+                    self._pump.end()  # that it hangs up now is no fault
+                with self._arrived:
+                    self._answers.append(message)
+                    self._arrived.notify_all()
+
+    def _keep(self, chunk: Chunk) -> None:
+        if self._run is None:
+            return
+        try:
+            size = write_chunk(self._run, chunk)
+        except OSError as error:
+            size = len(chunk.data)
+            if not self._fault:
+                self._fault = f"{chunk.path} of {self.host.name} cannot be written: {error}"
+        self._pump.send(Took(size))
+
+    @property
+    def fault(self) -> str:
+        """What of it could not be kept here, empty if all could."""
+        return self._fault
+
+    def _lose(self, reason: str) -> None:
+        code = None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(_EXITS_S)
+        if code is None:
+            self._process.kill()  # it would go on trying for minutes
+        self._errors.join(_EXITS_S)
+        said = self._errors.last
+        if code == _COMMAND_NOT_FOUND:
+            said += f": name the command neuros there in /hosts/{self.host.name}/neuros"
+        with self._arrived:
+            self.lost = f"{reason} ({said})" if said else reason
+            if self._run is not None:
+                where = f"{self.host.ssh or self.host.name}:{self.folders.run}"
+                self.lost += f"; what has not come from there is in {where}"
+            self._arrived.notify_all()
+
+    def _connect(self) -> ControlStream:
+        if self._control is None:
+            raise ConnectionRefusedError
+        return self._control()
+
+    def _await(
+        self,
+        kind: type[_Kind],
+        limit_s: float | None = None,
+        is_enough: Callable[[], bool] = lambda: False,
+    ) -> _Kind:
+        """The next answer, which must be of this kind. Raises ``EnvironmentFault``."""
+        end_s = None if limit_s is None else time.monotonic() + limit_s
+        with self._arrived:
+            while not self._answers:
+                if self.lost or self._is_closed:
+                    raise self._failed(self.lost or "it is not needed any more")
+                if is_enough() or (end_s is not None and time.monotonic() > end_s):
+                    raise self._failed("it did not answer in time")
+                self._arrived.wait(_LOOK_S)
+            answer = self._answers.pop(0)
+        if isinstance(answer, Refused):
+            raise self._failed(answer.text)
+        assert isinstance(answer, kind), f"{kind.__name__} was expected, not {answer}"
+        return answer
+
+    def _failed(self, text: str) -> EnvironmentFault:
+        return EnvironmentFault("\n".join(f"{self.host}: {line}" for line in text.splitlines()))
+
+    def _send_content(self, digest: str, path: Path) -> None:
+        try:
+            with open(path, "rb") as file:
+                data = file.read(_CONTENT_BYTES)
+                while True:
+                    following = file.read(_CONTENT_BYTES)
+                    while self._pump.unsent_bytes > _MOST_UNSENT_BYTES and not self.lost:
+                        time.sleep(_LOOK_S)
+                    text = b64encode(data).decode()
+                    self._pump.send(Content(digest, text, not following))
+                    if not following:
+                        return
+                    data = following
+        except OSError as error:
+            raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
+
+
+def agent_command(host: Host) -> list[str]:
+    """The command that starts the agent on a machine, as its child as far as this one can tell."""
+    if host.through:
+        return [*host.through, os.path.expanduser(host.neuros), "agent"]
+    neuros = host.neuros
+    home, rest = ("~/", neuros[2:]) if neuros.startswith("~/") else ("", neuros)
+    remote = f"exec {home}{shlex.quote(rest)} agent"
+    return ["ssh", *_SSH, *host.ssh_options, "--", host.ssh, remote]
+
+
+class _LastWords(threading.Thread):
+    """Reads what a program writes to its standard error, and remembers the end of it."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        super().__init__(name="neuros-errors", daemon=True)
+        self._process = process
+        self._said = b""
+        self.start()
+
+    def run(self) -> None:
+        assert self._process.stderr is not None
+        with self._process.stderr as stream:
+            while data := os.read(stream.fileno(), 1 << 12):
+                self._said = (self._said + data)[-_SAID_LAST_BYTES:]
+
+    @property
+    def last(self) -> str:
+        """The last line, which is why it has ended."""
+        lines = self._said.decode("utf-8", "replace").strip().splitlines()
+        return lines[-1].strip() if lines else ""

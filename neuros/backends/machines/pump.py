@@ -1,0 +1,314 @@
+"""Pump: carries messages and control connections between a launcher and an agent.
+
+One thread at each end, which never waits for anything but all of its descriptors at once: so signs
+of life come and are heard whatever else a process does. Whatever arrives is a sign of life.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from neuros.control import Message
+from neuros.control.link import decode, encode, kind_of
+from neuros.control.machines import Closed, Opened, Ping, Pong, Said
+from neuros.errors import ControlError
+from neuros.ports import ControlListener, ControlStream
+
+BEAT_S = 1.0
+_CLOSED = "the connection was closed"
+_READ_BYTES = 1 << 16
+_MOST_UNTOLD_BYTES = 1 << 20
+"""A control connection whose other end takes nothing is hung up on from here on."""
+
+
+class Pump(threading.Thread):
+    """One end of the connection between a launcher and an agent.
+
+    Args:
+        read_from, write_to: descriptors, which it closes in the end.
+        accepted: the messages that may come.
+        peer: who is at the other end, for error messages.
+        take: is called with each message that is not the pump's own; in its thread.
+        lose: is called once when nobody is there any more, with the reason.
+        connect: makes the other end of a control connection that was opened over there.
+        translate: is applied to what is said on one over there.
+
+    Attributes:
+        timeout_s: after so long without a sign of life the other end counts as gone; ``None``: not.
+        heard_s: when the last one came, on the monotonic clock.
+    """
+
+    def __init__(
+        self,
+        read_from: int,
+        write_to: int,
+        accepted: Sequence[type[Message]],
+        peer: str,
+        take: Callable[[Message], None],
+        lose: Callable[[str], None],
+        *,
+        connect: Callable[[], ControlStream] | None = None,
+        translate: Callable[[str], str] = str,
+    ) -> None:
+        super().__init__(name=f"neuros-{peer}", daemon=True)
+        self.timeout_s: float | None = None
+        self.heard_s = time.monotonic()
+        self._read_from, self._write_to = read_from, write_to
+        self._accepted = {kind_of(each): each for each in accepted}
+        self._peer, self._take, self._lose = peer, take, lose
+        self._connect, self._translate = connect, translate
+        self._lock = threading.Lock()
+        self._unsent = bytearray()
+        self._rest = b""
+        self._last: deque[Message] = deque()
+        self._links: dict[int, _Link] = {}
+        self._count = 0
+        self._listener: ControlListener | None = None
+        self._is_ending = False
+        self._waker, self._woken = socket.socketpair()
+        self._selector = selectors.DefaultSelector()
+        self._writes: set[int] = set()
+        for descriptor in (read_from, write_to):
+            os.set_blocking(descriptor, False)
+        self._waker.setblocking(False)
+        self._woken.setblocking(False)
+        self._selector.register(read_from, selectors.EVENT_READ)
+        self._selector.register(self._woken, selectors.EVENT_READ)
+
+    # ------------------------------------------------------------------ called by others
+
+    def send(self, message: Message) -> None:
+        """Send it, now or later. Any thread."""
+        with self._lock:
+            self._unsent += encode(message)
+        self._wake()
+
+    def send_last(self, message: Message) -> None:
+        """Send it after all that has been said on control connections by now. Any thread."""
+        self._last.append(message)
+        self._wake()
+
+    @property
+    def unsent_bytes(self) -> int:
+        """What has not been written yet."""
+        return len(self._unsent)
+
+    def listen(self, listener: ControlListener) -> None:
+        """Accept control connections here, from now on. Any thread."""
+        self._listener = listener
+        self._wake()
+
+    def end(self) -> None:
+        """Write what there is to be sent, and hang up. Any thread."""
+        self._is_ending = True
+        self._wake()
+
+    # ------------------------------------------------------------------ the thread
+
+    def run(self) -> None:
+        """Until :meth:`end`, or nobody is there any more."""
+        reason = ""
+        next_s = 0.0
+        try:
+            while not reason and not (self._is_ending and not (self._unsent or self._last)):
+                now_s = time.monotonic()
+                if now_s >= next_s:
+                    next_s = now_s + BEAT_S
+                    self.send(Ping(now_s))
+                reason = self._turn(max(0.0, next_s - time.monotonic()))
+        except Exception as error:  # else nobody would know that nothing is carried any more
+            reason = f"{type(error).__name__}: {error}"
+        finally:
+            if reason and not self._is_ending:
+                self._lose(reason)  # before anybody sees that control connections have ended
+            for link in tuple(self._links):
+                self._hang_up(link)
+            self._selector.close()
+            self._waker.close()
+            self._woken.close()
+            for descriptor in {self._read_from, self._write_to}:
+                with contextlib.suppress(OSError):
+                    os.close(descriptor)
+
+    def _turn(self, wait_s: float) -> str:
+        """One look at everything; returns why the other end is gone, empty while it is there."""
+        self._watch()
+        ready = {key.fd for key, _ in self._selector.select(wait_s)}
+        if self._woken.fileno() in ready:
+            with contextlib.suppress(BlockingIOError):
+                while self._woken.recv(_READ_BYTES):
+                    pass
+        if self._read_from in ready and (reason := self._read()):
+            return reason
+        if self._listener is not None and self._listener.fileno() in ready:
+            self._accept()
+        for number, link in tuple(self._links.items()):
+            if link.fileno() in ready:
+                self._relay(number, link)
+        self._send_last()
+        if self._write_to in ready and (reason := self._write()):
+            return reason
+        silent_s = time.monotonic() - self.heard_s
+        # What came while this process could not run has been read by now.
+        if self.timeout_s is not None and not ready and silent_s > self.timeout_s:
+            return f"nothing was heard of {self._peer} for {self.timeout_s:g} s"
+        return ""
+
+    def _watch(self) -> None:
+        """Look at what there is to be written and accepted."""
+        wanted = {self._write_to} if self._unsent else set()
+        for descriptor in self._writes - wanted:
+            self._selector.unregister(descriptor)
+        for descriptor in wanted - self._writes:
+            self._selector.register(descriptor, selectors.EVENT_WRITE)
+        self._writes = wanted
+        if self._listener is not None and self._listener not in self._selector.get_map():
+            self._selector.register(self._listener, selectors.EVENT_READ)
+        for number, link in tuple(self._links.items()):
+            if not link.flush():
+                self._part(number)
+
+    def _read(self) -> str:
+        try:
+            data = os.read(self._read_from, _READ_BYTES)
+        except BlockingIOError:
+            return ""
+        except OSError as error:
+            return str(error.strerror)
+        if not data:
+            return _CLOSED
+        self.heard_s = time.monotonic()
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        try:
+            for line in lines:
+                self._obey(decode(line, self._accepted, self._peer))
+        except ControlError as error:
+            return str(error)
+        return ""
+
+    def _obey(self, message: Message) -> None:
+        match message:
+            case Ping(sent_s):
+                self.send(Pong(sent_s, time.monotonic(), time.time()))
+            case Opened(number):
+                if self._connect is not None:
+                    self._open(number)
+            case Said(number, text):
+                if number in self._links:
+                    self._links[number].unsent += self._translate(text).encode()
+            case Closed(number):
+                self._hang_up(number)
+            case _:
+                for link in self._links.values():
+                    link.flush()  # what came before is heard before
+                self._take(message)
+
+    def _write(self) -> str:
+        with self._lock:
+            try:
+                written = os.write(self._write_to, self._unsent[:_READ_BYTES])
+            except BlockingIOError:
+                return ""
+            except BrokenPipeError:
+                return _CLOSED
+            except OSError as error:
+                return str(error.strerror)
+            del self._unsent[:written]
+        return ""
+
+    # ------------------------------------------------------------------ control connections
+
+    def _send_last(self) -> None:
+        count = len(self._last)
+        if not count:
+            return
+        for number, link in tuple(self._links.items()):
+            while number in self._links and self._relay(number, link):
+                pass
+        for _ in range(count):
+            self.send(self._last.popleft())
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        while (stream := self._listener.accept()) is not None:
+            self._count += 1
+            self._add(self._count, stream)
+            self.send(Opened(self._count))
+
+    def _open(self, number: int) -> None:
+        assert self._connect is not None
+        try:
+            self._add(number, self._connect())
+        except OSError:  # the supervisor listens no more
+            self.send(Closed(number))
+
+    def _add(self, number: int, stream: ControlStream) -> None:
+        stream.setblocking(False)
+        self._links[number] = link = _Link(stream)
+        self._selector.register(link, selectors.EVENT_READ)
+
+    def _relay(self, number: int, link: _Link) -> bool:
+        """Pass on what was said; returns whether there may be more right now."""
+        text, size, is_open = link.read()
+        if text:
+            self.send(Said(number, text))
+        if not is_open:
+            self._part(number)
+        return is_open and size > 0
+
+    def _part(self, number: int) -> None:
+        self._hang_up(number)
+        self.send(Closed(number))
+
+    def _hang_up(self, number: int) -> None:
+        link = self._links.pop(number, None)
+        if link is not None:
+            link.flush()
+            self._selector.unregister(link)
+            link.stream.close()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):
+            self._waker.send(b"\0")
+
+
+class _Link:
+    """A control connection: whole lines from there, any text to there."""
+
+    def __init__(self, stream: ControlStream) -> None:
+        self.stream = stream
+        self.unsent = bytearray()
+        self._rest = b""
+
+    def fileno(self) -> int:
+        return self.stream.fileno()
+
+    def read(self) -> tuple[str, int, bool]:
+        """The lines that have come, how many bytes came, and whether it is still open."""
+        try:
+            data = self.stream.recv(_READ_BYTES)
+        except BlockingIOError:
+            return "", 0, True
+        except OSError:
+            return "", 0, False
+        whole, line_feed, rest = (self._rest + data).rpartition(b"\n")
+        self._rest = rest
+        return (whole + line_feed).decode("utf-8", "replace"), len(data), bool(data)
+
+    def flush(self) -> bool:
+        """Write what goes through now; False if there is nobody to take it."""
+        try:
+            while self.unsent:
+                del self.unsent[: self.stream.send(self.unsent)]
+        except BlockingIOError:
+            return len(self.unsent) < _MOST_UNTOLD_BYTES
+        except OSError:
+            return False
+        return True

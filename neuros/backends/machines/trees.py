@@ -1,0 +1,174 @@
+"""Trees: folders with files that another machine gets, known by their content.
+
+::
+
+    ~/.cache/neuros/machines/         (or $XDG_CACHE_HOME/neuros/machines)
+        <name>-<key>/                 a tree, whole from its first moment; the key is its content's
+        <name>-<key>.json             its files and their digests
+        <name>-<key>.draft/           only while it is being made
+
+Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
+has been changed in a tree there is put right before it is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
+from neuros.control.machines import Tree, TreeFile
+from neuros.errors import EnvironmentFault
+
+_LEFT_OUT = frozenset({"__pycache__", "runs", "node_modules"})
+_RUN_FILE = "run.json"
+_READ_BYTES = 1 << 20
+
+
+def tree_cache(environ: Mapping[str, str]) -> Path:
+    """The folder of all trees."""
+    return cache_root(environ) / "machines"
+
+
+def scan(name: str, folder: Path) -> Tree:
+    """The tree of a folder: without hidden folders, caches of Python, and runs.
+
+    Raises:
+        EnvironmentFault: if a file cannot be read.
+    """
+    try:
+        files = [_file(path, folder) for path in _files(folder)] if folder.is_dir() else []
+    except OSError as error:
+        raise EnvironmentFault(
+            f"{error.filename} cannot be read, and other machines need it: {error.strerror}"
+        ) from error
+    return Tree(name, tuple(sorted(files, key=lambda file: file.path)))
+
+
+def key_of(tree: Tree) -> str:
+    """What a tree is called where it is kept."""
+    text = json.dumps([asdict(file) for file in tree.files]).encode()
+    return f"{tree.name}-{hashlib.sha256(text).hexdigest()[:KEY_LENGTH]}"
+
+
+class TreeStore:
+    """The trees of a machine.
+
+    Args:
+        cache: the folder that holds them.
+    """
+
+    def __init__(self, cache: Path) -> None:
+        self._cache = cache
+        self._received = cache / f"received-{os.getpid()}"
+
+    def lacking(self, trees: Sequence[Tree]) -> tuple[str, ...]:
+        """The digests of content that is nowhere here."""
+        known = self._known()
+        wanted = {file.digest: file for tree in trees for file in tree.files}
+        return tuple(digest for digest in wanted if not _find(known, digest))
+
+    def receive(self, digest: str, data: bytes) -> None:
+        """The next part of a file. Raises ``OSError``."""
+        self._received.mkdir(parents=True, exist_ok=True)
+        with open(self._received / digest, "ab") as file:
+            file.write(data)
+
+    def place(self, tree: Tree) -> Path:
+        """The folder with a tree whose content is here. Raises ``OSError``."""
+        kept = Kept(self._cache / key_of(tree))
+        known = self._known()
+        with kept.locked():
+            target = kept.folder if kept.folder.is_dir() else kept.beside(".draft")
+            target.mkdir(parents=True, exist_ok=True)
+            for file in tree.files:
+                path = target / file.path
+                if not _has(path, file.digest):
+                    received = self._received / file.digest
+                    source = received if received.exists() else _find(known, file.digest)
+                    _copy(source, path, file)
+            if target != kept.folder:
+                target.rename(kept.folder)
+            kept.beside(".json").write_text(json.dumps([asdict(file) for file in tree.files]))
+            os.utime(kept.folder)
+        return kept.folder
+
+    def clean_up(self) -> None:
+        """Remove what was received, and trees that nobody has used for a month."""
+        shutil.rmtree(self._received, ignore_errors=True)
+        oldest_s = time.time() - UNUSED_S
+        for kept in map(Kept, kept_in(self._cache)):
+            with contextlib.suppress(OSError), kept.locked(wait=False) as is_mine:
+                if is_mine and kept.folder.stat().st_mtime < oldest_s:
+                    shutil.rmtree(kept.folder, ignore_errors=True)
+                    kept.beside(".json").unlink(missing_ok=True)
+
+    def _known(self) -> dict[str, list[Path]]:
+        """By digest, the files that should have that content."""
+        found: dict[str, list[Path]] = {}
+        for folder in kept_in(self._cache):
+            with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+                for each in json.loads(Kept(folder).beside(".json").read_text("utf-8")):
+                    found.setdefault(each["digest"], []).append(folder / each["path"])
+        return found
+
+
+def digest_of(path: Path) -> str:
+    """The SHA-256 of a file. Raises ``OSError``."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while data := file.read(_READ_BYTES):
+            digest.update(data)
+    return digest.hexdigest()
+
+
+def _file(path: Path, folder: Path) -> TreeFile:
+    status = path.stat()
+    is_executable = bool(status.st_mode & 0o100)
+    name = path.relative_to(folder).as_posix()
+    return TreeFile(name, digest_of(path), status.st_size, is_executable)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The ordinary files below a folder; a link to a file is that file."""
+    for parent, folders, names in os.walk(folder, onerror=_raise):
+        here = Path(parent)
+        folders[:] = [each for each in folders if not _is_left_out(here / each)]
+        yield from (here / name for name in names if (here / name).is_file())
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def _is_left_out(folder: Path) -> bool:
+    is_hidden = folder.name.startswith(".") or folder.name in _LEFT_OUT
+    return is_hidden or (folder / _RUN_FILE).exists()
+
+
+def _has(path: Path, digest: str) -> bool:
+    try:
+        return path.is_file() and digest_of(path) == digest
+    except OSError:
+        return False
+
+
+def _find(known: Mapping[str, Sequence[Path]], digest: str) -> Path | None:
+    return next((path for path in known.get(digest, ()) if _has(path, digest)), None)
+
+
+def _copy(source: Path | None, path: Path, file: TreeFile) -> None:
+    if source is None:
+        raise OSError(f"the content of {file.path} has not arrived")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.draft")
+    shutil.copyfile(source, draft)
+    draft.chmod(0o755 if file.is_executable else 0o644)
+    draft.replace(path)

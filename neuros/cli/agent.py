@@ -1,0 +1,375 @@
+"""Program of an agent: runs nodes of a project for a launcher on another machine.
+
+The launcher starts it (``ssh pi@robot neuros agent``) and talks to it over its standard input and
+output. When it hears nothing more, or that is closed, all nodes end; its reaper sees to that where
+the agent itself is killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import queue
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from base64 import b64decode
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
+from neuros.backends.domain import DomainLock, choose_domain
+from neuros.backends.environments.pythons import Pythons
+from neuros.backends.machines.mirror import Follower
+from neuros.backends.machines.pump import Pump
+from neuros.backends.machines.trees import TreeStore, tree_cache
+from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
+from neuros.backends.reaper import Reaper
+from neuros.backends.run_processes import RUN_ID
+from neuros.backends.sessions import Session, reaper_environment, this_process
+from neuros.control import CONTROL_VARIABLE, Message
+from neuros.control.machines import (
+    TO_AGENT,
+    Chunk,
+    Content,
+    Examine,
+    Examined,
+    Finish,
+    Finished,
+    Lacking,
+    NodeEnded,
+    Place,
+    Placed,
+    Prepare,
+    Prepared,
+    Ready,
+    Refused,
+    Remark,
+    SignalNode,
+    Start,
+    Started,
+    Took,
+    Tree,
+)
+from neuros.distribution import __version__
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError
+from neuros.ports import NodeProgram
+from neuros.project.model import NodeFile
+from neuros.project.split import node_file_to_json, node_files_from_json
+from neuros.transport.dds_profile import as_asked
+
+if TYPE_CHECKING:
+    from neuros.recording.system_load import LoadMonitor
+
+_BUSY_S, _QUIET_S = 0.05, 0.2
+_MOST_IN_FLIGHT_BYTES = 1 << 19
+_STOP_S = 5.0
+_KEPT_S = 7 * 24 * 3600.0
+_RUN = "run-"
+
+
+def add_agent(agent: argparse.ArgumentParser) -> None:
+    """The program takes no arguments; ``launch`` starts it on another machine."""
+    agent.set_defaults(command=_run_agent)
+
+
+def _run_agent(_: argparse.Namespace) -> int:
+    return Agent().run()
+
+
+class Agent:
+    """Runs nodes until the launcher has ended them, or has gone."""
+
+    def __init__(self) -> None:
+        read_from, write_to = os.dup(0), os.dup(1)
+        with open(os.devnull, "rb") as nothing:
+            os.dup2(nothing.fileno(), 0)
+        os.dup2(2, 1)  # what libraries print is none of the launcher's messages
+        self._inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        self._pump = Pump(
+            read_from, write_to, TO_AGENT, "the launcher", self._inbox.put, self._lose
+        )
+        self._cache = tree_cache(os.environ)
+        self._store = TreeStore(self._cache)
+        self._trees: tuple[Tree, ...] = ()
+        self._awaited: set[str] = set()
+        self._run: Path | None = None
+        self._pythons = Pythons({})
+        self._reaper: Reaper | None = None
+        self._domain: DomainLock | None = None
+        self._monitor: LoadMonitor | None = None
+        self._follower: Follower | None = None
+        self._processes: dict[str, RunningProcess] = {}
+        self._in_flight_bytes = 0
+        self._is_lost = self._is_over = self._has_started = False
+
+    def run(self) -> int:
+        """Until the end; returns the exit code."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: self._lose("ended by a signal"))
+        self._pump.start()
+        reached_at = (os.environ.get("SSH_CONNECTION", "").split() or [""] * 4)[2]
+        python = platform.python_version()
+        self._pump.send(Ready(__version__, python, platform.machine(), platform.node(), reached_at))
+        try:
+            self._work()
+        finally:
+            self._end_nodes()
+            if not (self._is_lost and self._has_started) and self._run is not None:
+                shutil.rmtree(self._run, ignore_errors=True)
+        return 1 if self._is_lost else 0
+
+    def _work(self) -> None:
+        pause_s = _QUIET_S
+        while not (self._is_lost or self._is_over):
+            message = self._next(pause_s)
+            if message is not None:
+                self._obey(message)
+            pause_s = _BUSY_S if self._look() else _QUIET_S
+
+    def _next(self, pause_s: float) -> Message | None:
+        try:
+            return self._inbox.get(timeout=pause_s)
+        except queue.Empty:
+            return None
+
+    def _lose(self, _: str) -> None:
+        """The launcher has gone. In the thread of the pump, or a signal handler."""
+        self._is_lost = True
+        self._inbox.put(None)
+        if not self._has_started:  # pip or a compiler may be at work, which its reaper ends
+            if self._run is not None:
+                shutil.rmtree(self._run, ignore_errors=True)
+            os._exit(1)
+
+    def _obey(self, message: Message) -> None:
+        try:
+            match message:
+                case Place():
+                    self._pump.timeout_s = message.timeout_s
+                    self._begin_to_place(message)
+                case Content():
+                    self._receive(message)
+                case Prepare(nodes):
+                    self._prepare(nodes)
+                case Start():
+                    self._start(message)
+                case SignalNode(node, name):
+                    self._signal(node, name)
+                case Took(size):
+                    self._in_flight_bytes -= size
+                case Examine():
+                    self._examine()
+                case Finish():
+                    self._finish()
+        except ProjectError as error:
+            self._pump.send(Refused(str(error)))
+        except (NeurosError, OSError) as error:
+            self._pump.send(Refused(f"{error}"))
+
+    # ------------------------------------------------------------------ before the run
+
+    def _begin_to_place(self, message: Place) -> None:
+        self._cache.mkdir(parents=True, exist_ok=True)
+        self._store.clean_up()
+        _remove_old_runs(self._cache)
+        self._trees = (message.project, message.workspace)
+        lacking = self._store.lacking(self._trees)
+        self._awaited = set(lacking)
+        self._pump.send(Lacking(lacking))
+        if not lacking:
+            self._place()
+
+    def _receive(self, content: Content) -> None:
+        self._store.receive(content.digest, b64decode(content.data))
+        if content.is_last:
+            self._awaited.discard(content.digest)
+            if not self._awaited:
+                self._place()
+
+    def _place(self) -> None:
+        project, workspace = map(self._store.place, self._trees)
+        self._store.clean_up()
+        self._run = Path(tempfile.mkdtemp(prefix=_RUN, dir=self._cache))
+        self._pump.send(Placed(str(project), str(workspace), str(self._run)))
+
+    def _prepare(self, nodes: Iterable[Mapping[str, Any]]) -> None:
+        from neuros.api.plan import make_environments
+        from neuros.messages.needed import Messages
+        from neuros.messages.workspace import Workspaces
+
+        if find_spec("rclpy") is None:
+            raise EnvironmentFault(
+                f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
+                " install.py there"
+            )
+        files = node_files_from_json(nodes)
+        folders, described = files[0].folders, [file.node for file in files]
+        workspaces = Workspaces(folders.project / "workspace", folders.workspace, os.environ)
+        messages = Messages.of_nodes(described, workspaces)
+        if problems := messages.problems():
+            raise ProjectError(problems)
+        self._pythons = Pythons.choose(described, folders.project, os.environ)
+        for notice in self._pythons.notices:
+            self._pump.send(Remark("INFO", notice))
+        make_environments(self._pythons, messages, _Remarks(self._pump))
+        self._pump.send(Prepared(tuple(map(str, messages.paths))))
+
+    def _examine(self) -> None:
+        from neuros.doctor.checks import findings
+
+        found = findings(os.environ, proves=False)
+        self._pump.send(
+            Examined(tuple((f.state.value, f.subject, f.text, f.remedy) for f in found))
+        )
+
+    # ------------------------------------------------------------------ the run
+
+    def _start(self, order: Start) -> None:
+        assert self._run is not None
+        files = node_files_from_json(order.nodes)
+        names = [file.node.name for file in files]
+        given = {**order.files, **{f"{f.node.name}/node.json": _json_of(f) for f in files}}
+        for name, text in given.items():
+            path = self._run / name
+            path.parent.mkdir(exist_ok=True)
+            path.touch(0o600)  # it holds keys
+            path.write_text(text, "utf-8")
+        machine = order.machine
+        self._follower = Follower(self._run, names, machine, given.keys())
+        listener = UnixListener(self._run)
+        # Found by its first digits as the run of the launcher is, and another run to the reapers.
+        run_id = order.run[:8] + os.urandom(4).hex()
+        self._domain = choose_domain(int(order.environment["ROS_DOMAIN_ID"]), os.environ, False)
+        session = Session(
+            run_id,
+            order.project,
+            "process",
+            tuple(names),
+            str(self._run),
+            time.time(),
+            this_process(),
+            files[0].names.namespace,
+            control=listener.address,
+        )
+        self._has_started = True
+        self._reaper = Reaper.start(run_id, self._domain, reaper_environment(session))
+        for path in listener.files:
+            self._reaper.remove_later(path)
+        listener.open()
+        self._pump.listen(listener)
+        own = {
+            RUN_ID: run_id,
+            CONTROL_VARIABLE: listener.address,
+            "ROS_LOG_DIR": str(self._run),
+        }
+        program = NodeProgram(
+            order.options, order.cores, self._pythons.paths, self._reaper, as_asked(os.environ)
+        )
+        if order.monitors_load:
+            self._watch_load(run_id, names)
+        started = ProcessLauncher(program).start(files, {**order.environment, **own})
+        self._processes = {process.names[0]: process for process in started}
+        self._pump.send(Started())
+
+    def _watch_load(self, run_id: str, names: list[str]) -> None:
+        from neuros.api.observation import check_observation, load_monitor
+
+        assert self._run is not None
+        check_observation(monitors_load=True)
+        self._monitor = load_monitor(run_id, self._run, names, is_one_process=False)
+        self._monitor.start()
+
+    def _signal(self, node: str, name: str) -> None:
+        process = self._processes.get(node)
+        if process is not None:
+            (process.kill if name == "KILL" else process.terminate)()
+
+    def _look(self) -> bool:
+        """Send what has come since; returns whether that was anything."""
+        has_sent = False
+        assert self._follower is not None or not self._processes
+        for name, process in tuple(self._processes.items()):
+            how = process.poll()
+            assert self._follower is not None
+            for chunk in self._follower.grown(name):
+                self._send(chunk)
+                has_sent = True
+                if how is None and self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES:
+                    return True
+            if how is not None:
+                del self._processes[name]
+                self._pump.send_last(NodeEnded(name, how))
+        return has_sent
+
+    def _send(self, chunk: Chunk) -> None:
+        self._in_flight_bytes += len(chunk.data) * 3 // 4
+        self._pump.send(chunk)
+
+    def _finish(self) -> None:
+        """Send the rest, as fast as the launcher takes it."""
+        load = None if self._monitor is None else self._monitor.stop()
+        problem = None if self._monitor is None else self._monitor.failure
+        for chunk in self._follower.rest() if self._follower is not None else ():
+            self._send(chunk)
+            while self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES and not self._is_lost:
+                message = self._next(_QUIET_S)
+                if isinstance(message, Took):
+                    self._in_flight_bytes -= message.size
+        self._pump.send(Finished(load, (problem,) if problem else ()))
+        self._pump.end()
+        self._pump.join()
+        self._is_over = True
+
+    def _end_nodes(self) -> None:
+        """End what is left: politely, then by force."""
+        for process in self._processes.values():
+            process.terminate()  # those that are up have seen already that their launcher is gone
+        end_s = time.monotonic() + _STOP_S
+        for process in self._processes.values():
+            process.wait(max(0.0, end_s - time.monotonic()))
+        end_now(tuple(self._processes.values()))
+        if self._reaper is not None:
+            self._reaper.finish()
+        if self._domain is not None:
+            self._domain.release()
+
+
+class _Remarks:
+    """What is said while environments are made, for the user at the launcher."""
+
+    def __init__(self, pump: Pump) -> None:
+        self._pump = pump
+
+    def isatty(self) -> bool:
+        return False
+
+    def write(self, text: str) -> None:
+        for line in filter(str.strip, text.splitlines()):
+            self._pump.send(Remark("INFO", line))
+
+    def flush(self) -> None:
+        """There is no buffer."""
+
+
+def _json_of(file: NodeFile) -> str:
+    import json
+
+    return json.dumps(node_file_to_json(file), indent=2) + "\n"
+
+
+def _remove_old_runs(cache: Path) -> None:
+    """What was left of runs whose launcher has gone is kept for a week."""
+    for run in (*cache.glob(f"{_RUN}*"), *cache.glob("received-*")):
+        try:
+            is_old = run.stat().st_mtime < time.time() - _KEPT_S
+        except OSError:
+            continue
+        if is_old and not (run / SOCKET_NAME).exists():
+            shutil.rmtree(run, ignore_errors=True)

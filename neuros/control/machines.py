@@ -1,0 +1,258 @@
+"""Messages between a launcher and its agents: the programs that run its nodes on other machines.
+
+They travel as lines of JSON, as those of the control channel do, over the standard input and output
+of the program that reaches the machine (``ssh``). Control connections of the nodes there pass
+through: each has a number, and its lines are the text of :class:`Said`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from neuros.control import Message
+
+# ---------------------------------------------------------------------- both ways
+
+
+@dataclass(frozen=True)
+class Ping(Message):
+    """A sign of life, to be answered at once; ``sent_s`` is on the sender's monotonic clock."""
+
+    sent_s: float
+
+
+@dataclass(frozen=True)
+class Pong(Message):
+    """The answer, with the clocks of who answers: monotonic, and Unix time, in seconds."""
+
+    sent_s: float
+    monotonic_s: float
+    unix_s: float
+
+
+@dataclass(frozen=True)
+class Opened(Message):
+    """A control connection has been made to the agent."""
+
+    link: int
+
+
+@dataclass(frozen=True)
+class Said(Message):
+    """Whole lines on a control connection."""
+
+    link: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Closed(Message):
+    """A control connection has ended."""
+
+    link: int
+
+
+# ---------------------------------------------------------------------- from the launcher
+
+
+@dataclass(frozen=True)
+class TreeFile:
+    """A file of a tree: its path in there, the SHA-256 of its content, its length."""
+
+    path: str
+    digest: str
+    size: int
+    is_executable: bool = False
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A folder with files, known by its content."""
+
+    name: str
+    files: tuple[TreeFile, ...]
+
+
+@dataclass(frozen=True)
+class Place(Message):
+    """Have these folders there; the last sign of life may be ``timeout_s`` seconds old."""
+
+    project: Tree
+    workspace: Tree
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class Content(Message):
+    """The next part of a file that is lacking, in base64."""
+
+    digest: str
+    data: str
+    is_last: bool
+
+
+@dataclass(frozen=True)
+class Prepare(Message):
+    """Get ready for nodes: their ``node.json``, with the paths of the agent's machine."""
+
+    nodes: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Start(Message):
+    """Start the nodes that were prepared.
+
+    Attributes:
+        run: its id; ``project``: its name.
+        machine: what the agent's machine is called.
+        nodes: their ``node.json``.
+        files: texts for the run folder, by name.
+        environment: of each node.
+        options: of the node program.
+        cores: by node.
+        monitors_load: whether to write what they take of the machine.
+    """
+
+    run: str
+    project: str
+    machine: str
+    nodes: tuple[Mapping[str, Any], ...]
+    files: Mapping[str, str]
+    environment: Mapping[str, str]
+    options: tuple[str, ...]
+    cores: Mapping[str, tuple[int, ...]]
+    monitors_load: bool = False
+
+
+@dataclass(frozen=True)
+class SignalNode(Message):
+    """Send a signal (``TERM``, ``KILL``) to the process of a node."""
+
+    node: str
+    signal: str
+
+
+@dataclass(frozen=True)
+class Took(Message):
+    """So many bytes of :class:`Chunk` have been written."""
+
+    size: int
+
+
+@dataclass(frozen=True)
+class Examine(Message):
+    """Look at the machine, as ``neuros doctor`` does."""
+
+
+@dataclass(frozen=True)
+class Finish(Message):
+    """All nodes have ended: send what they have left, remove it, and end."""
+
+
+# ---------------------------------------------------------------------- from the agent
+
+
+@dataclass(frozen=True)
+class Ready(Message):
+    """The agent is up.
+
+    Attributes:
+        version: of NeuROS there; ``python``: of Python.
+        machine: its architecture; ``name``: its host name.
+        reached_at: the address at which ``ssh`` has reached it, empty if not known.
+    """
+
+    version: str
+    python: str
+    machine: str
+    name: str
+    reached_at: str = ""
+
+
+@dataclass(frozen=True)
+class Lacking(Message):
+    """The content that has to be sent, by digest; perhaps none."""
+
+    digests: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Placed(Message):
+    """The folders are there."""
+
+    project: str
+    workspace: str
+    run: str
+
+
+@dataclass(frozen=True)
+class Remark(Message):
+    """A line for the user."""
+
+    severity: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Prepared(Message):
+    """Nodes can be started; ``messages`` are the folders of built message packages."""
+
+    messages: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Started(Message):
+    """The processes of all nodes have been started."""
+
+
+@dataclass(frozen=True)
+class Refused(Message):
+    """What was asked for last cannot be done, in sentences for the user."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class NodeEnded(Message):
+    """The process of a node has ended, in words; its log has been sent."""
+
+    node: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Chunk(Message):
+    """Bytes of a file of the run folder, in base64, at the offset at which it is to end before."""
+
+    path: str
+    offset: int
+    data: str
+
+
+@dataclass(frozen=True)
+class Examined(Message):
+    """What was found: state, subject, text and remedy of each finding."""
+
+    findings: tuple[tuple[str, str, str, str], ...]
+
+
+@dataclass(frozen=True)
+class Finished(Message):
+    """All has been sent; ``load``: the summary of the system load there, ``None`` without one."""
+
+    load: Mapping[str, Any] | None = None
+    problems: tuple[str, ...] = field(default=())
+
+
+BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)
+TO_AGENT: Sequence[type[Message]] = (
+    *BOTH_WAYS,
+    *(Place, Content, Prepare, Start, SignalNode, Took, Examine, Finish),
+)
+FROM_AGENT: Sequence[type[Message]] = (
+    *BOTH_WAYS,
+    *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Chunk, Examined),
+    Finished,
+)

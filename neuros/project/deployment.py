@@ -1,0 +1,122 @@
+"""Deployment files: which machine each node of a project runs on.
+
+A deployment stands apart from the project: an experiment does not know where it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from neuros.errors import Problem, ProjectError
+from neuros.project.model import Project
+from neuros.project.scanner import Element, SourceError, read_file
+from neuros.project.suggest import did_you_mean
+from neuros.project.validate import violations_in
+
+HERE = "here"
+"""The machine of the launcher, which needs no entry."""
+TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Host:
+    """A machine, and how it is reached.
+
+    Attributes:
+        ssh: its destination for ``ssh``, as ``pi@robot``.
+        ssh_options: further arguments of ``ssh``.
+        through: a command that executes there what follows it, in the place of ``ssh``.
+        neuros: the command ``neuros`` there.
+        address: by which the other machines reach it; empty: the one that ``ssh`` has used.
+    """
+
+    name: str
+    ssh: str = ""
+    ssh_options: tuple[str, ...] = ()
+    through: tuple[str, ...] = ()
+    neuros: str = "neuros"
+    address: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.ssh})" if self.ssh else self.name
+
+
+@dataclass(frozen=True)
+class DeploymentFile:
+    """A checked deployment.
+
+    Attributes:
+        hosts: the machines besides this one, by name.
+        places: by node, the name of its host; none: it runs here.
+        here: what the file says of this machine.
+        timeout_s: a machine that has given no sign of life for so long counts as gone.
+    """
+
+    file: Path
+    hosts: Mapping[str, Host]
+    places: Mapping[str, str]
+    here: Host = field(default_factory=lambda: Host(HERE))
+    timeout_s: float = TIMEOUT_S
+
+    @property
+    def used(self) -> list[Host]:
+        """The machines besides this one on which nodes run."""
+        return [host for name, host in self.hosts.items() if name in self.places.values()]
+
+
+def load_deployment(path: Path, project: Project | None = None) -> DeploymentFile:
+    """Read a deployment file, and check it against a project.
+
+    Raises:
+        ProjectError: with all its problems.
+    """
+    try:
+        root, problems = read_file(path.absolute())
+    except SourceError as error:
+        raise ProjectError([error.problem]) from None
+    problems += violations_in(root, "deployment")
+    if not problems:
+        problems += _mistakes(root, project)
+    if problems:
+        raise ProjectError(problems)
+    hosts = {name: _host(name, each) for name, each in (root.plain.get("hosts") or {}).items()}
+    places = {node: host for node, host in root.plain.get("nodes", {}).items() if host != HERE}
+    timeout_s = float(root.plain.get("timeout_s", TIMEOUT_S))
+    here = hosts.pop(HERE, Host(HERE))
+    return DeploymentFile(path.absolute(), hosts, places, here, timeout_s)
+
+
+def _host(name: str, keys: Mapping[str, object]) -> Host:
+    lists = {key: tuple(each) for key, each in keys.items() if isinstance(each, list)}
+    return Host(name, **{**keys, **lists})  # type: ignore[arg-type]
+
+
+def _mistakes(root: Element, project: Project | None) -> list[Problem]:
+    """What the schema cannot say."""
+    found: list[Problem] = []
+    hosts = root.member("hosts")
+    known = {HERE}
+    for name, host in (hosts.value if hosts is not None else {}).items():
+        known.add(name)
+        ways = [key for key in ("ssh", "through") if key in host.value]
+        if name == HERE and ways:
+            text = f"'{HERE}' is the machine that launches, and is not reached by '{ways[0]}'"
+            hint = "give the other machine another name"
+            found.append(host.value[ways[0]].key_problem(text, hint))
+        elif name != HERE and len(ways) != 1:
+            text = "needs exactly one of 'ssh' and 'through', which say how it is reached"
+            found.append(host.problem(text, f"this machine is '{HERE}'"))
+        elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
+            found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))
+    nodes = root.member("nodes")
+    names = None if project is None else [node.name for node in project.nodes]
+    for node, host in (nodes.value if nodes is not None else {}).items():
+        if host.value not in known:
+            hint = did_you_mean(host.value, known) or f"there are {', '.join(sorted(known))}"
+            found.append(host.problem(f"there is no host '{host.value}'", hint))
+        if names is not None and node not in names:
+            text, hint = f"the project has no node '{node}'", did_you_mean(node, names)
+            found.append(host.key_problem(text, hint))
+    return found

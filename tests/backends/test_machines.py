@@ -1,0 +1,291 @@
+"""What an agent and its launcher share: trees, the mirror, clocks, and the pump between them."""
+
+from __future__ import annotations
+
+import os
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from neuros.backends.control_sockets import UnixListener, connect
+from neuros.backends.machines.clock import ClockOffset
+from neuros.backends.machines.machine import agent_command
+from neuros.backends.machines.mirror import Follower, write_chunk
+from neuros.backends.machines.pump import Pump
+from neuros.backends.machines.trees import TreeStore, scan
+from neuros.control import LiveCounters, Message, NodeStatus, Report
+from neuros.control.link import encode
+from neuros.control.machines import FROM_AGENT, TO_AGENT, Chunk, NodeEnded, Pong
+from neuros.ports import ControlStream
+from neuros.project.deployment import Host
+from neuros.stacks import FILE_NAME as STACK
+
+_SOON_S = 30.0
+
+
+class TestTrees:
+    """Folders that another machine gets."""
+
+    @pytest.fixture
+    def project(self, tmp_path: Path) -> Path:
+        folder = tmp_path / "toy"
+        for name in ("plugin.py", "models/robot.xml", ".git/config", "__pycache__/x.pyc"):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(name)
+        (folder / "old_run").mkdir()
+        (folder / "old_run/run.json").write_text("{}")
+        (folder / "script.sh").write_text("true")
+        (folder / "script.sh").chmod(0o755)
+        return folder
+
+    def give(self, project: Path, cache: Path) -> tuple[list[str], Path]:
+        """What had to be sent, by content, and the folder that came of it."""
+        tree, store = scan("toy", project), TreeStore(cache)
+        paths = {file.digest: project / file.path for file in tree.files}
+        lacking = store.lacking([tree])
+        for digest in lacking:
+            data = paths[digest].read_bytes()
+            store.receive(digest, data[:2])
+            store.receive(digest, data[2:])
+        folder = store.place(tree)
+        store.clean_up()
+        return sorted(paths[digest].name for digest in lacking), folder
+
+    def test_it_has_the_files_without_hidden_folders_caches_and_runs(
+        self, project: Path, tmp_path: Path
+    ) -> None:
+        sent, folder = self.give(project, tmp_path / "cache")
+        assert sent == ["plugin.py", "robot.xml", "script.sh"]
+        assert (folder / "models/robot.xml").read_text() == "models/robot.xml"
+        assert os.access(folder / "script.sh", os.X_OK)
+        assert not os.access(folder / "plugin.py", os.X_OK)
+
+    def test_only_what_has_changed_is_sent(self, project: Path, tmp_path: Path) -> None:
+        _, before = self.give(project, tmp_path / "cache")
+        assert self.give(project, tmp_path / "cache") == ([], before)
+        (project / "plugin.py").write_text("changed")
+        sent, after = self.give(project, tmp_path / "cache")
+        assert sent == ["plugin.py"]
+        assert (before / "plugin.py").read_text() == "plugin.py"  # another run may use it
+        assert (after / "plugin.py").read_text() == "changed"
+
+    def test_what_was_changed_there_is_put_right(self, project: Path, tmp_path: Path) -> None:
+        _, folder = self.give(project, tmp_path / "cache")
+        (folder / "plugin.py").write_text("changed there")
+        assert self.give(project, tmp_path / "cache") == (["plugin.py"], folder)
+        assert (folder / "plugin.py").read_text() == "plugin.py"
+
+
+class TestMirror:
+    """Files that nodes write elsewhere."""
+
+    @pytest.fixture
+    def there(self, tmp_path: Path) -> Path:
+        (tmp_path / "there/eye/spool").mkdir(parents=True)
+        return tmp_path / "there"
+
+    def write(self, chunks: Iterator[Chunk], here: Path) -> list[str]:
+        found = list(chunks)
+        for chunk in found:
+            write_chunk(here, chunk)
+        return [chunk.path for chunk in found if chunk.data]
+
+    def test_logs_and_recorded_packets_come_while_they_grow(
+        self, there: Path, tmp_path: Path
+    ) -> None:
+        here, follower = tmp_path / "here", Follower(there, ["eye"], "robot", ())
+        (there / "eye/node.log").write_text("one\n")
+        (there / "eye/figure.png").write_text("later")
+        assert self.write(follower.grown("eye"), here) == ["eye/node.log"]
+        with open(there / "eye/node.log", "a") as log:
+            log.write("two\n")
+        (there / "eye/spool/00000000").write_bytes(bytes(200_000))
+        sizes = [os.path.getsize(there / "eye" / n) for n in ("node.log", "spool/00000000")]
+        self.write(follower.grown("eye"), here)
+        assert (here / "eye/node.log").read_text() == "one\ntwo\n"
+        assert os.path.getsize(here / "eye/spool/00000000") == sizes[1]
+        assert self.write(follower.grown("eye"), here) == []
+
+    def test_a_file_that_is_cut_off_is_cut_off_here(self, there: Path, tmp_path: Path) -> None:
+        here, follower = tmp_path / "here", Follower(there, ["eye"], "robot", ())
+        stack = there / "eye" / STACK
+        for text in ("head\nTimeout!\n", "head\n", "head\nTimeout again!\n"):
+            stack.write_text(text)
+            self.write(follower.grown("eye"), here)
+            assert (here / "eye" / STACK).read_text() == text
+
+    def test_in_the_end_everything_else_comes_and_what_was_given_does_not(
+        self, there: Path, tmp_path: Path
+    ) -> None:
+        here = tmp_path / "here"
+        (there / "eye/node.json").write_text("given")
+        (there / "eye/sub").mkdir()
+        (there / "eye/sub/figure.png").write_text("a figure")
+        (there / "notes.txt").write_text("of no node")
+        follower = Follower(there, ["eye"], "robot", ["eye/node.json"])
+        self.write(follower.rest(), here)
+        files = {path.relative_to(here).as_posix() for path in here.rglob("*") if path.is_file()}
+        assert files == {"eye/sub/figure.png", "machines/robot/notes.txt"}
+
+    def test_nothing_is_written_outside_of_the_run_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(OSError, match="outside of the run folder"):
+            write_chunk(tmp_path / "run", Chunk("../elsewhere", 0, ""))
+
+
+class TestClock:
+    """Times of a machine whose monotonic clock is 1000 s ahead."""
+
+    @pytest.fixture
+    def clock(self) -> ClockOffset:
+        clock = ClockOffset()
+        clock.take(Pong(5.0, 1005.0, 2e9 + 0.5), 5.0, 2e9)
+        return clock
+
+    def test_the_fastest_answer_tells_how_far_it_is_ahead(self) -> None:
+        clock = ClockOffset()
+        for late_s, ahead_s in ((0.5, 1000.2), (0.01, 1000.0), (0.25, 999.9)):
+            sent_s, there_s = 50.0, 50.0 + late_s / 2 + ahead_s
+            clock.take(Pong(sent_s, there_s, 2e9 - late_s / 2 - 3.0), sent_s + late_s, 2e9)
+        assert clock.round_trip_s == pytest.approx(0.01)
+        assert clock.monotonic_s == pytest.approx(1000.0)
+        assert clock.unix_s == pytest.approx(-3.0)
+
+    def test_processes_of_one_machine_have_one_clock(self) -> None:
+        clock = ClockOffset()
+        clock.take(Pong(50.0, 50.06, 2e9), 50.1, 2e9)
+        assert clock.monotonic_s == 0.0
+
+    def test_what_nodes_report_is_on_the_clock_of_this_machine(self, clock: ClockOffset) -> None:
+        report = Report(node="eye", running_since_s=1005.0, timeline=((1.0, 1006.0),))
+        here = replace(report, running_since_s=5.0, timeline=((1.0, 6.0),))
+        metrics = {"state": {"state": "idle", "cause": ""}}
+        counters = LiveCounters(1007.0, metrics, {"c": (1, (10**12,))}, {"c": (1, 10**12 + 1)})  # type: ignore[arg-type]
+        status = NodeStatus("eye", 1, None, counters, {"x": {"values": [[1008.0, 3.5]]}})
+        moved = LiveCounters(7.0, metrics, {"c": (1, (0,))}, {"c": (1, 1)})  # type: ignore[arg-type]
+        status_here = NodeStatus("eye", 1, None, moved, {"x": {"values": [[8.0, 3.5]]}})
+        other = '{"kind": "hello", "nodes": ["eye"]}\n'
+        text = encode(report).decode() + other + encode(status).decode()
+        expected = encode(here).decode() + other + encode(status_here).decode()
+        assert clock.text_here(text) == expected
+
+    def test_so_are_the_times_in_packet_logs(self, clock: ClockOffset, tmp_path: Path) -> None:
+        second_ns = 10**9
+        files = {
+            "0.sent_ns": ([1001 * second_ns, 1002 * second_ns], [second_ns, 2 * second_ns]),
+            "0.taken": ([1, 2], [1, 2]),
+            "executions": (
+                [0, 1003 * second_ns, 1004 * second_ns],
+                [0, 3 * second_ns, 4 * second_ns],
+            ),
+            "credits": ([0, 5, 1005 * second_ns], [0, 5, 5 * second_ns]),
+        }
+        for name, (there, _) in files.items():
+            (tmp_path / name).write_bytes(array("q", there).tobytes())
+        clock.log_here(tmp_path)
+        for name, (_, here) in files.items():
+            assert array("q", (tmp_path / name).read_bytes()) == array("q", here), name
+
+
+class TestPump:
+    """Two ends in one process."""
+
+    @pytest.fixture
+    def ends(self, tmp_path: Path) -> Iterator[Ends]:
+        ends = Ends(tmp_path)
+        yield ends
+        ends.close()
+
+    def test_control_connections_pass_through_in_order(self, ends: Ends) -> None:
+        node = connect(ends.listener.address)
+        node.sendall(b'{"kind": "hello"}\n')
+        supervisor = ends.accepted()
+        assert supervisor.recv(100) == b'{"kind": "hello"}\n'
+        supervisor.sendall(b'{"kind": "stop"}\n')
+        assert node.recv(100) == b'{"kind": "stop"}\n'
+        words = b"last words\n" * 10_000  # more than is read at once
+        node.sendall(words)
+        node.close()
+        end = NodeEnded("eye", "exit code 0")
+        ends.agent.send_last(end)
+        ends.wait_for(lambda: end in ends.to_launcher)
+        supervisor.setblocking(False)  # what it has said before is there when its end is known
+        assert b"".join(iter(lambda: supervisor.recv(1 << 16), b"")) == words
+        supervisor.close()
+
+    def test_who_hangs_up_is_missed_at_once(self, ends: Ends) -> None:
+        ends.agent.end()
+        ends.wait_for(lambda: ends.lost)
+        assert ends.lost == ["the connection was closed"]
+
+    def test_who_is_silent_is_missed_after_its_time(self) -> None:
+        (from_there, held), (taken, to_there) = os.pipe(), os.pipe()  # and nobody writes
+        lost: list[str] = []
+        pump = Pump(from_there, to_there, (), "robot", id, lost.append)
+        pump.timeout_s = 0.2
+        pump.start()
+        pump.join(_SOON_S)
+        os.close(held)
+        os.close(taken)
+        assert lost == ["nothing was heard of robot for 0.2 s"]
+
+
+class Ends:
+    """A launcher's pump and an agent's, joined by pipes."""
+
+    def __init__(self, folder: Path) -> None:
+        (from_agent, to_launcher), (from_launcher, to_agent) = os.pipe(), os.pipe()
+        self.to_launcher: list[Message] = []
+        self.lost: list[str] = []
+        self.supervisor, self.listener = (UnixListener(folder / name) for name in ("run", "there"))
+        for name, listener in (("run", self.supervisor), ("there", self.listener)):
+            (folder / name).mkdir()
+            listener.open()
+        self.launcher = Pump(
+            *(from_agent, to_agent, FROM_AGENT, "robot"),
+            self.to_launcher.append,
+            self.lost.append,
+            connect=lambda: connect(self.supervisor.address),
+        )
+        self.agent = Pump(from_launcher, to_launcher, TO_AGENT, "the launcher", id, id)
+        self.agent.listen(self.listener)
+        self.launcher.start()
+        self.agent.start()
+
+    def accepted(self) -> ControlStream:
+        """The control connection that has come through."""
+        found: list[ControlStream] = []
+        self.wait_for(lambda: found.extend(filter(None, [self.supervisor.accept()])) or found)
+        found[0].setblocking(True)
+        return found[0]
+
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        deadline_s = time.monotonic() + _SOON_S
+        while not condition():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        for pump in (self.launcher, self.agent):
+            pump.end()
+            pump.join(_SOON_S)
+        self.supervisor.close()
+        self.listener.close()
+
+
+class TestCommand:
+    """How an agent is started."""
+
+    def test_by_ssh_which_must_not_ask(self) -> None:
+        host = Host("robot", "pi@robot", ("-p", "2222"), neuros="~/my robot/neuros")
+        command = agent_command(host)
+        assert command[0] == "ssh"
+        assert "BatchMode=yes" in command
+        assert command[-5:] == ["-p", "2222", "--", "pi@robot", "exec ~/'my robot/neuros' agent"]
+
+    def test_through_another_command(self) -> None:
+        host = Host("node7", through=("srun", "--nodelist=node7"), neuros="/opt/neuros")
+        assert agent_command(host) == ["srun", "--nodelist=node7", "/opt/neuros", "agent"]

@@ -1,0 +1,83 @@
+"""A project with an agent for some of its nodes, on this very machine: no ``ssh``, no root."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from launching import Finished, Running, launch, start
+
+STREAM = Path(__file__).parent / "network" / "stream"
+NEUROS = Path(sys.executable).with_name("neuros")
+CONNECTION = "source.image -> sink.image"
+ENDED_S = 120.0  # on a machine that does many other things
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(STREAM, tmp_path / "stream"))
+
+
+def deployment(folder: Path, **more: Any) -> Path:
+    """The sink is with an agent, which has a cache and a current folder of its own."""
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir(exist_ok=True)
+    through = ["env", f"--chdir={elsewhere}", f"XDG_CACHE_HOME={elsewhere}"]
+    host = {"through": through, "neuros": str(NEUROS), "address": "127.0.0.1"}
+    content = {"hosts": {"other": host}, "nodes": {"sink": "other"}, "timeout_s": 60, **more}
+    file = folder / "deployment.json"
+    file.write_text(json.dumps(content))
+    return file
+
+
+def deployed(project: Path, *arguments: str, cwd: Path) -> Running:
+    file = deployment(cwd)
+    return start(project, "--deployment", str(file), *arguments, cwd=cwd)
+
+
+def left_there(folder: Path) -> list[str]:
+    """What agents have left in their cache, beside the trees and environments that are kept."""
+    return [path.name for path in (folder / "elsewhere/neuros/machines").glob("r*-*")]
+
+
+def trees_there(folder: Path) -> list[Path]:
+    return sorted((folder / "elsewhere/neuros/machines").glob("stream-*.json"))
+
+
+def assert_all_arrived(finished: Finished, count: int = 100) -> None:
+    assert finished.exit_code == 0, finished.output
+    books = finished.connection(CONNECTION)
+    assert (books["sent"], books["received"], books["lost"]) == (count, count, 0)
+    assert finished.run_folder is not None
+    received = json.loads((finished.run_folder / "sink" / "received.json").read_text())
+    assert received["numbers"] == list(range(1, count + 1))
+
+
+def test_one_command_starts_nodes_elsewhere_and_brings_home_all_they_leave(
+    project: Path, tmp_path: Path
+) -> None:
+    with deployed(project, "--record", cwd=tmp_path) as running:
+        finished = running.finish(ENDED_S)
+    assert_all_arrived(finished)
+    assert "the first image is here" in finished.output
+    assert f"recorded 100 packets on 1 topic: {finished.run_folder}/bag" in finished.output
+    machine = finished.record["machines"]["other"]
+    assert (machine["nodes"], machine["lost"]) == (["sink"], "")
+    assert finished.connection(CONNECTION)["latency_ms"]["p50"] > 0
+    assert left_there(tmp_path) == []
+    assert len(trees_there(tmp_path)) == 1
+
+
+def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(
+    project: Path, tmp_path: Path
+) -> None:
+    file = str(deployment(tmp_path))
+    finished = launch(project, "--deployment", file, "--dry-run", cwd=tmp_path, timeout_s=ENDED_S)
+    assert finished.exit_code == 0, finished.output
+    assert "process source: " in finished.output
+    assert "process sink on other\n" in finished.output
+    assert not list((tmp_path / "elsewhere").iterdir())

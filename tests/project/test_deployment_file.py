@@ -1,0 +1,93 @@
+"""Deployment files: what they say, and every problem of one with its place."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuros.errors import ProjectError
+from neuros.project.deployment import DeploymentFile, Host, load_deployment
+from neuros.project.model import Node, Project
+
+PROJECT = Project(
+    "toy",
+    tuple(Node(name, "neuros_python", Path("plugin.py")) for name in ("eye", "brain")),
+    (),
+    Path("project.json"),
+)
+ROBOT = {"ssh": "pi@robot"}
+
+
+def load(folder: Path, content: Any) -> DeploymentFile:
+    file = folder / "deployment.json"
+    file.write_text(content if isinstance(content, str) else json.dumps(content))
+    return load_deployment(file, PROJECT)
+
+
+def problems_of(folder: Path, content: Any) -> list[str]:
+    """Each as pointer and text, without the place, sorted."""
+    with pytest.raises(ProjectError) as raised:
+        load(folder, content)
+    return sorted(f"{each.pointer}: {each.text}" for each in raised.value.problems)
+
+
+def test_it_says_where_nodes_run_and_how_machines_are_reached(tmp_path: Path) -> None:
+    robot = {**ROBOT, "ssh_options": ["-p", "2222"], "neuros": "/opt/neuros", "address": "10.0.0.7"}
+    hosts = {"robot": robot, "unused": {"through": ["srun"]}, "here": {"address": "10.0.0.1"}}
+    file = load(tmp_path, {"hosts": hosts, "nodes": {"eye": "robot", "brain": "here"}})
+    reached = Host("robot", "pi@robot", ("-p", "2222"), (), "/opt/neuros", "10.0.0.7")
+    assert file.used == [reached]
+    assert file.places == {"eye": "robot"}
+    assert file.here.address == "10.0.0.1"
+    assert file.timeout_s == 5.0
+
+
+def test_nodes_that_it_does_not_name_run_here(tmp_path: Path) -> None:
+    assert load(tmp_path, {"nodes": {}}).places == {}
+    assert load(tmp_path, {"hosts": {"robot": ROBOT}, "nodes": {"eye": "robot"}}).places == {
+        "eye": "robot"
+    }
+
+
+def test_all_problems_of_its_form_are_told_at_once(tmp_path: Path) -> None:
+    hosts = {"robot": {"shs": "pi@robot"}, "2nd": {"ssh": 5}}
+    assert problems_of(tmp_path, {"hosts": hosts, "node": {}, "timeout_s": 0}) == [
+        "/: the key 'nodes' is missing",
+        "/hosts/2nd/ssh: must be a text, but is a whole number",
+        "/hosts/2nd: '2nd' is not allowed as a name here",
+        "/hosts/robot/shs: unknown key 'shs'",
+        "/node: unknown key 'node'",
+        "/timeout_s: must be at least 2, but is 0",
+    ]
+
+
+def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
+    hosts = {
+        "both": {"ssh": "a", "through": ["srun"]},
+        "neither": {},
+        "option": {"ssh": "-oProxyCommand=x"},
+        "here": {"ssh": "me@here"},
+    }
+    nodes = {"eye": "robbot", "brian": "both"}
+    ways = "needs exactly one of 'ssh' and 'through', which say how it is reached"
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes}) == [
+        f"/hosts/both: {ways}",
+        "/hosts/here/ssh: 'here' is the machine that launches, and is not reached by 'ssh'",
+        f"/hosts/neither: {ways}",
+        "/hosts/option/ssh: is an option, not a destination: user@host",
+        "/nodes/brian: the project has no node 'brian'",
+        "/nodes/eye: there is no host 'robbot'",
+    ]
+
+
+def test_what_is_no_json_is_told_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(ProjectError, match=r"deployment\.json:2:1"):
+        load(tmp_path, '{"nodes":\n}')
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ProjectError, match=r"absent\.json"):
+        load_deployment(tmp_path / "absent.json", PROJECT)
