@@ -331,8 +331,8 @@ def explain_failure(text: str) -> str | None:
     if sentence is None and re.search("No matching distribution|Could not find a version", text):
         return (
             "a package does not exist for this Python or processor: run"
-            f" {other_python()} install.py (with --wheelhouse: or it is not in there; with an index of your own: --newest takes"
-            " the versions that it has)"
+            f" {other_python()} install.py (with --wheelhouse: or it is not in there; with an index"
+            " of your own: --newest takes the versions that it has)"
         )
     return sentence
 
