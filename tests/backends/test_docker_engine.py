@@ -182,5 +182,7 @@ class TestAbilities:
         nodes = [node("a", mem_bytes=1 << 30), node("b", pids=9), node("c")]
         ((severity, text),) = without_limits(nodes, {"mem_bytes", "cpus"})
         assert severity == "WARN"
-        assert text.startswith("resources of a have no effect: this Docker engine has no control groups")
+        assert text.startswith(
+            "resources of a have no effect: this Docker engine has no control groups"
+        )
         assert without_limits(nodes, ()) == ()
