@@ -82,11 +82,11 @@ def run(name: str, folder: Path, duration_s: float, backend: str) -> None:
         )
     else:
         rate_rad_s, bias_rad_s = WAYS[name]
-        weights = shutil.copy(_weights(folder.parents[1], seed), project)
+        shutil.copyfile(_weights(folder.parents[1], seed), project / WEIGHTS)
         file, settings = (
             "prediction.json",
             {
-                "pcn.environment.WEIGHTS": weights,
+                "pcn.environment.WEIGHTS": WEIGHTS,
                 "snn.environment.SEED": seed,
                 "snn.environment.GYRO_BIAS": bias_rad_s,
                 "robot.environment.SEED": seed,

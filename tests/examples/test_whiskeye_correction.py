@@ -222,6 +222,13 @@ def test_pictures_of_two_eyes_are_paired_where_some_are_lost(load):
     assert eyes.pairs(left[4], right[5]) == [(left[4], right[4])]
 
 
+def test_weights_may_be_named_as_they_lie_beside_the_plugin(load, weights, monkeypatch):
+    pcn = load("pcn")
+    monkeypatch.setattr(pcn, "__file__", str(Path(weights).with_name("pcn.py")))
+    monkeypatch.setenv("WEIGHTS", "weights.npz")
+    assert "old_views" in pcn.Predictor().weights
+
+
 @pytest.mark.parametrize("named", ["", "/nowhere/weights.npz"])
 def test_without_weights_it_says_how_to_get_them(named):
     with (

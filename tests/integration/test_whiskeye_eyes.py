@@ -110,7 +110,8 @@ def test_five_runs_and_all_back_ends_carry_the_same_packets(weights, tmp_path, c
     require_containers(*IMAGES)
     # In containers the nodes see the folder of their project alone.
     project = Path(shutil.copytree(WHISKEYE, tmp_path / "whiskeye"))
-    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__WEIGHTS": shutil.copy(weights, project)}
+    shutil.copy(weights, project)
+    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__WEIGHTS": weights.name}
     runs = []
     with nothing_left(tmp_path):
         for number, backend in enumerate(("process",) * 5 + ("in-process", "docker")):

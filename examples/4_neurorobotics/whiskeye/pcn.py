@@ -51,12 +51,16 @@ class Eyes:
 
 
 class Predictor:
-    """The network of ``WEIGHTS``, and how far a heading is off per prediction error of its view."""
+    """The network of ``WEIGHTS``, and how far a heading is off per prediction error of its view.
+
+    A relative path may lead from the folder of this file, which is all that a container sees.
+    """
 
     def __init__(self):
         named = os.environ.get("WEIGHTS", "")
         try:
-            with np.load(Path(named)) as weights:
+            beside = Path(__file__).parent / named
+            with np.load(beside if beside.is_file() else Path(named)) as weights:
                 self.weights = dict(weights)
             self.network = PredictiveCodingNetwork.of_weights(self.weights)
             self._rad_per_error = float(self.weights["rad_per_error"])
