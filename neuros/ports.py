@@ -1,6 +1,4 @@
-"""All seams of NeuROS on one page: an adapter implements one (layer 4), the runtime and the
-supervisor use it (layer 5), the command line picks it. The engine knows none of what is behind.
-"""
+"""All seams of NeuROS on one page: adapters (layer 4) implement what nodes and supervisor use."""
 
 from __future__ import annotations
 
@@ -488,7 +486,7 @@ class Deployment(ABC):
         return {}
 
     def finish(self, is_enough: Callable[[], bool]) -> Sequence[str]:
-        """Bring here what the nodes have left elsewhere, until ``is_enough()``; returns faults."""
+        """Bring here what nodes have left elsewhere, until ``is_enough()``; returns faults."""
         return ()
 
     def record(self) -> Mapping[str, Any]:
