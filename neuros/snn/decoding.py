@@ -129,7 +129,7 @@ class LeakyIntegrator:
     def update(self, value: object, until_s: float) -> Floats:
         """The filtered value at ``until_s``, the input having been ``value`` since the last call.
 
-        Raises ``ValueError`` where time goes back or the shape is another one.
+        Raises ``ValueError`` if time goes back or the shape is wrong.
         """
         target = np.asarray(value, dtype=np.float64)
         if target.shape != self._value.shape:

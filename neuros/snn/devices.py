@@ -38,7 +38,7 @@ class RateInput:
     def set_rates(self, rates_hz: object) -> None:
         """From the next step on, in Hz, ``(n,)``. What has not changed costs nothing.
 
-        Raises ``ValueError`` where the shape is another one, or a rate is negative or not finite.
+        Raises ``ValueError`` if the shape is wrong, or a rate is negative or not finite.
         """
         rates = checked_rates(rates_hz, self._rates_hz.size)
         changed = np.flatnonzero(rates != self._rates_hz)
