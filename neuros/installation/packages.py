@@ -330,9 +330,9 @@ def explain_failure(text: str) -> str | None:
     sentence = explain_machine(text)
     if sentence is None and re.search("No matching distribution|Could not find a version", text):
         return (
-            f"a package does not exist for this Python or processor: run {other_python()} install.py"
-            " (with --wheelhouse: or it is not in there; with an index of your own: --newest takes"
-            " the versions that it has)"
+            "a package does not exist for this Python or processor: run"
+            f" {other_python()} install.py (with --wheelhouse: or it is not in there; with an"
+            " index of your own: --newest takes the versions that it has)"
         )
     return sentence
 
