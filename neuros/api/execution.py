@@ -332,7 +332,6 @@ class Execution:
             **_without_notebook(os.environ),
             "NEUROS_RUN_ID": self._run_id,
             "ROS_DOMAIN_ID": str(self._domain.id),
-            "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # the only one that the wheels bring
             "ROS_LOG_DIR": str(self.folder),
         }
 

@@ -17,6 +17,7 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.backends.placement import THREAD_VARIABLES, Cores, on_cores, thread_limits
@@ -53,6 +54,7 @@ _TAIL_BYTES = 8192
 _MARK = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BOOTSTRAPPER = "ros_wheels_bootstrapper"
+_RMW = "rmw_fastrtps_cpp"
 
 
 PROCESS_LOG = "host.log"
@@ -145,8 +147,13 @@ def node_environment(node: NodeFile) -> dict[str, str]:
 
 
 def process_environment(base: Mapping[str, str], added: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a node process: ``base`` (the launcher's own) with ``added`` on top."""
-    return {**DEFAULTS, **without_mark(base), **added}
+    """The environment of a node process: ``base`` (the launcher's own) with ``added`` on top.
+
+    The wheels bring one implementation of RMW, whatever a shell with another ROS says; without
+    them, as in an image with a ROS of its own, the environment names it.
+    """
+    rmw = {"RMW_IMPLEMENTATION": _RMW} if find_spec(_BOOTSTRAPPER) else {}
+    return {**DEFAULTS, **without_mark(base), **rmw, **added}
 
 
 def with_messages(environment: Mapping[str, str], messages: Sequence[Path]) -> dict[str, str]:

@@ -330,7 +330,6 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
     (own / "node.json").write_text(json.dumps(node_file_to_json(file), indent=2) + "\n", "utf-8")
     added = {
         **node_environment(file),
-        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF",  # it has no neighbours
         "ROS_LOG_DIR": str(file.folders.run),
     }

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from neuros.backends import node_command
 from neuros.backends.node_command import process_environment
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
 from neuros.errors import EnvironmentFault
@@ -145,6 +146,20 @@ def test_the_restart_of_the_ros_wheels_happens_anew_in_each_host() -> None:
 def test_library_paths_of_the_user_stay() -> None:
     environment = process_environment({"LD_LIBRARY_PATH": f"{sys.prefix}/lib"}, {})
     assert environment["LD_LIBRARY_PATH"] == f"{sys.prefix}/lib"
+
+
+def test_the_implementation_of_rmw_is_that_of_the_wheels_where_ros_comes_from_wheels() -> None:
+    sourced = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    assert process_environment(sourced, {})["RMW_IMPLEMENTATION"] == "rmw_fastrtps_cpp"
+
+
+def test_the_implementation_of_rmw_is_that_of_the_environment_where_another_ros_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(node_command, "_BOOTSTRAPPER", "no_wheels_of_ros")
+    image = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    assert process_environment(image, {})["RMW_IMPLEMENTATION"] == "rmw_cyclonedds_cpp"
+    assert "RMW_IMPLEMENTATION" not in process_environment({}, {})
 
 
 def test_both_outputs_are_appended_to_the_log(run: Run) -> None:
