@@ -122,6 +122,11 @@ class Execution:
                 reaper.remove_later(file)
             return self._run(reaper, started)
 
+    @property
+    def control_address(self) -> str:
+        """Where observers connect to its control channel."""
+        return self._listener.address
+
     def cancel(self) -> None:
         """Give up what it holds, in the place of :meth:`run`."""
         self._domain.release()
@@ -287,6 +292,7 @@ class Execution:
             duration_s=self._plan.request.end.wall_s,
             peers=Peers(self._run_id, self._plan.elsewhere, self._files, self._where_to_start()),
             waker=self._waker,
+            is_held=self._plan.is_held,
         )
 
     def _where_to_start(self) -> str:
