@@ -1,16 +1,17 @@
 """Finds out when nothing moves any more in a run that is paused: the end of a step of a session.
 
-Each node process answers when no event waits in it. Two of them are not asked at one instant, so a
-packet may be under way between them: one round of answers with equal counters at both ends is not
-enough, two equal rounds are (F. Mattern, "Algorithms for distributed termination detection", 1987).
-One process alone, which hands packets over in memory, is at rest when it says so.
+Each node process answers when no event waits in it, and none starts anything unasked. They answer
+at different instants, but with counters by connection one round is enough: if something still
+moved, then some process was the first to receive a packet after its answer. That was sent before the
+answer of its sender, so the counters of this connection would differ (F. Mattern, "Algorithms for
+distributed termination detection", 1987, channel counting).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TypeAlias
 
 from neuros.control import AtRest, NewestPacket, Pause, Settle, Settled
 from neuros.control.link import ControlLink
@@ -22,17 +23,27 @@ _LOST_AFTER_S = 0.1
 """On a connection that may lose packets, one that has not arrived for so long has been lost."""
 _NEVER_S = 3600.0
 
+Counts: TypeAlias = Mapping[str, tuple[int, int]]
+"""By connection, packets that have passed, and those acknowledged; -1: none ever are."""
+
 
 class Settling:
     """Answers ``settle`` of a session: once all nodes have begun, and nothing moves.
 
     Args:
         names: the nodes, all of which have to answer.
+        clock: monotonic, seconds.
     """
 
-    def __init__(self, names: Iterable[str], channels: Channels) -> None:
+    def __init__(
+        self,
+        names: Iterable[str],
+        channels: Channels,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._names = set(names)
         self._channels = channels
+        self._clock = clock
         self._asker: ControlLink | None = None
         self._asked = Settle(0, {})
         self._round = 0
@@ -40,13 +51,13 @@ class Settling:
         self._due_s: float | None = None
         self._answers: dict[tuple[str, ...], AtRest] = {}
         self._packets: dict[str, NewestPacket] = {}
-        self._last: tuple[Any, ...] | None = None
-        self._differs_since_s = 0.0
+        self._last: tuple[Counts, Counts] | None = None
+        self._last_s = 0.0
 
     @property
     def wait_s(self) -> float:
         """Seconds until :meth:`look` has something to do."""
-        return _NEVER_S if self._due_s is None else max(0.0, self._due_s - time.monotonic())
+        return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
 
     def ask(self, asker: ControlLink, message: Settle) -> None:
         """Find out from now on, and answer this one; what was asked before is answered no more."""
@@ -66,7 +77,7 @@ class Settling:
 
     def look(self) -> None:
         """Ask again where it is time."""
-        if self._due_s is not None and time.monotonic() >= self._due_s:
+        if self._due_s is not None and self._clock() >= self._due_s:
             self._begin_round()
 
     def _begin_round(self) -> None:
@@ -81,20 +92,14 @@ class Settling:
 
     def _ask_later(self) -> None:
         self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S)
-        self._due_s = time.monotonic() + self._pause_s
+        self._due_s = self._clock() + self._pause_s
 
     def _judge(self, asker: ControlLink) -> None:
         answers = self._answers.values()
-        now = tuple((a.nodes, a.sent, a.received) for a in sorted(answers, key=_nodes_of))
-        is_unchanged, self._last = now == self._last, now
-        if not is_unchanged:
-            self._differs_since_s = time.monotonic()
         if not all(answer.has_begun for answer in answers) or self._is_under_way():
             self._ask_later()
-        elif len(self._answers) == 1 or is_unchanged:
-            self._answer(asker)
         else:
-            self._begin_round()
+            self._answer(asker)
 
     def _is_under_way(self) -> bool:
         """Whether a packet or an acknowledgement is on its way, and not lost."""
@@ -103,8 +108,9 @@ class Settling:
         different = [key for key in sent if sent[key] != received[key]]
         if any(sent[key][1] >= 0 for key in different):
             return True
-        is_recent = time.monotonic() - self._differs_since_s < _LOST_AFTER_S
-        return bool(different) and is_recent
+        if (sent, received) != self._last:
+            self._last, self._last_s = (sent, received), self._clock()
+        return bool(different) and self._clock() - self._last_s < _LOST_AFTER_S
 
     def _answer(self, asker: ControlLink) -> None:
         self._asker = None
@@ -113,9 +119,5 @@ class Settling:
         self._channels.send_to(asker, Settled(self._asked.number, times, dict(self._packets)))
 
 
-def _nodes_of(answer: AtRest) -> tuple[str, ...]:
-    return answer.nodes
-
-
-def _joined(parts: Iterable[Mapping[str, tuple[int, int]]]) -> dict[str, tuple[int, int]]:
+def _joined(parts: Iterable[Counts]) -> Counts:
     return {key: counts for part in parts for key, counts in part.items()}

@@ -76,6 +76,7 @@ class NodeProcess:
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
+        self._settle_number = 0
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
@@ -130,6 +131,7 @@ class NodeProcess:
             self._probe(message.number)
             return
         if isinstance(message, control.Settle):
+            self._settle_number = message.number
             self._settle(message)
             return
         for node in self._nodes:
@@ -185,9 +187,14 @@ class NodeProcess:
             )
 
     def _settle(self, message: control.Settle) -> None:
-        """Answer once no event waits: a hook that may start has a loop-back waiting."""
+        """Answer once no event waits: a hook that may start has a loop-back waiting.
+
+        Of several questions the last one counts, else each would wait for the other.
+        """
         assert self._middleware is not None
         loop = self._middleware.loop
+        if message.number != self._settle_number:
+            return
         if loop.has_waiting_events or not loop.has_taken_in:
             loop.post_loop_back(lambda: self._settle(message))
         elif not self._is_ending:
