@@ -107,6 +107,9 @@ class Packets(Protocol):
     def encode(self, packet: Packet) -> bytes:
         """A packet as ROS serialises it."""
 
+    def decode(self, type_name: str, data: bytes) -> Packet:
+        """The inverse of :meth:`encode`, for a type in ROS notation."""
+
 
 class Way(str, Enum):
     """How a packet passes a node that keeps it for the recording."""

@@ -62,6 +62,7 @@ PACKAGES = (
     Package(7, ("api",)),
     Package(7, ("bag",)),
     Package(7, ("testing",)),
+    Package(8, ("pytest_plugin",)),
     Package(8, ("cli", "doctor", "replay")),
 )
 # neuros itself holds public names; every package may ask it for the version. Those of the package
@@ -91,6 +92,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "backends.environments.requirements": {"packaging"},
     "api.export": {"yaml"},
     "api.run": {"pandas"},
+    "pytest_plugin": {"pytest"},
     "api.sweep": {"tabulate"},
     "executors.pools": {"distributed"},
     "executors.slurm": {"submitit"},

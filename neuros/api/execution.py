@@ -130,6 +130,11 @@ class Execution:
                 reaper.remove_later(file)
             return self._run(reaper, started)
 
+    @property
+    def control_address(self) -> str:
+        """Where observers connect to its control channel."""
+        return self._listener.address
+
     def cancel(self) -> None:
         """Give up what it holds, in the place of :meth:`run`."""
         self._plan.deployment.finish(lambda: True)
@@ -314,6 +319,7 @@ class Execution:
                 self._plan.request.peer_timeout,
             ),
             waker=self._waker,
+            is_held=self._plan.is_held,
         )
 
     def _where_to_start(self) -> str:

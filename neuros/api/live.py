@@ -73,6 +73,11 @@ class LiveRun:
         return self._execution.folder
 
     @property
+    def control_address(self) -> str:
+        """Where observers connect to its control channel."""
+        return self._execution.control_address
+
+    @property
     def is_running(self) -> bool:
         """Whether it has not ended yet."""
         return not self._done.is_set()

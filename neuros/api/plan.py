@@ -27,6 +27,7 @@ from neuros.messages.needed import Messages
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
 from neuros.project.deployment import load_deployment
 from neuros.project.model import Folders, Node, NodeFile, Project
+from neuros.project.names import SESSION
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
@@ -109,7 +110,7 @@ def _address(host: str) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and how."""
+    """A project, which of its nodes to start, where, and how; ``is_held``: for a session."""
 
     project: Project
     names: tuple[str, ...]
@@ -118,6 +119,7 @@ class Plan:
     pythons: Pythons = field(default_factory=lambda: Pythons({}))
     network: Network = THIS_MACHINE
     messages: Messages | None = None
+    is_held: bool = False
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -164,7 +166,8 @@ class Plan:
         """Whether others have to find this run, so that it cannot hide in a domain of its own."""
         nodes = self.project.nodes
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
-        has_external_topics = any(port.external_topic is not None for port in ports)
+        topics = (port.external_topic for port in ports)
+        has_external_topics = any(t is not None and not t.startswith(SESSION) for t in topics)
         is_named = bool(self.project.names.namespace)  # who wants one is among others
         # A launcher tells the domain to all machines of its deployment.
         is_open = self.is_partial or (self.network.is_wide and not self.places)
@@ -189,6 +192,8 @@ class Plan:
             options.append("--digests")
         if self.request.recording is not None:
             options.append("--record")
+        if self.is_held:
+            options.append("--held")
         return self.deployment.launcher(
             NodeProgram(
                 options,

@@ -7,9 +7,9 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
 from neuros.api.loading import load_with_messages
@@ -24,6 +24,9 @@ from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import Loaded
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
+
+if TYPE_CHECKING:
+    from neuros.api.session import Session
 
 _ENVIRONMENT = "environment"
 
@@ -44,6 +47,16 @@ class RunOptions(StartOptions):
 
     check: bool = option(
         default=False, is_recorded=False, help="raise RunError unless the run ends normally"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionOptions(StartOptions):
+    """The arguments of :meth:`Project.session`."""
+
+    take_over: Sequence[str] = option(
+        is_repeatable=True,
+        help="inputs that the session feeds in the place of their connections: robot.wheels",
     )
 
 
@@ -174,6 +187,26 @@ class Project:
         live.begin()
         return live
 
+    @takes(SessionOptions)
+    def session(self, options: SessionOptions) -> Session:
+        """Start it, and hold it before the first hook: the program steps it, reads and sends.
+
+        Initialise hooks have run when this returns.
+
+        Raises:
+            ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
+            RunError: if it has ended meanwhile.
+        """
+        from neuros.api.session import Session, with_session_inputs  # they bring rclpy
+
+        if options.nodes:
+            raise UsageError("nodes: a session holds all nodes of its project")
+        project, messages = self._load_for_run(options)
+        held, inputs = with_session_inputs(project, options.take_over)
+        live = self._live(held, messages, options, is_held=True)
+        live.begin()
+        return Session(live, project, inputs, messages.paths)
+
     def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
         """As another machine, or a later time, has it: read again."""
         return Project, (self._path, self.settings)
@@ -184,8 +217,17 @@ class Project:
 
     def _prepared(self, options: StartOptions) -> LiveRun:
         """A run that has yet to begin."""
-        project, messages = self._load_for_run(options)
-        plan = make_plan(project, messages, options)
+        return self._live(*self._load_for_run(options), options)
+
+    def _live(
+        self,
+        project: Described,
+        messages: Messages,
+        options: StartOptions,
+        *,
+        is_held: bool = False,
+    ) -> LiveRun:
+        plan = replace(make_plan(project, messages, options), is_held=is_held)
         if options.isolate and not plan.back_end.has_own_network:
             raise UsageError(
                 "isolate: a Python program cannot give a run a network of its own: use"

@@ -39,6 +39,7 @@ def add_node(node: argparse.ArgumentParser) -> None:
     node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
     node.add_argument("--record", action="store_true")
+    node.add_argument("--held", action="store_true")
     node.set_defaults(command=_run_node)
 
 
@@ -74,6 +75,7 @@ def _run_node(options: argparse.Namespace) -> int:
         partial(connect_by, os.environ),
         open_recorder=_recorders(files[0].folders.run) if options.record else None,
         duration_sim_s=options.duration_sim,
+        is_held=options.held,
         own_logs=options.one_process,
     ).run()
     return leave.exit_code

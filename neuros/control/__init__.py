@@ -238,6 +238,35 @@ class NodeStatus(Message):
     samples: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class NewestPacket:
+    """The newest packet of an output: its number, from 1, and its ROS serialisation in base64."""
+
+    number: int
+    data: str
+
+
+@dataclass(frozen=True)
+class AtRest(Message):
+    """No event waits in a node process, and no hook may start; in answer to ``settle``.
+
+    Attributes:
+        has_begun: whether each node has found its receivers, so that its hooks may run.
+        sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
+        received: by connection from another process, likewise.
+        sim_times: of nodes that own simulated time, in seconds.
+        packets: by output (``robot.imu``), what is newer than the number that was asked with.
+    """
+
+    nodes: tuple[str, ...]
+    number: int
+    has_begun: bool
+    sent: Mapping[str, tuple[int, int]]
+    received: Mapping[str, tuple[int, int]]
+    sim_times: Mapping[str, float]
+    packets: Mapping[str, NewestPacket]
+
+
 # ---------------------------------------------------------------------- to nodes
 
 
@@ -303,6 +332,23 @@ class Look(Message):
     asker: int
 
 
+@dataclass(frozen=True)
+class Settle(Message):
+    """While paused, answer once nothing moves; ``known``: outputs to show, and what is known."""
+
+    number: int
+    known: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Deliver(Message):
+    """A packet of a session for one of its inputs, in base64."""
+
+    node: str
+    input: str
+    data: str
+
+
 # ---------------------------------------------------------------------- from observers
 
 
@@ -349,6 +395,15 @@ class PhaseChanged(Message):
 
 
 @dataclass(frozen=True)
+class Settled(Message):
+    """Nothing moves in the whole run; in answer to ``settle``. Fields as in ``at_rest``."""
+
+    number: int
+    sim_times: Mapping[str, float]
+    packets: Mapping[str, NewestPacket]
+
+
+@dataclass(frozen=True)
 class LogRecord(Message):
     """Message of the launcher to the user."""
 
@@ -375,10 +430,13 @@ class Ended(Message):
 
 FROM_NODES: Sequence[type[Message]] = (
     *(Hello, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation, Heard),
-    NodeStatus,
+    *(NodeStatus, AtRest),
 )
 TO_NODES: Sequence[type[Message]] = (
     *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+    *(Settle, Deliver),
 )
-FROM_OBSERVERS: Sequence[type[Message]] = (Watch, LookAll, Pause, Resume, StepAll, End, Interrupt)
-TO_OBSERVERS: Sequence[type[Message]] = (NodeStatus, PhaseChanged, LogRecord, Ended)
+FROM_OBSERVERS: Sequence[type[Message]] = (
+    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver),
+)
+TO_OBSERVERS: Sequence[type[Message]] = (NodeStatus, PhaseChanged, LogRecord, Ended, Settled)

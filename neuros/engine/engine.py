@@ -182,7 +182,8 @@ class Engine:
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`, but for initialise hooks and steps.
 
-        Where draining has begun it has no effect.
+        Where draining has begun it has no effect. A second time it takes back what is left of
+        steps.
         """
         now_ns = self._wake()
         if not self._lifecycle.is_draining:
@@ -215,6 +216,11 @@ class Engine:
     def is_started(self) -> bool:
         """Whether :meth:`start` was called."""
         return self._lifecycle.is_started
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether it was started and every receiver has been found."""
+        return self._lifecycle.has_begun
 
     @property
     def is_running(self) -> bool:

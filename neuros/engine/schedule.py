@@ -263,11 +263,11 @@ class Pause:
         self.is_on = False
 
     def begin(self, now_ns: int) -> None:
-        """Pause; a second time has no effect."""
+        """Pause; a second time takes back what is left of steps."""
         if not self.is_on:
             self.is_on, self._since_ns = True, now_ns
-            self._granted = 0
-            self._started.clear()
+        self._granted = 0
+        self._started.clear()
 
     def end(self, now_ns: int) -> None:
         """Go on, as if no time had passed for ticks."""

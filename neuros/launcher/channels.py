@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
+    Deliver,
     End,
     Ended,
     Hello,
@@ -105,6 +106,17 @@ class Channels:
         """Send to all node processes."""
         for link in tuple(self._nodes):
             self.send_to(link, message)
+
+    def send_to_node(self, name: str, message: Message) -> None:
+        """Send to the process of one node."""
+        for link, names in tuple(self._nodes.items()):
+            if name in names:
+                self.send_to(link, message)
+
+    @property
+    def greeted(self) -> set[str]:
+        """The nodes whose processes have said hello."""
+        return {name for names in self._nodes.values() for name in names}
 
     def send_to(self, link: ControlLink, message: Message) -> None:
         """Send to one; what does not go through now goes with the next, or :meth:`flush`."""
@@ -249,6 +261,8 @@ class Observers:
                 self._pause.begin()
             case Resume():
                 self._pause.end()
+            case Deliver(node=node):
+                self._channels.send_to_node(node, message)
             case StepAll(count):
                 self._pause.step(count, is_driven=self._is_driven())
             case End(reason):

@@ -22,6 +22,7 @@ from neuros.launcher.declarations import Declarations
 from neuros.launcher.outcome import Outcome, Output, Phase, Processes, names_of
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Probing, Verdict, connections_among
+from neuros.launcher.settling import Settling
 from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.ports import ControlListener, Launcher, RunningNode
@@ -52,6 +53,7 @@ class Supervisor:
             thread.
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
         peers: who starts the other nodes of the project, where not all are started here.
+        is_held: whether the nodes start paused, for a session.
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
             processes that end before they have connected, are seen a fifth of a second late.
 
@@ -77,6 +79,7 @@ class Supervisor:
         duration_s: float | None = None,
         peers: Peers | None = None,
         waker: socket.socket | None = None,
+        is_held: bool = False,
     ) -> None:
         self._files = files
         self._run_folder = run_folder
@@ -112,6 +115,9 @@ class Supervisor:
             signals,
         )
         self.pause = PauseState(self._channels.send, time.monotonic)
+        if is_held:
+            self.pause.begin()
+        self._settling = Settling(names, self._channels)
         self.observers = Observers(
             self._channels,
             self.pause,
@@ -131,11 +137,12 @@ class Supervisor:
             has_shown = True
             self._looked_s = time.monotonic()
             while self._processes and not self._shutdown.is_hopeless:
-                self._channels.wait(self._pause_s(has_shown))
+                self._channels.wait(min(self._pause_s(has_shown), self._settling.wait_s))
                 self._shutdown.heed_signals()
                 self._hear()
                 self._look_at_processes()
                 self._look_at_time()
+                self._settling.look()
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
@@ -197,6 +204,10 @@ class Supervisor:
                     self._output.log("WARN", f"{node} {'; '.join(lines)}")
             case control.Heard(node, text):
                 self._peers.hear(node, text, time.monotonic())
+            case control.Settle():
+                self._settling.ask(link, message)
+            case control.AtRest():
+                self._settling.take(message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
             case _:

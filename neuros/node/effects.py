@@ -107,13 +107,15 @@ class NodeEffects:
     def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None] | None:
         """Return what sends packets of an output, and shows them to the instruments."""
         transmit: Callable[[Any], bytes | None]
+        tap = self.tap(Way.SENT, port)
         if port.external_topic is not None:
             transmit = partial(self._transport.send_external, port)
         elif connections:
             transmit = self._transport.sender(connections)
+        elif tap.observers:
+            transmit = _to_nobody
         else:
             return None
-        tap = self.tap(Way.SENT, port)
 
         def send(packet: Any) -> None:
             data = transmit(packet)
@@ -136,6 +138,10 @@ class NodeEffects:
         for observe in tap.observers:
             observe(packet, None)
         return self._copy(packet)
+
+
+def _to_nobody(packet: Any) -> None:
+    """Send a packet of an output that nothing is connected to."""
 
 
 def _hook_error(spec: HookSpec, error: BaseException) -> HookError:

@@ -50,6 +50,27 @@ class Instrument(Protocol):
         """Add what looks at the packets of a tap, at once or for as long as it is asked for."""
 
 
+class NewestPackets:
+    """The newest packet of each output, serialised, for a session.
+
+    Attributes:
+        by_output: number, from 1, and content.
+    """
+
+    def __init__(self, encode: Callable[[Any], bytes]) -> None:
+        self._encode = encode
+        self.by_output: dict[str, tuple[int, bytes]] = {}
+
+    def attach(self, tap: Tap) -> None:
+        """Keep what passes there, if it is an output."""
+        if tap.way is Way.SENT:
+            tap.add(lambda packet, data: self._keep(tap.name, packet, data))
+
+    def _keep(self, output: str, packet: Any, data: bytes | None) -> None:
+        count = self.by_output.get(output, (0, b""))[0]
+        self.by_output[output] = (count + 1, data or self._encode(packet))
+
+
 class NodeRecorder:
     """Gives packets of one node, serialised, to its packet recorder, until that fails.
 

@@ -19,7 +19,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.effects import NodeEffects
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices
-from neuros.node.instruments import Instrument, NodeRecorder
+from neuros.node.instruments import Instrument, NewestPackets, NodeRecorder
 from neuros.node.plugin import load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
@@ -42,8 +42,11 @@ class NodeRuntime:
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
         make_engine: the engine, called like its class.
+        is_held: whether hooks stand still from the start, as paused, and the newest packet of each
+            output is kept.
 
     Attributes:
+        newest: the newest packets, where they are kept.
         engine: ``None`` until :meth:`load`.
         specs: the hooks of its plugin, once that is loaded.
         handle: the ``node`` that hooks receive.
@@ -65,6 +68,7 @@ class NodeRuntime:
         on_initialised: Callable[[], None] = lambda: None,
         clock: Callable[[], int] = time.monotonic_ns,
         make_engine: Callable[..., Engine] = Engine,
+        is_held: bool = False,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -102,6 +106,10 @@ class NodeRuntime:
                 recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
             )
             instruments.append(self._recorder)
+        self._is_held = is_held
+        self.newest = NewestPackets(middleware.packets.encode)
+        if is_held:
+            instruments.append(self.newest)
         self._effects = NodeEffects(
             middleware,
             self._transport,
@@ -161,6 +169,8 @@ class NodeRuntime:
         self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, specs, self._effects, self._clock, types
         )
+        if self._is_held:
+            self.engine.pause()
         self.reports.open(self.engine, self._logger)
 
     def start(self) -> None:
@@ -227,6 +237,11 @@ class NodeRuntime:
         for observe in self._heard[port.name].observers:
             observe(packet, None)
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
+
+    def deliver(self, input_name: str, data: bytes) -> None:
+        """A session sends a packet to one of its inputs."""
+        port = self.file.node.input(input_name)
+        self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""

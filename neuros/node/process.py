@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import functools
 import gc
@@ -27,7 +28,7 @@ from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
 from neuros.ports import ControlStream, Middleware, PacketRecorder, Voice
-from neuros.project.model import NodeFile
+from neuros.project.model import Connection, NodeFile
 from neuros.stacks import StackFile
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
@@ -46,6 +47,7 @@ class NodeProcess:
         connect: connects to the supervisor; the current folder is the run folder by then.
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
+        is_held: whether nodes stand still from the start, for a session.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
     """
@@ -58,6 +60,7 @@ class NodeProcess:
         *,
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
+        is_held: bool = False,
         own_logs: bool = False,
     ) -> None:
         self._files = files
@@ -65,6 +68,7 @@ class NodeProcess:
         self._connect = connect
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
+        self._is_held = is_held
         self._own_logs = own_logs
         self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
@@ -72,6 +76,7 @@ class NodeProcess:
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
+        self._settle_number = 0
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
@@ -125,6 +130,10 @@ class NodeProcess:
         if isinstance(message, control.Probe):
             self._probe(message.number)
             return
+        if isinstance(message, control.Settle):
+            self._settle_number = message.number
+            self._settle(message)
+            return
         for node in self._nodes:
             match message:
                 case control.Drain(last_round):
@@ -135,6 +144,8 @@ class NodeProcess:
                     node.resume()
                 case control.Step(count, is_driven):
                     node.step(count, is_driven=is_driven)
+                case control.Deliver(name, input_name, data) if name == node.name:
+                    node.deliver(input_name, base64.b64decode(data))
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
@@ -174,6 +185,20 @@ class NodeProcess:
             self._tell(
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
+
+    def _settle(self, message: control.Settle) -> None:
+        """Answer once no event waits: a hook that may start has a loop-back waiting.
+
+        Of several questions the last one counts, else each would wait for the other.
+        """
+        assert self._middleware is not None
+        loop = self._middleware.loop
+        if message.number != self._settle_number:
+            return
+        if loop.has_waiting_events or not loop.has_taken_in:
+            loop.post_loop_back(lambda: self._settle(message))
+        elif not self._is_ending:
+            self._tell(_at_rest(self._nodes, message))
 
     def _explain(self) -> None:
         """Report why nothing moves, but for nodes whose hook runs."""
@@ -237,6 +262,7 @@ class NodeProcess:
                 make_engine=Engine if self._open_recorder is None else LoggedEngine,
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
+                is_held=self._is_held,
                 on_initialised=_keep_for_good,
             )
         )
@@ -419,6 +445,37 @@ class PeerLink:
 
     def _hear(self, name: str, text: str | None) -> None:
         self._tell(control.Heard(name, text))
+
+
+def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtRest:
+    """State of all nodes of a process at one moment."""
+    names = tuple(node.name for node in nodes)
+    engines = [node.engine for node in nodes if node.engine is not None]
+    windows = [w for engine in engines for w in engine.send_windows.values()]
+    subscriptions = [s for engine in engines for s in engine.subscriptions.values()]
+    packets = {
+        f"{node.name}.{output}": control.NewestPacket(number, base64.b64encode(data).decode())
+        for node in nodes
+        for output, (number, data) in node.newest.by_output.items()
+        if number > asked.known.get(f"{node.name}.{output}", number)
+    }
+    return control.AtRest(
+        names,
+        asked.number,
+        len(engines) == len(nodes) and all(engine.has_begun for engine in engines),
+        {
+            str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
+            for w in windows
+            if w.connection.destination_node not in names
+        },
+        {
+            s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
+            for s in subscriptions
+            if isinstance(s.key, Connection) and s.key.source_node not in names
+        },
+        {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
+        packets,
+    )
 
 
 def _keep_for_good() -> None:

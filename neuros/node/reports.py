@@ -16,6 +16,7 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Logger, Middleware, Transport
 from neuros.project.model import Connection, NodeFile
+from neuros.project.names import SESSION
 from neuros.stacks import LONG_S, Stack, stack_in
 
 _MAIN = threading.main_thread()
@@ -43,6 +44,8 @@ class NodeReports:
         for hook in engine.free_running_hooks():
             logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
         for subscription in engine.untaken_subscriptions():
+            if subscription.name.startswith(SESSION):
+                continue
             logger.warning(
                 f"no hook takes input '{subscription.input_name}': packets on"
                 f" {subscription.name} are acknowledged on arrival and dropped"

@@ -17,6 +17,9 @@ MOST_CHARACTERS = 247
 INTERNAL = "/neuros/"
 """Where, within the namespace, the topics of connections are."""
 
+SESSION = "/neuros/session/"
+"""The external topics of inputs that a session feeds; nothing of them is on the ROS graph."""
+
 
 @dataclass(frozen=True)
 class Names:

@@ -16,7 +16,7 @@ from typing import Any
 
 from neuros.backends.node_command import without_mark
 from neuros.distribution import WORKSPACE
-from neuros.errors import ProjectError, WrongValue
+from neuros.errors import ProjectError
 from neuros.installation.progress import Progress
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
@@ -25,8 +25,7 @@ from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.modules import find_module, is_module_name
 from neuros.testing.bench import NodeBench
 from neuros.testing.wiring import ports, with_neighbours, with_observer
-from neuros.transport.messages import decode, encode, message_class
-from neuros.transport.values import checker
+from neuros.transport.messages import checked, decode, encode, message_class
 
 
 class PluginHarness(NodeBench):
@@ -220,7 +219,7 @@ class PluginHarness(NodeBench):
                 send; none of them is sent then.
         """
         port = self._port(input_name, "input", self._inputs)
-        packets = tuple(self._checked(port, packet) for packet in packets)
+        packets = tuple(checked(port, packet) for packet in packets)
         if port.external_topic is not None:
             for packet in packets:
                 self._loop.post(partial(self._topics.deliver, port, decode(encode(packet))))
@@ -273,15 +272,6 @@ class PluginHarness(NodeBench):
     @property
     def _outputs(self) -> dict[str, Port]:
         return {port.name: port for port in self._file.node.outputs}
-
-    def _checked(self, port: Port, packet: Any) -> Any:
-        kind = message_class(port.type)
-        if not isinstance(packet, kind):
-            raise TypeError(f"input '{port.name}' takes {port.type}, not {packet!r}")
-        try:
-            return checker(kind)(packet)
-        except WrongValue as error:
-            raise ValueError(f"packet for input '{port.name}': {error}") from None
 
     def _port(self, name: str, side: str, known: Mapping[str, Port]) -> Port:
         if name not in known:

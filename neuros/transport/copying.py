@@ -45,6 +45,9 @@ class RosPackets:
         kind: type = type(packet)
         return message_codec(kind).encode(packet)
 
+    def decode(self, type_name: str, data: bytes) -> Any:
+        return message_codec(message_class(type_name)).decode(data)
+
 
 def copy_packet(packet: Any) -> Any:
     """A message that shares nothing with ``packet``, which has been checked."""

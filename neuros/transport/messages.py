@@ -10,7 +10,9 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, WrongValue
+from neuros.project.model import Port
+from neuros.transport.values import checker
 
 
 @cache
@@ -34,6 +36,22 @@ def message_class(type_name: str) -> type:
         warnings.simplefilter("ignore", DeprecationWarning)
         check_for_type_support(found)
     return found
+
+
+def checked(port: Port, packet: Any) -> Any:
+    """A packet that a program outside the nodes sends to an input, with the values that arrive.
+
+    Raises:
+        TypeError: if it is of another type.
+        ValueError: if it holds a value that no node may send.
+    """
+    kind = message_class(port.type)
+    if not isinstance(packet, kind):
+        raise TypeError(f"input '{port.name}' takes {port.type}, not {packet!r}")
+    try:
+        return checker(kind)(packet)
+    except WrongValue as error:
+        raise ValueError(f"packet for input '{port.name}': {error}") from None
 
 
 def encode(packet: Any) -> tuple[type, bytes]:

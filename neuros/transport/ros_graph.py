@@ -28,6 +28,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.project.names import SESSION
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.messages import message_class
@@ -65,7 +66,7 @@ class ExternalTopics:
         heard = {
             port: self._subscription(port, port.external_topic, inbox)
             for port in self._file.node.inputs
-            if port.external_topic is not None
+            if port.external_topic is not None and not port.external_topic.startswith(SESSION)
         }
         if heard:
             self._loop.expect_arrivals()

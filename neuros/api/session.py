@@ -1,0 +1,502 @@
+"""A run that a Python program holds in its hand: it steps the run, reads outputs and feeds inputs.
+
+The session is an observer on the control channel of the run, which stands paused from its start.
+Its inputs are external topics that are on no ROS graph: packets for them, like steps, go over the
+control channel, so a packet that is sent before a step is there when the step begins.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import html
+import select
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from neuros.analysis.run_record import run_table
+from neuros.api.live import LiveRun
+from neuros.api.run import Run
+from neuros.backends.control_sockets import connect
+from neuros.control import (
+    TO_OBSERVERS,
+    Deliver,
+    Ended,
+    LookAll,
+    Message,
+    NewestPacket,
+    NodeStatus,
+    Pause,
+    Resume,
+    Settle,
+    Settled,
+    StepAll,
+    Watch,
+)
+from neuros.control.link import ControlLink
+from neuros.errors import RunError, UsageError
+from neuros.project.graph_svg import graph_svg
+from neuros.project.model import Node, Port, Project
+from neuros.project.names import SESSION
+from neuros.project.scanner import display_name, place_of
+from neuros.project.suggest import did_you_mean
+from neuros.transport.copying import RosPackets
+from neuros.transport.messages import checked
+
+_CONNECT_S = 0.01
+_MOST_ROUNDS_AT_REST = 1000
+_FINE = 1e-9
+
+
+class Session:
+    """A run that stands still, but for the steps of this program::
+
+        with neuros.Project.from_file("project.json").session(backend="in-process") as s:
+            while s["robot.imu"].packet is None:
+                s.step()
+            s.send("robot.wheels", command)
+            s.step(sim_s=0.02)
+
+    A *round* lets each hook that drives the project start once, and lasts until nothing moves any
+    more. Several threads may use it, one at a time. At the end of the block the run is ended,
+    drained; where the block fails, interrupted.
+
+    Attributes:
+        folder: the run folder.
+    """
+
+    def __init__(
+        self, live: LiveRun, project: Project, inputs: Sequence[str], messages: Sequence[Path]
+    ) -> None:
+        self._live = live
+        self._project = project
+        self._inputs = set(inputs)
+        self.folder = live.folder
+        self._packets = RosPackets()
+        self._lock = threading.RLock()
+        self._number = 0
+        self._newest: dict[str, NewestPacket] = {}
+        self._decoded: dict[str, tuple[int, Any]] = {}
+        self._sim_times: Mapping[str, float] = {}
+        self._run: Run | None = None
+        sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
+        try:
+            self._link = self._connect()
+            self._link.send(Watch())
+            self._advance(0, None)
+        except BaseException:
+            live.end()
+            raise
+
+    # ------------------------------------------------------------------ time
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the run has not ended."""
+        return self._run is None
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulated seconds, ``None`` where they are unknown."""
+        return max(self._sim_times.values(), default=None)
+
+    def step(
+        self,
+        rounds: int = 1,
+        *,
+        sim_s: float | None = None,
+        until: Callable[[Session], object] | None = None,
+        timeout_s: float | None = None,
+    ) -> bool:
+        """Let the run go on by rounds, each until nothing moves any more.
+
+        Args:
+            rounds: so many.
+            sim_s: in their place, as many as it takes for so many simulated seconds.
+            until: or as many as it takes until ``until(session)`` is true; it is asked before.
+            timeout_s: the longest time to wait, in wall seconds; ``None``: for ever.
+
+        Returns:
+            Whether the run goes on; ``False`` once the project has ended itself.
+
+        Raises:
+            RunError: if it has failed, or had ended before.
+            TimeoutError: if it takes longer; what goes on is waited for by the next step.
+            UsageError: for ``sim_s`` where no node owns simulated time.
+        """
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        with self._lock:
+            self._check_running()
+            for _ in self._rounds(rounds, sim_s, until):
+                if not self._advance(1, end_s):
+                    return False
+        return True
+
+    async def astep(self, rounds: int = 1, **options: Any) -> bool:
+        """As :meth:`step`, for coroutines."""
+        return await asyncio.to_thread(partial(self.step, rounds, **options))
+
+    def run(self, *, duration_s: float | None = None, duration_sim_s: float | None = None) -> bool:
+        """Let the run go freely for a time, as without a session, then hold it again.
+
+        Args:
+            duration_s: wall seconds; the run is held when they are over.
+            duration_sim_s: simulated seconds. So many rounds are granted at once that it is not
+                held in between, and ends with the round that reaches the time.
+
+        Returns:
+            As :meth:`step`, and raises what that raises.
+        """
+        if (duration_s is None) == (duration_sim_s is None):
+            raise UsageError("run: give either duration_s or duration_sim_s")
+        with self._lock:
+            self._check_running()
+            if duration_s is None:
+                return self._run_sim(float(duration_sim_s or 0.0))
+            self._link.send(Resume())
+            try:
+                with contextlib.suppress(TimeoutError):
+                    self._wait_for(lambda message: False, time.monotonic() + duration_s)
+            finally:
+                self._link.send(Pause())
+            return self._run is None and self._advance(0, None)
+
+    # ------------------------------------------------------------------ packets
+
+    def __getitem__(self, output: str) -> SessionOutput:
+        """An output, ``robot.imu``. Raises ``UsageError`` if there is none of that name."""
+        node, port = _port(self._project, output, is_input=False)
+        return SessionOutput(self, f"{node.name}.{port.name}", port)
+
+    def send(self, input_name: str, message: Any) -> None:
+        """Send a packet to an input that the project leaves free, or that was taken over.
+
+        It waits in the queue of the input (of 10 packets, or ``depth`` of its ``qos``) for a hook
+        that starts on it in the next round. The message is sent as it is now.
+
+        Raises:
+            UsageError: if the node has no such input, or a connection feeds it.
+            TypeError, ValueError: if the message is of another type, or holds a value that no node
+                may send.
+            RunError: if the run has ended.
+        """
+        node, port = _port(self._project, input_name, is_input=True)
+        name = f"{node.name}.{port.name}"
+        if name not in self._inputs:
+            raise UsageError(
+                f"{name}: {' and '.join(_feeding(self._project, name))} feeds this input: take it"
+                f' over with session(take_over="{name}"), or send to another;'
+                f" {_where(node)}"
+            )
+        packet = checked(port, message)
+        data = base64.b64encode(self._packets.encode(packet)).decode()
+        with self._lock:
+            self._check_running()
+            self._link.send(Deliver(node.name, port.name, data))
+
+    # ------------------------------------------------------------------ state
+
+    def state(self) -> dict[str, NodeStatus]:
+        """State and counters of each node, by name.
+
+        ``state()["robot"].counters.metrics`` has ``state``, ``hooks``, ``incoming``, ``outgoing``.
+
+        Raises:
+            RunError: if the run has ended.
+        """
+        found: dict[str, NodeStatus] = {}
+
+        def is_last(message: Message) -> bool:
+            if isinstance(message, NodeStatus):
+                found[message.node] = message
+            return len(found) == len(self._project.nodes)
+
+        with self._lock:
+            self._check_running()
+            self._link.send(LookAll({}))
+            if not self._wait_for(is_last, None):
+                self._check_running()
+        return found
+
+    def close(self) -> Run:
+        """End the run, drained, and return what it has left behind; a second time the same."""
+        with self._lock:
+            if self._run is None:
+                self._live.stop("the session was closed")
+                self._end()
+            assert self._run is not None
+            return self._run
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None and self._run is None:
+            self._live.interrupt()
+            self._end()
+        self.close()
+
+    def __repr__(self) -> str:
+        time_s = "" if self.sim_time is None else f", {self.sim_time:g} s simulated"
+        state = f"held{time_s}" if self.is_running else "ended"
+        return f"<Session of {self._project.name}: {state}; {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the graph, and how often hooks have run."""
+        if self._run is not None:
+            return f"<pre>{html.escape(run_table(self._run.record))}</pre>"
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{html.escape(hook)}</td><td>{figures['executions']}</td></tr>"
+            for name, status in self.state().items()
+            if status.counters is not None
+            for hook, figures in status.counters.metrics["hooks"].items()
+        )
+        head = "<tr><th>node</th><th>hook</th><th>executions</th></tr>"
+        caption = html.escape(repr(self))
+        return f"{graph_svg(self._project)}<p>{caption}</p><table>{head}{rows}</table>"
+
+    # ------------------------------------------------------------------ inside
+
+    def _connect(self) -> ControlLink:
+        while True:
+            try:
+                stream = connect(self._live.control_address)
+            except OSError:
+                with contextlib.suppress(TimeoutError):
+                    self._run = self._live.wait(_CONNECT_S)
+                    self._check_running()
+            else:
+                return ControlLink(stream, TO_OBSERVERS, "the supervisor")
+
+    def _rounds(
+        self, rounds: int, sim_s: float | None, until: Callable[[Session], object] | None
+    ) -> Iterator[None]:
+        """As many turns as there are rounds to go."""
+        if until is not None:
+            while not until(self):
+                yield
+        elif sim_s is not None:
+            end_s = self._sim_now() + sim_s
+            at_rest = 0
+            while (now_s := self._sim_now()) < end_s - _FINE:
+                yield
+                at_rest = 0 if self._sim_now() > now_s else at_rest + 1
+                self._check_progress(at_rest)
+        else:
+            yield from (None for _ in range(rounds))
+
+    def _run_sim(self, duration_s: float) -> bool:
+        end_s = self._sim_now() + duration_s
+        count, at_rest = 1, 0
+        while (now_s := self._sim_now()) < end_s - _FINE:
+            if not self._advance(count, None):
+                return False
+            gained_s = self._sim_now() - now_s
+            at_rest = 0 if gained_s > 0 else at_rest + 1
+            self._check_progress(at_rest)
+            if gained_s > 0:
+                count = max(1, int((end_s - self._sim_now()) / gained_s * count * (1 - _FINE)))
+        return True
+
+    def _sim_now(self) -> float:
+        if not any(node.owns_time for node in self._project.nodes):
+            raise UsageError(
+                f"no node of {self._project.name} owns simulated time: step by rounds, or give"
+                " duration_s"
+            )
+        return self.sim_time or 0.0
+
+    def _check_progress(self, at_rest: int) -> None:
+        if at_rest >= _MOST_ROUNDS_AT_REST:
+            raise TimeoutError(
+                f"simulated time has stood still at {self._sim_now():g} s for {at_rest} rounds:"
+                " does a hook wait for an input that the session has to send?"
+            )
+
+    def _advance(self, rounds: int, end_s: float | None) -> bool:
+        """Go on by rounds, and wait until nothing moves; whether the run goes on."""
+        self._number += 1
+        number = self._number
+        if rounds:
+            self._link.send(StepAll(rounds))
+        self._link.send(Settle(number, {name: each.number for name, each in self._newest.items()}))
+
+        def is_settled(message: Message) -> bool:
+            if isinstance(message, Settled) and message.number == number:
+                self._sim_times = message.sim_times
+                self._newest.update(message.packets)
+                return True
+            return False
+
+        if self._wait_for(is_settled, end_s):
+            return True
+        assert self._run is not None
+        self._run.check()
+        return False
+
+    def _wait_for(self, is_wanted: Callable[[Message], bool], end_s: float | None) -> bool:
+        """Until such a message comes; ``False`` once the run has ended.
+
+        Raises:
+            TimeoutError: if neither comes until ``end_s``.
+        """
+        while True:
+            left_s = None if end_s is None else max(0.0, end_s - time.monotonic())
+            if not select.select([self._link], [], [], left_s)[0]:
+                raise TimeoutError(f"the run has not come to rest in time: {self.folder}")
+            messages = self._link.receive()
+            is_over = messages is None
+            for message in messages or ():
+                if is_wanted(message):
+                    return True
+                is_over = is_over or isinstance(message, Ended)
+            if is_over:
+                self._end()
+                return False
+
+    def _newest_of(self, output: str) -> NewestPacket:
+        """The newest packet of an output; number 0: there is none yet."""
+        with self._lock:
+            if output not in self._newest:
+                self._check_running()
+                self._newest[output] = NewestPacket(0, "")
+                self._advance(0, None)
+            return self._newest[output]
+
+    def _end(self) -> None:
+        self._run = self._live.wait()
+        self._link.close()
+
+    def _check_running(self) -> None:
+        if self._run is not None:
+            self._run.check()
+            raise RunError(f"the run has ended: {self._run.reason}", self._run.exit_code)
+
+
+@dataclass(frozen=True)
+class SessionOutput:
+    """An output of a node, as a session sees it: ``session["robot.imu"]``.
+
+    Attributes:
+        name: of node and output.
+    """
+
+    _session: Session
+    name: str
+    _port: Port
+
+    @property
+    def count(self) -> int:
+        """How many packets it has sent."""
+        return self._session._newest_of(self.name).number
+
+    @property
+    def packet(self) -> Any:
+        """The newest packet, a message of its type; ``None`` before the first."""
+        newest = self._session._newest_of(self.name)
+        decoded = self._session._decoded
+        if newest.number and decoded.get(self.name, (0,))[0] != newest.number:
+            data = base64.b64decode(newest.data)
+            packet = self._session._packets.decode(self._port.type, data)
+            decoded[self.name] = newest.number, packet
+        return decoded[self.name][1] if newest.number else None
+
+    def wait(self, timeout_s: float | None = None) -> Any:
+        """Step until it sends a further packet, and return that.
+
+        Raises:
+            TimeoutError: if none comes in so many wall seconds.
+            RunError: if the run ends before.
+        """
+        before, session = self.count, self._session
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+
+        def is_there(_: Session) -> bool:
+            if self.count == before and end_s is not None and time.monotonic() >= end_s:
+                raise TimeoutError(f"{self.name} has sent nothing in {timeout_s:g} s")
+            return self.count > before
+
+        if not session.step(until=is_there, timeout_s=timeout_s):
+            session._check_running()
+        return self.packet
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.count} packets of {self._port.type}>"
+
+
+def with_session_inputs(project: Project, taken: Sequence[str]) -> tuple[Project, tuple[str, ...]]:
+    """The project with the inputs that a session feeds bound to it, and the names of these.
+
+    They are the inputs that nothing is connected to, those with an external topic, and those that
+    are ``taken`` over, which lose their connections.
+
+    Raises:
+        UsageError: if a name is that of no input.
+    """
+    chosen = {f"{node.name}.{port.name}" for node, port in (_input(project, n) for n in taken)}
+    connections = [c for c in project.connections if _end_of(c) not in chosen]
+    connected = {_end_of(c) for c in connections}
+    nodes, names = [], []
+    for node in project.nodes:
+        inputs = []
+        for port in node.inputs:
+            name = f"{node.name}.{port.name}"
+            if name not in connected:
+                names.append(name)
+                if port.external_topic is None:
+                    port = replace(port, external_topic=f"{SESSION}{node.name}/{port.name}")
+            inputs.append(port)
+        nodes.append(replace(node, inputs=tuple(inputs)))
+    bound = replace(project, nodes=tuple(nodes), connections=tuple(connections))
+    return bound, tuple(names)
+
+
+def _input(project: Project, name: str) -> tuple[Node, Port]:
+    return _port(project, name, is_input=True)
+
+
+def _end_of(connection: Any) -> str:
+    return f"{connection.destination_node}.{connection.destination_input}"
+
+
+def _feeding(project: Project, name: str) -> list[str]:
+    return [str(c) for c in project.connections if _end_of(c) == name]
+
+
+def _port(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]:
+    """A port by ``node.port``.
+
+    Raises:
+        UsageError: if there is none of that name; it says where the node is declared.
+    """
+    node_name, _, port_name = name.partition(".")
+    nodes = {node.name: node for node in project.nodes}
+    if node_name not in nodes or not port_name:
+        hint = did_you_mean(node_name, nodes) or f"it has {', '.join(nodes)}"
+        file = display_name(project.file)
+        raise UsageError(f"'{name}': {file} has no node '{node_name}' ({hint}); say node.port")
+    node = nodes[node_name]
+    ports = {port.name: port for port in (node.inputs if is_input else node.outputs)}
+    if port_name not in ports:
+        hint = did_you_mean(port_name, ports) or f"it has {', '.join(ports) or 'none'}"
+        side = "input" if is_input else "output"
+        raise UsageError(f"'{name}': no such {side} ({hint}); {_where(node)}")
+    return node, ports[port_name]
+
+
+def _where(node: Node) -> str:
+    line, column = place_of(node.file, node.pointer)
+    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"

@@ -1,0 +1,406 @@
+"""Sessions: a program holds a run, steps it, reads its outputs and feeds its inputs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from api_projects import ENDLESS, dice
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from std_msgs.msg import Float64, String
+from test_python_api import thrown
+
+import neuros
+from containers import require_containers, wait_until
+from neuros.api.session import Session
+from neuros.errors import ProjectError, RunError, UsageError
+
+# The input that a test pushes the robot by.
+pytestmark = pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
+ACCEPTANCE = pytest.mark.acceptance
+EVERY_BACK_END = [
+    "in-process",
+    pytest.param("process", marks=ACCEPTANCE),
+    pytest.param("docker", marks=ACCEPTANCE),
+]
+DEADLINE_S = 60.0
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "sessions.md"
+
+ROBOT = """
+from neuros.hooks import neuros_function, Optional
+
+@neuros_function(inputs=Optional("push"), outputs=["pose", "clock"])
+def step(node, push):
+    place, steps = node.get_user_data() or (1.0, 0)
+    if push is not None:
+        place += push.data
+    steps += 1
+    node.set_user_data((place, steps))
+    pose, clock = node.make_packet("pose"), node.make_packet("clock")
+    pose.data = place
+    clock.clock.sec, clock.clock.nanosec = divmod(steps * 10_000_000, 10**9)
+    return pose, clock
+
+@neuros_function(inputs="wheels")
+def steer(node, wheels):
+    if wheels.data == 13.0:
+        raise RuntimeError("a wheel has broken")
+    place, steps = node.get_user_data() or (1.0, 0)
+    node.set_user_data((place + wheels.data, steps))
+"""
+BRAIN = """
+from neuros.hooks import neuros_function
+
+@neuros_function(inputs="pose", outputs="command")
+def decide(node, pose):
+    command = node.make_packet("command")
+    command.data = -0.5 * pose.data
+    return command
+"""
+
+
+def port(name: str, kind: str = "std_msgs/msg/Float64") -> dict[str, str]:
+    return {"name": name, "type": kind}
+
+
+def cart(folder: Path) -> Path:
+    """A robot that drives the project, and a brain that brings it back to 0."""
+    made = folder / "cart"
+    made.mkdir()
+    (made / "robot.py").write_text(ROBOT)
+    (made / "brain.py").write_text(BRAIN)
+    robot = {
+        "name": "robot",
+        "plugin": "robot.py",
+        "inputs": [port("wheels"), port("push")],
+        "outputs": [port("pose"), port("clock", "rosgraph_msgs/msg/Clock")],
+    }
+    brain = {
+        "name": "brain",
+        "plugin": "brain.py",
+        "inputs": [port("pose")],
+        "outputs": [port("command")],
+    }
+    wires = [("robot", "pose", "brain", "pose"), ("brain", "command", "robot", "wheels")]
+    keys = ("source_node", "source_output", "destination_node", "destination_input")
+    project = {
+        "nodes": [{**node, "container": "neuros_python"} for node in (robot, brain)],
+        "connections": [{**dict(zip(keys, w, strict=True)), "discard_limit": 0} for w in wires],
+    }
+    (made / "project.json").write_text(json.dumps(project, indent=1))
+    return made
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    """A session whose steps no test counts from the start."""
+    folder = tmp_path_factory.mktemp("held")
+    project = neuros.Project.from_file(cart(folder))
+    with project.session(backend="in-process", output=folder / "run") as s:
+        yield s
+
+
+def poses(s: Session, rounds: int) -> list[float]:
+    """Where the robot is after each round."""
+    found = []
+    for _ in range(rounds):
+        assert s.step(timeout_s=DEADLINE_S)
+        found.append(s["robot.pose"].packet.data)
+    return found
+
+
+# ------------------------------------------------------------------ steps
+
+
+@pytest.mark.parametrize("back_end", EVERY_BACK_END)
+class TestOnEveryBackEnd:
+    def test_a_round_is_one_start_of_what_drives_and_all_answers(
+        self, tmp_path: Path, back_end: str
+    ) -> None:
+        if back_end == "docker":
+            require_containers()
+        with neuros.Project.from_file(cart(tmp_path)).session(backend=back_end) as s:
+            assert s["robot.pose"].packet is None
+            assert poses(s, 3) == [1.0, 0.5, 0.25]
+            assert s["brain.command"].packet == Float64(data=-0.125)
+            s.send("robot.push", Float64(data=8.0))
+            assert poses(s, 1) == [8.125]
+            assert s.step(sim_s=0.04, timeout_s=DEADLINE_S)
+            assert s["robot.pose"].count == 8
+            assert s.sim_time == pytest.approx(0.08)
+            assert s.step(until=lambda s: s["robot.pose"].packet.data < 0.01)
+        run = s.close()
+        assert (run.exit_code, run.reason) == (0, "the session was closed")
+        # What was under way at the end may still have been answered.
+        assert run.connections["robot.pose -> brain.pose"]["lost"] == 0
+
+    def test_a_connection_is_taken_over(self, tmp_path: Path, back_end: str) -> None:
+        if back_end == "docker":
+            require_containers()
+        project = neuros.Project.from_file(cart(tmp_path))
+        with project.session(backend=back_end, take_over="robot.wheels") as s:
+            assert poses(s, 2) == [1.0, 1.0]
+            s.send("robot.wheels", Float64(data=2.0))
+            assert poses(s, 2) == [3.0, 3.0]
+            assert s["brain.command"].count == 4
+            s.send("robot.wheels", Float64(data=13.0))
+            with pytest.raises(RunError, match=r"(?s)robot\.py:\d+.*a wheel has broken"):
+                s.step(timeout_s=DEADLINE_S)
+            with pytest.raises(RunError, match="a wheel has broken"):
+                s.step()
+        assert s.close().exit_code == 1
+
+    def test_rounds_by_hand_give_the_packets_of_a_free_run(
+        self, tmp_path: Path, back_end: str
+    ) -> None:
+        if back_end == "docker":
+            require_containers()
+        project = neuros.Project.from_file(dice(tmp_path, ENDLESS))
+        with project.session(backend=back_end, seed=3) as s:
+            shown = []
+            for _ in range(10):
+                s.step(timeout_s=DEADLINE_S)
+                shown.append(s["thrower.eyes"].packet.data)
+        assert shown == thrown(3)
+
+
+@pytest.mark.acceptance
+@settings(max_examples=8)
+@given(parts=st.lists(st.integers(1, 9), min_size=1, max_size=6), seed=st.integers(0, 99))
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_however_rounds_are_put_together_the_recorded_packets_are_those_of_a_free_run(
+    tmp_path_factory: pytest.TempPathFactory, back_end: str, parts: list[int], seed: int
+) -> None:
+    folder = tmp_path_factory.mktemp("parts")
+    project = neuros.Project.from_file(dice(folder, ENDLESS.replace("== 0", "== 60")))
+    free = project.run(backend=back_end, seed=seed, record=True, output=folder / "free").check()
+    with project.session(backend=back_end, seed=seed, record=True, output=folder / "held") as s:
+        for rounds in parts:
+            s.step(rounds)
+        assert s["thrower.eyes"].count == sum(parts)
+    eyes = "thrower.eyes"
+    stepped = [each.message.data for each in s.close().bag[eyes]]
+    assert stepped == [each.message.data for each in free.bag[eyes]][: len(stepped)]
+    assert len(stepped) >= sum(parts)
+
+
+def test_between_two_steps_nothing_starts(held: Session) -> None:
+    """Not even a hook that would answer what is sent."""
+    held.step()
+    before = held["robot.pose"].count
+    held.send("robot.push", Float64(data=0.5))
+    counters = held.state()["robot"].counters
+    assert counters is not None
+    assert held["robot.pose"].count == before
+    assert counters.metrics["incoming"]["/neuros/session/robot/push -> robot.push"]["unread"] == 1
+    held.step()
+    assert held["robot.pose"].count == before + 1
+
+
+def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
+    assert held.sim_time is not None
+    end_s = held.sim_time + 1.0
+    assert held.run(duration_sim_s=1.0)
+    assert held.sim_time == pytest.approx(end_s)
+
+
+def test_a_free_run_of_wall_time_is_held_again(held: Session) -> None:
+    held.step()
+    before = held["robot.pose"].count
+    assert held.run(duration_s=0.3)
+    after = held["robot.pose"].count
+    assert after > before
+    held.step()
+    assert held["robot.pose"].count == after + 1
+
+
+def test_to_wait_for_a_packet_is_to_step(held: Session) -> None:
+    before = held["brain.command"].count
+    assert isinstance(held["brain.command"].wait(DEADLINE_S), Float64)
+    assert held["brain.command"].count == before + 1
+
+
+def test_a_coroutine_steps(held: Session) -> None:
+    before = held["robot.pose"].count
+    assert asyncio.run(held.astep(2))
+    assert held["robot.pose"].count == before + 2
+
+
+def test_a_notebook_shows_the_graph_and_the_hooks(held: Session) -> None:
+    shown = held._repr_html_()
+    assert "<svg" in shown
+    assert "<td>decide</td>" in shown
+
+
+def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> None:
+    before = held["robot.pose"].count
+    with pytest.raises(TimeoutError, match="has not come to rest in time"):
+        held.step(timeout_s=0.0)
+    held.step(timeout_s=DEADLINE_S)
+    assert held["robot.pose"].count == before + 2
+
+
+def test_the_program_is_interrupted_in_a_step_and_goes_on(held: Session) -> None:
+    def interrupt(_: Session) -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    before = held["robot.pose"].count
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            held.step(until=interrupt)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    held.step(timeout_s=DEADLINE_S)
+    assert held["robot.pose"].count == before + 1
+
+
+def test_the_code_of_the_page_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(cart(tmp_path))
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    exec(compile(code, str(PAGE), "exec"), {})
+    assert "0 the session was closed" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------ mistakes
+
+
+def test_an_unknown_name_is_said_with_its_place(held: Session) -> None:
+    with pytest.raises(UsageError, match=r"did you mean 'pose'\?.*project\.json:3:\d+"):
+        held["robot.poze"]
+    with pytest.raises(UsageError, match=r"no node 'robt' \(did you mean 'robot'\?\)"):
+        held["robt.pose"]
+    with pytest.raises(UsageError, match="no such input"):
+        held.send("robot.pose", Float64())
+
+
+def test_an_input_that_a_connection_feeds_is_refused(held: Session) -> None:
+    with pytest.raises(UsageError, match=r"brain\.command -> robot\.wheels.*take_over"):
+        held.send("robot.wheels", Float64())
+
+
+def test_wrong_values_are_refused_as_those_of_a_hook(held: Session) -> None:
+    with pytest.raises(TypeError, match="input 'push' takes std_msgs/msg/Float64"):
+        held.send("robot.push", String(data="13"))
+    wrong = Float64()
+    wrong._data = "13"
+    with pytest.raises(ValueError, match="packet for input 'push': field 'data' must be"):
+        held.send("robot.push", wrong)
+
+
+def test_what_a_session_cannot_be_is_said_before_anything_starts(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(cart(tmp_path))
+    with pytest.raises(UsageError, match="a session holds all nodes"):
+        project.session(nodes=["robot"])
+    with pytest.raises(UsageError, match=r"did you mean 'wheels'\?"):
+        project.session(take_over="robot.wheel")
+    assert not (tmp_path / "runs").exists()
+    with pytest.raises(ProjectError):
+        project.session(set={"nodes.robot.plugin": "nothing.py"})
+
+
+def test_simulated_seconds_need_a_node_that_has_them(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(dice(tmp_path))
+    with project.session(backend="in-process") as s:
+        with pytest.raises(UsageError, match="no node of dice owns simulated time"):
+            s.step(sim_s=1.0)
+        # And a project that ends itself ends the session.
+        assert not s.step(20)
+    assert s.close().reason == "counter ended the project: ten were thrown"
+    with pytest.raises(RunError, match="ten were thrown"):
+        s.step()
+
+
+# ------------------------------------------------------------------ its end
+
+
+def test_a_block_that_fails_interrupts_the_run(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(cart(tmp_path))
+    with pytest.raises(ZeroDivisionError), project.session(backend="in-process") as s:
+        s.step(until=lambda s: s["robot.pose"].count and 1 / 0)
+    assert s.close().exit_code == 130
+
+
+@pytest.mark.acceptance
+def test_a_plugin_that_cannot_be_imported_is_the_error_of_the_start(tmp_path: Path) -> None:
+    made = cart(tmp_path)
+    (made / "brain.py").write_text(BRAIN + "\nraise ValueError('no brain')\n")
+    with pytest.raises(RunError, match="no brain"):
+        neuros.Project.from_file(made).session(backend="in-process")
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_a_program_that_is_killed_leaves_nothing(tmp_path: Path, back_end: str) -> None:
+    program = (
+        "import neuros, time\n"
+        f"s = neuros.Project.from_file({str(cart(tmp_path))!r}).session(backend={back_end!r})\n"
+        "s.step()\nprint('held', flush=True)\ntime.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held\n"
+        started = psutil.Process(process.pid).children(recursive=True)
+        assert started
+        process.kill()
+    wait_until(lambda: not any(map(_lives, started)), DEADLINE_S)
+
+
+def _lives(process: psutil.Process) -> bool:
+    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+
+
+def test_two_threads_share_a_session(held: Session) -> None:
+    before = held["robot.pose"].count
+    threads = [threading.Thread(target=held.step, args=(5,)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert held["robot.pose"].count == before + 10
+
+
+TEST = """
+def test_the_robot_comes_back(neuros_session):
+    s = neuros_session("cart/project.json", backend="in-process")
+    s.step(4)
+    assert abs(s["robot.pose"].packet.data) < 0.2
+"""
+
+
+@pytest.mark.acceptance
+def test_the_fixture_of_pytest_closes_its_sessions(tmp_path: Path) -> None:
+    cart(tmp_path)
+    (tmp_path / "test_cart.py").write_text(TEST)
+    # Whether or not the plugin is known from the installation.
+    plugin = ["-p", "no:neuros", "-p", "neuros.pytest_plugin", "-p", "no:cacheprovider"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *plugin, "test_cart.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert "1 passed" in done.stdout, done.stdout + done.stderr
+    (run,) = (tmp_path / "runs" / "cart").iterdir()
+    assert neuros.Run(run).reason == "the session was closed"
