@@ -207,7 +207,8 @@ class Supervisor:
             case control.Settle():
                 self._settling.ask(link, message)
             case control.AtRest():
-                self._settling.take(message)
+                if self._shutdown.phase is Phase.RUNNING:  # else the session hears of the end
+                    self._settling.take(message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
             case _:
