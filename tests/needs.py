@@ -33,6 +33,8 @@ COMPILER = ("gcc", "g++", "Python.h")
 """What builds message packages."""
 
 _INSTALL = ("install", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
+_POLICY = Path("/usr/sbin/policy-rc.d")
+"""Debian asks it whether a package may start a daemon; 101: it may not."""
 _SKIPPED = re.compile(r"needs (?P<what>.+?)(: |$)")
 
 
@@ -134,11 +136,27 @@ def main(arguments: list[str]) -> int:
         return 0
     print(f"installing what the tests need: {what}", flush=True)
     _apt_get("update")
-    # A newer Debian may have dropped one of them: the others are installed nevertheless.
-    missing = [] if _apt_get(*_INSTALL, *packages) else packages
-    if missing := [package for package in missing if not _apt_get(*_INSTALL, package)]:
+    with _daemons_not_started():
+        # A newer Debian may have dropped one of them: the others are installed nevertheless.
+        missing = [] if _apt_get(*_INSTALL, *packages) else packages
+        missing = [package for package in missing if not _apt_get(*_INSTALL, package)]
+    if missing:
         print(f"not installed, so tests that need them fail: {' '.join(missing)}", flush=True)
     return 0
+
+
+@contextlib.contextmanager
+def _daemons_not_started() -> Iterator[None]:
+    """Packages start their daemons (sshd, slurmd, dockerd) at once; tests start their own."""
+    if _POLICY.exists():
+        yield
+        return
+    _POLICY.write_text("#!/bin/sh\nexit 101\n")
+    try:
+        _POLICY.chmod(0o755)
+        yield
+    finally:
+        _POLICY.unlink()
 
 
 def _apt_get(*arguments: str) -> bool:
