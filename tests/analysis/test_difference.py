@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuros.analysis.difference import Verdict, compare, differing_fields
-from neuros.analysis.run_record import PastRun, open_run
+from neuros.analysis.run_record import PastRun, open_run, open_whole
 from neuros.errors import EnvironmentFault, UsageError
 
 FIRST, SECOND = "a.out -> b.in", "b.out -> c.in"
@@ -280,3 +281,27 @@ def test_a_run_that_goes_on_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a/node.json").write_text("{}")
     with pytest.raises(UsageError, match="its run goes on"):
         open_run(tmp_path)
+
+
+def test_a_run_in_parts_is_compared_as_a_whole(folders: tuple[Path, Path]) -> None:
+    whole, parts = folders
+    sent = {FIRST: [1, 2, 3], SECOND: [4, 5]}
+    a = run(whole, sent)
+    for part, nodes, lacks in (("a", "a", SECOND), ("desk", "bc", None)):
+        (parts / part).mkdir()
+        run(parts / part, sent)
+        for node in {*"abc"} - {*nodes}:
+            shutil.rmtree(parts / part / node)
+        for node in nodes:
+            (parts / part / node / "node.json").touch()
+        record = json.loads((parts / part / "run.json").read_text())
+        kept = [each for each in record["connections"] if each["connection"] != lacks]
+        for each in kept:
+            each |= {"sent": None} if each["connection"][0] not in nodes else {}
+        (parts / part / "run.json").write_text(json.dumps({**record, "connections": kept}))
+    verdict = compare(a, open_whole(parts), Bags())
+    assert (verdict.difference, verdict.remarks, verdict.compared) == (None, (), 5)
+    (parts / "a/a/packets/0.digests").write_bytes(np.array([1, 2, 4], "u8").tobytes())
+    difference = compare(a, open_whole(parts), Bags()).difference
+    assert difference is not None
+    assert difference.startswith(f"{FIRST}: packet 3 differs")
