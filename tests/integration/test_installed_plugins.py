@@ -26,7 +26,7 @@ def answer(node, into):
     global strokes
     strokes += 1
     node.set_result("strokes", strokes)
-    if node.name == "bob" and strokes == STROKES:
+    if node.name == "bob" and strokes >= STROKES:
         return node.shutdown("enough")
     return into
 """
@@ -43,11 +43,11 @@ INT = "std_msgs/msg/Int32"
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """Two nodes of one module, in lockstep; it is in ``installed``, which Python searches."""
-    package = tmp_path / "installed" / "lab"
+    """Two nodes of one module, in lockstep; it is in ``site-packages``, which Python searches."""
+    package = tmp_path / "site-packages" / "lab"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("")
-    (package / "limits.py").write_text("STROKES = 5\n")
+    (package / "limits.py").write_text("STROKES = 6\n")
     (package / "counter.py").write_text(COUNTER)
     ports = {"inputs": [{"name": "into", "type": INT}], "outputs": [{"name": "out", "type": INT}]}
     node = {"container": "neuros_python", "plugin": "lab.counter", **ports}
@@ -63,7 +63,7 @@ def project(tmp_path: Path) -> Path:
 
 
 def run(project: Path, backend: str) -> Finished:
-    installed = str(project.parent / "installed")
+    installed = str(project.parent / "site-packages")
     return launch(project, "--backend", backend, cwd=project.parent, PYTHONPATH=installed)
 
 
@@ -72,12 +72,12 @@ def test_nodes_of_one_module_share_nothing_of_it(backend: str, project: Path) ->
     done = run(project, backend)
     assert done.exit_code == 0, done.output
     strokes = {name: node["results"]["strokes"] for name, node in done.record["nodes"].items()}
-    assert strokes == {"ann": 4, "bob": 5}
+    assert strokes == {"ann": 5, "bob": 6}
 
 
 def test_a_callback_that_fails_is_named_with_its_line(project: Path) -> None:
-    plugin = project.parent / "installed" / "lab" / "counter.py"
-    plugin.write_text(COUNTER.replace("== STROKES", "< 0") + FAILING)
+    plugin = project.parent / "site-packages" / "lab" / "counter.py"
+    plugin.write_text(COUNTER.replace(">= STROKES", "< 0") + FAILING)
     done = run(project, "process")
     assert done.exit_code == 1, done.output
     line = plugin.read_text("utf-8").splitlines().index("def fail():") + 1
