@@ -221,6 +221,7 @@ class Session:
 
         with self._lock:
             self._check_running()
+            self._advance(0, None)  # what was sent has arrived then
             self._link.send(LookAll({}))
             if not self._wait_for(is_last, None):
                 self._check_running()

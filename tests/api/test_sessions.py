@@ -182,7 +182,7 @@ class TestOnEveryBackEnd:
 
 
 @pytest.mark.acceptance
-@settings(max_examples=8)
+@settings(max_examples=3)
 @given(parts=st.lists(st.integers(1, 9), min_size=1, max_size=6), seed=st.integers(0, 99))
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_however_rounds_are_put_together_the_recorded_packets_are_those_of_a_free_run(

@@ -88,6 +88,24 @@ def test_a_step_outside_a_pause_does_nothing():
     assert bench.ran == ["step"]
 
 
+def test_a_second_pause_takes_back_what_is_left_of_steps():
+    bench = Bench(
+        function("step", outputs="o", returns="reading"),
+        function("answer", "x"),
+        connections=[wire(OUT, 0), wire(IN, 0)],
+    )
+    bench.engine.pause()
+    bench.engine.step(3, is_driven=True)  # its receiver is behind
+    bench.engine.pause()
+    bench.acknowledge_to_node(OUT, 1)
+    assert bench.packet(IN) == []
+    assert bench.ran == ["step"]
+    bench.engine.step(1, is_driven=True)
+    bench.settle()
+    bench.acknowledge_to_node(OUT, 2)
+    assert sorted(bench.ran) == ["answer", "step", "step"]
+
+
 def test_a_step_starts_a_tick_hook_though_no_time_passes():
     bench = Bench(tick("t", 1.0))
     bench.engine.pause()
