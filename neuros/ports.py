@@ -331,10 +331,7 @@ class Simulator(Protocol):
 
 
 class ControlStream(Protocol):
-    """Bytes between the supervisor and another process, in order, both ways.
-
-    A connected ``socket.socket`` is one.
-    """
+    """Bytes to and from another process, in order: a connected ``socket.socket`` is one."""
 
     def fileno(self) -> int:
         """For selectors: readable when :meth:`recv` does not wait."""
