@@ -253,7 +253,7 @@ def _compose_service(export: Export, part: Part) -> dict[str, Any]:
         "restart": "no",
         "tmpfs": ["/tmp:exec,mode=1777"],
         # Who exports reads what nodes write, and may remove it.
-        "user": f"${{NEUROS_USER:-{os.getuid()}:{os.getgid()}}}",
+        "user": f"${{RUN_AS:-{os.getuid()}:{os.getgid()}}}",
         "security_opt": ["no-new-privileges:true"],
         "pids_limit": resources.pids or _MOST_PIDS,
         "volumes": [f"./{NODES_FILE}:{ROOT / NODES_FILE}:ro", f"./runs:{FOLDERS.run}"],
