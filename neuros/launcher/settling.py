@@ -2,9 +2,9 @@
 
 Each node process answers when no event waits in it, and none starts anything unasked. They answer
 at different instants, but with counters by connection one round is enough: if something still
-moved, then some process was the first to receive a packet after its answer. That was sent before the
-answer of its sender, so the counters of this connection would differ (F. Mattern, "Algorithms for
-distributed termination detection", 1987, channel counting).
+moved, then some process was the first to receive a packet after its answer. That was sent before
+the answer of its sender, so the counters of this connection would differ (F. Mattern, "Algorithms
+for distributed termination detection", 1987, channel counting).
 """
 
 from __future__ import annotations
