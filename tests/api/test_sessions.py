@@ -35,6 +35,7 @@ EVERY_BACK_END = [
     pytest.param("docker", marks=ACCEPTANCE),
 ]
 DEADLINE_S = 60.0
+EYES = "thrower.eyes"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "sessions.md"
 
 ROBOT = """
@@ -182,7 +183,7 @@ class TestOnEveryBackEnd:
 
 
 @pytest.mark.acceptance
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(parts=st.lists(st.integers(1, 9), min_size=1, max_size=6), seed=st.integers(0, 99))
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_however_rounds_are_put_together_the_recorded_packets_are_those_of_a_free_run(
@@ -195,9 +196,8 @@ def test_however_rounds_are_put_together_the_recorded_packets_are_those_of_a_fre
         for rounds in parts:
             s.step(rounds)
         assert s["thrower.eyes"].count == sum(parts)
-    eyes = "thrower.eyes"
-    stepped = [each.message.data for each in s.close().bag[eyes]]
-    assert stepped == [each.message.data for each in free.bag[eyes]][: len(stepped)]
+    stepped, whole = ([m.data for _, m in run.bag[EYES].messages()] for run in (s.close(), free))
+    assert stepped == whole[: len(stepped)]
     assert len(stepped) >= sum(parts)
 
 
@@ -224,9 +224,8 @@ def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
 def test_a_free_run_of_wall_time_is_held_again(held: Session) -> None:
     held.step()
     before = held["robot.pose"].count
-    assert held.run(duration_s=0.3)
-    after = held["robot.pose"].count
-    assert after > before
+    while (after := held["robot.pose"].count) == before:
+        assert held.run(duration_s=0.1)
     held.step()
     assert held["robot.pose"].count == after + 1
 
@@ -250,9 +249,17 @@ def test_a_notebook_shows_the_graph_and_the_hooks(held: Session) -> None:
 
 
 def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> None:
+    children = psutil.Process().children(recursive=True)
+    nodes = [each for each in children if str(held.folder) in " ".join(each.cmdline())]
     before = held["robot.pose"].count
-    with pytest.raises(TimeoutError, match="has not come to rest in time"):
-        held.step(timeout_s=0.0)
+    for node in nodes:
+        node.suspend()
+    try:
+        with pytest.raises(TimeoutError, match="has not come to rest in time"):
+            held.step(timeout_s=0.1)
+    finally:
+        for node in nodes:
+            node.resume()
     held.step(timeout_s=DEADLINE_S)
     assert held["robot.pose"].count == before + 2
 
