@@ -41,10 +41,7 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
     """
     package, name = module_name.rpartition(".")[0], f"{PREFIX}{node_name}"
     if module_name and path == Path():
-        raise PluginError(
-            f"there is no module {module_name} for {sys.executable}: its package goes into the"
-            " requirements.txt of the node's container: docs/plugins.md"
-        )
+        raise no_module(module_name)
     full_name = f"{package}.{name}" if package else name
     folders = [str(path.parent)] if path.name == "__init__.py" and module_name else None
     spec = importlib.util.spec_from_file_location(
@@ -81,6 +78,14 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
             " from neuros.hooks"
         )
     return specs
+
+
+def no_module(name: str) -> PluginError:
+    """What to say where a plugin is a module that this Python does not have."""
+    return PluginError(
+        f"there is no module {name} for {sys.executable}: its package goes into the"
+        " requirements.txt of the node's container: docs/plugins.md"
+    )
 
 
 def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxError]:

@@ -20,6 +20,7 @@ from neuros.errors import ProjectError
 from neuros.installation.progress import Progress
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
+from neuros.node.plugin import no_module
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.modules import find_module, is_module_name
@@ -110,7 +111,9 @@ class PluginHarness(NodeBench):
         path, module = Path(plugin).resolve(), ""
         if not path.exists() and is_module_name(os.fspath(plugin)):
             module = os.fspath(plugin)
-            path = find_module(module) or Path()
+            if (found := find_module(module)) is None:
+                raise no_module(module)
+            path = found
         node = Node(
             name=name,
             container="neuros_python",

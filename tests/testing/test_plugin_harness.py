@@ -289,9 +289,9 @@ def test_mistakes_in_the_test_are_pointed_out(plugin):
         counter(plugin, connections=[wire("a.b -> node.z")])
     with pytest.raises(ValueError, match="neither begins nor ends at node 'node'"):
         counter(plugin, connections=[wire("a.b -> c.d")])
-    with pytest.raises(ValueError, match="is no connection"):
+    with pytest.raises(ValueError, match="is not a connection"):
         wire("a -> b")
-    with pytest.raises(ValueError, match="is no message type"):
+    with pytest.raises(ValueError, match="is not a message type"):
         PluginHarness(plugin(COUNT), inputs={"x": "int"})
 
 
