@@ -80,6 +80,24 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         require(*needs.args)
 
 
+class FailuresAtOnce:
+    """Says which test failed when it does: a run of all takes a quarter of an hour."""
+
+    def __init__(self, terminal: pytest.TerminalReporter) -> None:
+        self._terminal = terminal
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self._terminal.write_line(f" {report.nodeid}: {report.when} failed")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    terminal = config.pluginmanager.get_plugin("terminalreporter")
+    if terminal is not None:  # a worker of pytest-xdist has none
+        config.pluginmanager.register(FailuresAtOnce(terminal))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Count apart the tests that were left out for want of something."""
     skipped = terminalreporter.stats.get("skipped", [])
