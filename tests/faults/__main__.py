@@ -42,7 +42,7 @@ def main() -> int:
             if options.table:  # now: who interrupts a long row has what there is
                 text = options.table.read_text("utf-8") if options.table.exists() else ""
                 options.table.write_text(with_tables(text, [outcome]), "utf-8")
-    failed = [outcome for outcome in outcomes if outcome.problems]
+    failed = [outcome for outcome in outcomes if not outcome.is_well]
     print(f"{len(outcomes)} runs, {len(failed)} not as they must be")
     return 1 if failed else 0
 
@@ -109,7 +109,7 @@ def _in_folder(place: Place, run: _Run, options: argparse.Namespace) -> Outcome:
         except Exception as error:  # the others go on
             text = f"{type(error).__name__}: {error}"
             outcome = Outcome(place, -1, "", 0.0, "", text, {}, [text.partition("\n")[0]])
-        if outcome.problems and options.keep:
+        if not outcome.is_well and options.keep:
             kept = options.keep / re.sub(r"\W+", "_", str(outcome.place))
             shutil.rmtree(kept, ignore_errors=True)
             sockets = shutil.ignore_patterns("*.sock")

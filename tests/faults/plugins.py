@@ -49,8 +49,7 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int) -> Outcome:
         # Both count from the first hook.
         outcome.took_s = outcome.record["wall_s"] - DURATION_S
     drains_s = DRAINS_WITHIN_S if cell.ends_by_itself and not cell.is_survived else 0.0
-    if outcome.took_s > ENDS_WITHIN_S + drains_s:
-        outcome.problems.append(f"ended after {outcome.took_s:.1f} s")
+    outcome.is_late = outcome.took_s > ENDS_WITHIN_S + drains_s
     return outcome
 
 

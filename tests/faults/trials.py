@@ -76,6 +76,8 @@ class Outcome:
         took_s: from when the end was due to the end of the launcher, and of what it leaves behind.
         bag: ``complete``, ``repaired``, ``none``, or what is wrong with it.
         problems: where that is not what must be.
+        is_late: it took longer than it may: a figure of the tables, which are made on a quiet
+            machine, and no failure of a test.
     """
 
     place: Place
@@ -86,15 +88,21 @@ class Outcome:
     output: str
     record: dict[str, Any]
     problems: list[str] = field(default_factory=list)
+    is_late: bool = False
+
+    @property
+    def is_well(self) -> bool:
+        return not self.problems and not self.is_late
 
     @property
     def shown(self) -> str:
         """In a table."""
         text = f"{self.exit_code}, {max(0.0, self.took_s):.1f} s"
-        return f"**{text}: {'; '.join(self.problems)}**" if self.problems else text
+        problems = f": {'; '.join(self.problems)}" if self.problems else ""
+        return text if self.is_well else f"**{text}{problems}**"
 
     def __str__(self) -> str:
-        problems = "; ".join(self.problems) or "ok"
+        problems = "; ".join([*self.problems, *["late"] * self.is_late]) or "ok"
         return (
             f"{self.place!s:55} {self.exit_code:4} {self.took_s:5.1f} s {self.bag:9} {problems}\n"
             f"    {self.said}"
@@ -196,8 +204,8 @@ class Trial:
         """
         is_over = read_to_end(running, time.monotonic() + GIVES_UP_AFTER_S)
         took_s = time.monotonic() - due_s
-        # Where the launcher was killed, its reaper has what is left of that time.
-        until_s = time.monotonic() if expected.has_record else due_s + expected.within_s
+        # Where the launcher was killed, its reaper cleans up after it.
+        until_s = time.monotonic() if expected.has_record else due_s + GIVES_UP_AFTER_S
         left = self._left(until_s, is_left)
         if not expected.has_record:
             took_s = time.monotonic() - due_s
@@ -215,6 +223,7 @@ class Trial:
             outcome.problems.append(f"not ended after {GIVES_UP_AFTER_S:g} s")
         outcome.problems += [f"left: {each}" for each in left]
         outcome.problems += _problems(outcome, expected)
+        outcome.is_late = took_s > expected.within_s
         return outcome
 
     def _left(self, until_s: float, is_left: Callable[[], Sequence[str]]) -> list[str]:
@@ -326,8 +335,6 @@ def _record(run_folder: Path) -> dict[str, Any]:
 def _problems(outcome: Outcome, expected: Expected) -> Iterator[str]:
     if outcome.exit_code not in expected.exit_codes:
         yield f"exit code {outcome.exit_code}, not {' or '.join(map(str, expected.exit_codes))}"
-    if outcome.took_s > expected.within_s:
-        yield f"ended after {outcome.took_s:.1f} s"
     if expected.says not in outcome.output:
         yield f"does not say '{expected.says}'"
     if expected.last_says not in outcome.said:
