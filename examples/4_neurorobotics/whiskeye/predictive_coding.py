@@ -2,7 +2,7 @@
 
 Every layer predicts the one below it, and is corrected by how far its prediction is off::
 
-    view (1152) <- causes (192) <- causes (96) <- causes (48) -> heading code (180)
+    view (1152) <- causes (320) <- causes (160) <- causes (80) -> heading code (180)
 
 A generative model: *causes* ``c`` are inferred for each view by descending the energy, half the sum
 of squared errors of all predictions ``f(c) W``; then the weights descend the same energy at these
@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-LAYERS = (192, 96, 48)
+LAYERS = (320, 160, 80)
 LEAK = np.float32(0.2)  # slope of the leaky ReLU below 0
 STEP, MOMENTUM = np.float32(0.08), np.float32(0.8)  # of inference
 DECAY = np.float32(0.01)  # pulls the uppermost causes to 0
 START = 0.1  # causes before inference
 CODE_WEIGHT = np.float32(0.3)  # of the heading's error against the view's, while learning
-LEARNING_STEPS, INFERENCE_STEPS = 20, 60
+LEARNING_STEPS, INFERENCE_STEPS = 30, 60
 READING_PENALTY = 0.03  # on the weights by which the heading is read off
 BATCH = 24
 LEARNING_RATES = (2e-3, 2e-4)  # first and last epoch, geometric in between
@@ -184,7 +184,7 @@ class _Adam:
 
 
 def _readable(layers: list[Floats]) -> Floats:
-    """What the heading is read off: the causes of all layers, and a 1 ``(n, 337)``."""
+    """What the heading is read off: the causes of all layers, and a 1 ``(n, 561)``."""
     ones = np.ones((len(layers[0]), 1), np.float32)
     return np.hstack([*(_active(causes) for causes in layers[1:]), ones])
 

@@ -17,7 +17,7 @@ PIXELS = 2 * WIDTH * HEIGHT * 3
 CODES = 180
 
 _PREFERRED_RAD = evenly_spaced_angles(CODES)
-_BUMP = GaussianTuning(_PREFERRED_RAD, math.radians(18), peak_hz=1.0, period=math.tau)
+_BUMP = GaussianTuning(_PREFERRED_RAD, math.radians(12), peak_hz=1.0, period=math.tau)
 _READ = PopulationVector(_PREFERRED_RAD)
 
 
@@ -47,8 +47,8 @@ def code_of(heading_rad: float) -> Floats:
 
 
 def heading_of(code: Floats) -> float:
-    """The heading, in radians, that a predicted code stands for: squared, the peak counts most."""
-    return _READ.of_rates(np.maximum(code, 0.0) ** 2).angle_rad
+    """The heading, in radians, that a predicted code stands for: with a power of 4, its peak."""
+    return _READ.of_rates(np.maximum(code, 0.0) ** 4).angle_rad
 
 
 def stamp_ns(packet: Any) -> int:
