@@ -35,6 +35,7 @@ from neuros.simulators.mujoco.lookup import (
     is_list_of_names,
     names_of,
 )
+from neuros.time import to_stamp
 
 Vector: TypeAlias = "list[float]"
 """3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
@@ -97,13 +98,8 @@ class Sensor:
         raise NotImplementedError
 
 
-def _set_time(time: Any, time_ns: int) -> None:
-    """Set a ``builtin_interfaces/Time``."""
-    time.sec, time.nanosec = divmod(time_ns, 1_000_000_000)
-
-
 def _set_header(header: Any, time_ns: int, frame: str) -> None:
-    _set_time(header.stamp, time_ns)
+    header.stamp = to_stamp(nanoseconds=time_ns)
     header.frame_id = frame
 
 
@@ -308,7 +304,7 @@ class JointStates(Sensor):
         self._speeds = self.model.jnt_dofadr[joints]
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        _set_time(packet.header.stamp, time_ns)
+        packet.header.stamp = to_stamp(nanoseconds=time_ns)
         packet.name = list(self._names)
         packet.position = array("d", data.qpos[self._positions].tobytes())
         packet.velocity = array("d", data.qvel[self._speeds].tobytes())
@@ -388,7 +384,7 @@ class Clock(Sensor):
     types = ("rosgraph_msgs/msg/Clock",)
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        _set_time(packet.clock, time_ns)
+        packet.clock = to_stamp(nanoseconds=time_ns)
 
 
 SENSORS: Mapping[str, type[Sensor]] = {
