@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar
 
 from neuros.errors import HookError
@@ -88,13 +89,18 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class HookSpec:
-    """What a decorator says about one function. ``period_s`` is set for ticks only."""
+    """What a decorator says about one function.
+
+    ``period_s`` is set for ticks by the wall clock only, ``sim_period_s`` for those by simulated
+    time; a node runs the latter as functions of its clock.
+    """
 
     kind: HookKind
     function: Callable[..., Any]
     inputs: tuple[InputSpec, ...] = ()
     outputs: tuple[OutputSpec, ...] = ()
     period_s: float | None = None
+    sim_period_s: float | None = None
 
     @property
     def name(self) -> str:
@@ -110,7 +116,7 @@ class HookSpec:
     def sends_unasked(self) -> bool:
         """Whether it can send without having received: a tick, or no required input."""
         if self.kind is HookKind.TICK:
-            return True
+            return self.sim_period_s is None
         return bool(self.outputs) and all(port.is_optional for port in self.inputs)
 
 
@@ -122,10 +128,17 @@ def neuros_initialise(
 
 
 def neuros_tick(
-    seconds: float, inputs: Ports = None, outputs: Ports = None
+    seconds: float | None = None,
+    inputs: Ports = None,
+    outputs: Ports = None,
+    sim_seconds: float | None = None,
 ) -> Callable[[_Function], _Function]:
-    """Mark a hook that runs every ``seconds`` of wall time from the end of initialisation on."""
-    return _marker(HookKind.TICK, inputs, outputs, seconds)
+    """Mark a hook that runs every ``seconds`` of wall time from the end of initialisation on.
+
+    With ``sim_seconds`` in its place: at every whole number of so many seconds of simulated time,
+    by the packets of the node's clock, an input of type ``rosgraph_msgs/msg/Clock``.
+    """
+    return _marker(HookKind.TICK, inputs, outputs, {"seconds": seconds, "sim_seconds": sim_seconds})
 
 
 def neuros_function(
@@ -158,9 +171,12 @@ def _marks(value: object) -> tuple[HookSpec, ...]:
 
 
 def _marker(
-    kind: HookKind, inputs: Ports, outputs: Ports, seconds: float | None = None
+    kind: HookKind,
+    inputs: Ports,
+    outputs: Ports,
+    periods: Mapping[str, float | None] = MappingProxyType({}),
 ) -> Callable[[_Function], _Function]:
-    bare = next((given for given in (inputs, seconds) if callable(given)), None)
+    bare = next((given for given in (inputs, *periods.values()) if callable(given)), None)
     if bare is not None:
         raise HookError(
             f"@neuros_{kind.value} needs parentheses",
@@ -175,12 +191,17 @@ def _marker(
 
         if not callable(function):
             raise fail(f"@neuros_{kind.value} needs parentheses and a function below it")
+        given = {name: period for name, period in periods.items() if period is not None}
+        if periods and len(given) != 1:
+            raise fail("@neuros_tick needs seconds or sim_seconds, and not both")
+        period = {name: _period(name, value, fail) for name, value in given.items()}
         spec = HookSpec(
             kind=kind,
             function=function,
             inputs=tuple(_input(port, fail) for port in _listed(inputs, fail)),
             outputs=tuple(_output(port, fail) for port in _listed(outputs, fail)),
-            period_s=None if seconds is None else _period(seconds, fail),
+            period_s=period.get("seconds"),
+            sim_period_s=period.get("sim_seconds"),
         )
         for side, names in (
             ("input", [port.name for port in spec.inputs]),
@@ -225,11 +246,11 @@ def _output(port: object, fail: Callable[[str], HookError]) -> OutputSpec:
     return OutputSpec(inner, isinstance(port, Optional))
 
 
-def _period(seconds: float, fail: Callable[[str], HookError]) -> float:
+def _period(name: str, seconds: float, fail: Callable[[str], HookError]) -> float:
     if isinstance(seconds, bool) or not isinstance(seconds, int | float):
-        raise fail(f"seconds={seconds!r} is not a number")
+        raise fail(f"{name}={seconds!r} is not a number")
     if not (math.isfinite(seconds) and seconds > 0):
-        raise fail(f"seconds={seconds!r} is not a positive time")
+        raise fail(f"{name}={seconds!r} is not a positive time")
     return float(seconds)
 
 

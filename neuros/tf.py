@@ -18,6 +18,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from neuros.time import to_nanoseconds, to_stamp
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 """x, y, z, w, as in ROS."""
@@ -90,7 +92,7 @@ class TransformBuffer:
         if at is None:
             at_ns = min((self._poses[frame][-1].at_ns for frame in moving), default=0)
         else:
-            at_ns = at.sec * 1_000_000_000 + at.nanosec
+            at_ns = to_nanoseconds(at)
         pose = self._chain(up, at_ns)
         if down:
             pose = pose.within(self._chain(down, at_ns).inverted())
@@ -98,8 +100,8 @@ class TransformBuffer:
 
     def _add(self, stamped: Any, is_static: bool) -> None:
         frame, parent = _plain(stamped.child_frame_id), _plain(stamped.header.frame_id)
-        stamp, moved, turned = stamped.header.stamp, *_parts(stamped.transform)
-        pose = _Pose(stamp.sec * 1_000_000_000 + stamp.nanosec, moved, turned)
+        moved, turned = _parts(stamped.transform)
+        pose = _Pose(to_nanoseconds(stamped), moved, turned)
         if is_static or self._parents.get(frame) != parent:
             self._poses[frame] = []
         self._parents[frame] = parent
@@ -176,10 +178,7 @@ def transform(
 
     made = TransformStamped()
     made.header.frame_id, made.child_frame_id = parent, child
-    if isinstance(stamp, int):
-        made.header.stamp.sec, made.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-    else:
-        made.header.stamp = stamp
+    made.header.stamp = to_stamp(nanoseconds=stamp) if isinstance(stamp, int) else stamp
     for axis, value in zip("xyz", translation, strict=True):
         setattr(made.transform.translation, axis, float(value))
     for axis, value in zip("xyzw", rotation, strict=True):

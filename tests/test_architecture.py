@@ -40,7 +40,7 @@ def is_within(module: str, package: str) -> bool:
 # The first one that holds a module counts.
 PACKAGES = (
     Package(0, ("errors", "distribution")),
-    Package(1, ("hooks",)),
+    Package(1, ("hooks", "time")),
     Package(1, ("project",)),
     Package(1, ("installation",)),
     Package(1, ("caching",)),
@@ -79,6 +79,7 @@ GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 # What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
+    "time": {"builtin_interfaces"},
     "transport": {"numpy", "rclpy", "rosidl_parser", "rpyutils", "xxhash"} | MESSAGES,
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,

@@ -21,6 +21,7 @@ from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, S
 from neuros.engine.node_ports import Links, NodePorts, Output, PacketType, undeclared
 from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule, drives
 from neuros.engine.send_window import SendWindow
+from neuros.engine.sim_clock import ClockSubscription
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node
@@ -64,6 +65,7 @@ class Engine:
         since_ns: when that started, or else up to when the time is counted.
         spent_ns: wall time by cause; that of executions is counted by each hook.
         execution_log: the first executions.
+        sim_clock: simulated time, as far as the node knows it.
 
     Raises:
         HookError: if a hook names a port that the node has not, or needs an input without source.
@@ -82,7 +84,8 @@ class Engine:
         self._effects = effects
         self._has_taken_in = effects.has_taken_in
         self._clock = clock
-        ports = NodePorts(node, connections, packet_types or {}, effects)
+        ports = NodePorts(node, connections, packet_types or {}, effects, clock)
+        self.sim_clock = ports.sim_clock
         self.subscriptions, self.send_windows = ports.subscriptions, ports.send_windows
         self.outputs = ports.outputs
         for connection, window in self.send_windows.items():
@@ -287,8 +290,9 @@ class Engine:
         return self._schedule.free_running_hooks()
 
     def untaken_subscriptions(self) -> Sequence[Subscription]:
-        """Connections to inputs that no hook takes."""
-        return [s for s in self.subscriptions.values() if not s.queues]
+        """Connections to inputs that no hook takes, but for the clock, which the node takes."""
+        found = (s for s in self.subscriptions.values() if not s.queues)
+        return [s for s in found if not isinstance(s, ClockSubscription)]
 
     def rest(self) -> Rest:
         """The state of the node now, and its cause."""

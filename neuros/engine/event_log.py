@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from neuros.engine.engine import Effects, Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
-from neuros.hooks import HookKind, HookSpec
+from neuros.hooks import HookSpec
 from neuros.project.model import Connection, Node
 
 _KIND_BITS, _PLACE_BITS = 5, 20
@@ -75,7 +75,7 @@ class LoggedEngine(Engine):
     ) -> None:
         self.event_log = array("q")
         self._note = self.event_log.append
-        has_ticks = any(spec.kind is HookKind.TICK for spec in specs)
+        has_ticks = any(spec.period_s is not None for spec in specs)
         own_clock = self._noting(clock) if has_ticks else clock
         super().__init__(node, connections, specs, effects, own_clock, packet_types)
         self._has_taken_in = self._noting_deferral(effects.has_taken_in)

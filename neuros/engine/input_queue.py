@@ -23,6 +23,7 @@ class Taker(Protocol):
     """A hook, as its inputs see it."""
 
     name: str
+    missed_ticks: int
 
     def is_ready(self) -> bool:
         """Whether it may start now."""
@@ -147,9 +148,9 @@ class Subscription:
             packets = queue.packets
             if len(packets) >= self.capacity:
                 self._discard_oldest(queue)
-            if not packets:
-                queue.hook_input.on_filled()
             packets.append((arrival, self.received, packet))
+            if len(packets) == 1:
+                queue.hook_input.on_filled()
         if not self.queues:
             self._settle()
             self.acknowledge_taken()

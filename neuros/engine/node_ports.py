@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from neuros.engine.input_queue import HookInput, Subscription
 from neuros.engine.send_window import SendWindow
+from neuros.engine.sim_clock import ClockSubscription, SimClock, TickInput
 from neuros.errors import HookError
 from neuros.hooks import HookSpec, InputSpec
 from neuros.project.model import Connection, Node, Port
@@ -79,6 +80,7 @@ class NodePorts:
         subscriptions: by connection; those of external topics come last, by the name of the input.
         send_windows: by connection; one to the node itself is registered from the start.
         outputs: by name.
+        sim_clock: simulated time, as the node's clock tells it.
     """
 
     def __init__(
@@ -87,10 +89,22 @@ class NodePorts:
         connections: Sequence[Connection],
         packet_types: Mapping[str, PacketType],
         links: Links,
+        clock: Callable[[], int],
     ) -> None:
         self._node = node
+        self._clock = clock
+        self.sim_clock = SimClock()
         self.subscriptions: dict[Connection | str, Subscription] = {
-            c: _subscription(c) for c in connections if c.destination_node == node.name
+            c: self._subscription(
+                c,
+                str(c),
+                c.destination_input,
+                c.queue_size,
+                is_lossless=c.discard_limit == 0,
+                is_acknowledged=c.is_reliable,
+            )
+            for c in connections
+            if c.destination_node == node.name
         }
         for c in connections:
             if c.destination_node == node.name != c.source_node and c.is_reliable:
@@ -98,7 +112,7 @@ class NodePorts:
         for port in node.inputs:
             if port.external_topic is not None:
                 depth = DEPTH if port.qos is None else port.qos.depth or DEPTH
-                self.subscriptions[port.name] = Subscription(
+                self.subscriptions[port.name] = self._subscription(
                     port.name, port.external_topic, port.name, depth
                 )
         self.send_windows = {c: SendWindow(c) for c in connections if c.source_node == node.name}
@@ -140,21 +154,24 @@ class NodePorts:
                 hook=spec.name,
                 where=spec.where,
             )
+        if spec.sim_period_s is not None and self._is_clock(port.name):
+            return TickInput(port, subscriptions, spec.sim_period_s, self._clock)
         return HookInput(port, subscriptions)
+
+    def _subscription(
+        self, key: Connection | str, name: str, input_name: str, capacity: int, **kind: bool
+    ) -> Subscription:
+        if not self._is_clock(input_name):
+            return Subscription(key, name, input_name, capacity, **kind)
+        subscription = ClockSubscription(key, name, input_name, capacity, **kind)
+        subscription.sim_clock = self.sim_clock
+        return subscription
+
+    def _is_clock(self, input_name: str) -> bool:
+        return self._node.clock is not None and self._node.clock.name == input_name
 
 
 def undeclared(kind: str, name: str, known: Iterable[str], node: Node) -> str:
     """The message for a port that a node does not have."""
     has = ", ".join(sorted(known)) or "none"
     return f"node '{node.name}' declares no {kind} '{name}' (it has {has})"
-
-
-def _subscription(connection: Connection) -> Subscription:
-    return Subscription(
-        connection,
-        str(connection),
-        connection.destination_input,
-        connection.queue_size,
-        is_lossless=connection.discard_limit == 0,
-        is_acknowledged=connection.is_reliable,
-    )

@@ -136,6 +136,22 @@ class NodeHandle:
         """The node as its file declares it."""
         return self._file.node
 
+    @property
+    def sim_time(self) -> float | None:
+        """Simulated seconds as far as this node knows: of its simulator, or else of its clock.
+
+        The clock is the input of type ``rosgraph_msgs/msg/Clock``; its time is that of the packet
+        which a hook of the node started on last. ``None`` before the first one, and without it.
+        """
+        return self._services.time.known_s
+
+    def now(self) -> Any:
+        """A stamp, ``builtin_interfaces/msg/Time``: simulated time, or else wall time.
+
+        It is simulated where the node has a simulator or a clock, and 0 before that is known.
+        """
+        return self._services.time.stamp()
+
     def make_packet(self, output: str | None = None) -> Any:
         """A new message of the type of an output, with default values.
 

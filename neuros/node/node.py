@@ -13,6 +13,7 @@ from typing import Any
 from neuros.control import Finalising, FirstHook, Message, Shutdown
 from neuros.engine.engine import Engine
 from neuros.engine.node_ports import PacketType
+from neuros.engine.sim_clock import with_clocks
 from neuros.errors import NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
@@ -163,7 +164,7 @@ class NodeRuntime:
         self._transport.open(self)
         self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
         node = self.file.node
-        self.specs = load_plugin(node.plugin, self.name, node.module)
+        self.specs = with_clocks(node, load_plugin(node.plugin, self.name, node.module))
         types = {port.name: self._packet_type(port) for port in node.outputs}
         specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
         self.engine = self._services.engine = self._make_engine(
@@ -171,6 +172,7 @@ class NodeRuntime:
         )
         if self._is_held:
             self.engine.pause()
+        self._time.clock = self.engine.sim_clock
         self.reports.open(self.engine, self._logger)
 
     def start(self) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
+from neuros.engine.sim_clock import SimClock
 from neuros.node.instruments import Tap
 from neuros.ports import Way
-from neuros.project.model import Node
+from neuros.project.model import CLOCK_TYPE, Node
+from neuros.time import to_seconds, to_stamp
 
-CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _FINE_S = 60.0
 _FINE_INTERVAL_S = 0.1
 
@@ -26,6 +28,7 @@ class SimulatedTime:
     Attributes:
         is_watched: whether the node owns time, so that :meth:`look` is wanted after each hook.
         expected_end_s: when the plugin says that it will end the project, ``None``: not known.
+        clock: that of the node's engine, which tells the time of other nodes.
     """
 
     def __init__(
@@ -43,11 +46,28 @@ class SimulatedTime:
         self._on_over = on_over
         self._timeline = Timeline()
         self._read_s: Callable[[], float] | None = None
+        self._has_clock = node.clock is not None
+        self.clock = SimClock()
 
     @property
     def now_s(self) -> float | None:
-        """Simulated seconds, ``None`` where they are unknown."""
+        """Simulated seconds of what the node owns, ``None`` where they are unknown."""
         return None if self._read_s is None else self._read_s()
+
+    @property
+    def known_s(self) -> float | None:
+        """Simulated seconds as far as the node knows: of what it owns, or else of its clock."""
+        if self._read_s is not None:
+            return self._read_s()
+        return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
+
+    def stamp(self) -> Any:
+        """A stamp of now: simulated where the node owns time or has a clock, else wall time."""
+        if self._read_s is not None:
+            return to_stamp(self._read_s())
+        if self._has_clock or self.is_watched:
+            return to_stamp(nanoseconds=self.clock.now_ns or 0)
+        return to_stamp(nanoseconds=time.time_ns())
 
     def own(self, read_s: Callable[[], float]) -> None:
         """Take it from a simulator, rather than from a clock that the node publishes."""
@@ -62,7 +82,7 @@ class SimulatedTime:
     def _hear(self, packet: Any, _: bytes | None) -> None:
         if self._is_owned:
             return
-        seconds = packet.clock.sec + packet.clock.nanosec * 1e-9
+        seconds = to_seconds(packet)
         self._read_s = lambda: seconds
         if self.is_watched:
             self.look()

@@ -428,6 +428,13 @@ def _misfits(
     hook: DeclaredHook, node: Node, connections: Sequence[Connection] | None
 ) -> Iterator[Remark]:
     """The ports of a hook that its node does not have, and those that nothing is connected to."""
+    if hook.sim_tick is not None:
+        text, hint = node.no_clock
+        if node.clock is not None:
+            text = f"ticks by '{node.clock.name}', but nothing is connected to that input"
+            hint = "connect the project's clock to it"
+        if node.clock is None or not _is_fed(node, node.clock.name, connections):
+            yield Remark(*hook.sim_tick, f"hook '{hook.name}': {text}", hint)
     for side, declared, known, others in (
         ("input", hook.inputs, node.inputs, node.outputs),
         ("output", hook.outputs, node.outputs, node.inputs),

@@ -21,6 +21,7 @@ Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, .
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,26 @@ class Node:
     def owns_time(self) -> bool:
         """Whether the node has a simulator, or publishes a clock."""
         return any(port.mujoco for port in (*self.inputs, *self.outputs)) or any(
-            port.type == "rosgraph_msgs/msg/Clock" for port in self.outputs
+            port.type == CLOCK_TYPE for port in self.outputs
         )
+
+    @property
+    def clock(self) -> Port | None:
+        """The input that brings simulated time: that of type Clock; of several, ``clock``."""
+        clocks = [port for port in self.inputs if port.type == CLOCK_TYPE]
+        if len(clocks) > 1:
+            clocks = [port for port in clocks if port.name == "clock"]
+        return clocks[0] if clocks else None
+
+    @property
+    def no_clock(self) -> tuple[str, str]:
+        """What is wrong where a hook needs a clock and the node has none, and what to do."""
+        clocks = [port.name for port in self.inputs if port.type == CLOCK_TYPE]
+        has = "several inputs" if clocks else "no input"
+        text = f"ticks by simulated time, but node '{self.name}' has {has} of type {CLOCK_TYPE}"
+        if clocks:
+            return text, "name the one to go by 'clock'"
+        return text, "give it one, and connect the project's clock to it"
 
 
 @dataclass(frozen=True)

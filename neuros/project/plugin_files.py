@@ -13,7 +13,7 @@ import re
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +26,7 @@ _MOST_BYTES = 4 << 20
 _HOOKS = "neuros.hooks"
 _ARGUMENTS = {
     "neuros_initialise": ("inputs", "outputs"),
-    "neuros_tick": ("seconds", "inputs", "outputs"),
+    "neuros_tick": ("seconds", "inputs", "outputs", "sim_seconds"),
     "neuros_function": ("inputs", "outputs"),
     "neuros_finalise": (),
 }
@@ -71,11 +71,15 @@ class DeclaredPort:
 
 @dataclass(frozen=True)
 class DeclaredHook:
-    """A hook that the plugin has in any case; its ports are ``None`` where they are computed."""
+    """A hook that the plugin has in any case; its ports are ``None`` where they are computed.
+
+    ``sim_tick``: line and column of the period, if it ticks by simulated time.
+    """
 
     name: str
     inputs: tuple[DeclaredPort, ...] | None
     outputs: tuple[DeclaredPort, ...] | None
+    sim_tick: tuple[int, int] | None = None
 
 
 @dataclass
@@ -326,27 +330,38 @@ class _Reader:
                 given[keyword.arg] = keyword.value
         if not is_known:
             return unknown
-        if kind == "neuros_tick":
-            self._check_seconds(function, decorator, given.get("seconds"))
-        inputs = self._ports(function, given.get("inputs"), "input")
+        is_right = kind == "neuros_tick" and self._check_period(function, decorator, given)
+        period = given.get("sim_seconds") if is_right else None
         return DeclaredHook(
-            function.name, inputs, self._ports(function, given.get("outputs"), "output")
+            function.name,
+            self._ports(function, given.get("inputs"), "input"),
+            self._ports(function, given.get("outputs"), "output"),
+            None if period is None else (period.lineno, period.col_offset + 1),
         )
 
-    def _check_seconds(
-        self, function: _Function, decorator: ast.expr, seconds: ast.expr | None
-    ) -> None:
-        if seconds is None:
-            self._fail(function, decorator, "@neuros_tick needs seconds", "seconds=0.02")
-            return
+    def _check_period(
+        self, function: _Function, decorator: ast.expr, given: Mapping[str, ast.expr]
+    ) -> bool:
+        """Report what is wrong with the period of a tick; returns whether nothing is."""
+        nothing = (name for name, each in given.items() if ast.unparse(each) == "None")
+        periods = sorted({"seconds", "sim_seconds"} & (given.keys() - {*nothing}))
+        if len(periods) != 1:
+            text = "@neuros_tick needs seconds or sim_seconds, and not both"
+            self._fail(function, decorator, text, "seconds=0.02")
+            return False
+        (name,) = periods
+        seconds = given[name]
         try:
             value = ast.literal_eval(seconds)
         except (TypeError, ValueError):
-            return
+            return True
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self._fail(function, seconds, f"seconds={value!r} is not a number")
+            self._fail(function, seconds, f"{name}={value!r} is not a number")
         elif not (math.isfinite(value) and value > 0):
-            self._fail(function, seconds, f"seconds={value!r} is not a positive time")
+            self._fail(function, seconds, f"{name}={value!r} is not a positive time")
+        else:
+            return True
+        return False
 
     def _ports(
         self, function: _Function, written: ast.expr | None, side: str

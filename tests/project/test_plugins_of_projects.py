@@ -96,6 +96,18 @@ def doubts(check: Check, text: str, overrides: Sequence[str] = ()) -> list[str]:
         ),
         ("@neuros_tick()\ndef f(node): pass", "brain.py:2:2: hook 'f': @neuros_tick needs seconds"),
         (
+            "@neuros_tick(0.1, sim_seconds=0.1)\ndef f(node): pass",
+            "brain.py:2:2: hook 'f': @neuros_tick needs seconds or sim_seconds, and not both",
+        ),
+        (
+            "@neuros_tick(sim_seconds=0)\ndef f(node): pass",
+            "brain.py:2:26: hook 'f': sim_seconds=0 is not a positive time",
+        ),
+        (
+            "@neuros_tick(sim_seconds=0.1)\ndef f(node): pass",
+            "brain.py:2:26: hook 'f': ticks by simulated time, but node 'brain' has no input of ty",
+        ),
+        (
             "@neuros_tick(seconds=-0.1)\ndef f(node): pass",
             "brain.py:2:22: hook 'f': seconds=-0.1 is not a positive time",
         ),

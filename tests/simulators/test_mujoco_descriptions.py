@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from simulated_node import SimulatedNode
+from std_msgs.msg import String
 
 from neuros.errors import ModelError
 from neuros.simulators.mujoco import MuJoCo
@@ -118,6 +119,15 @@ def test_a_wrong_drive_is_named_by_its_key(tmp_path: Path, drive, problem: str) 
     with pytest.raises(ModelError) as caught:
         simulated(tmp_path, "arm.urdf", URDF, drive)
     assert problem in str(caught.value)
+
+
+def test_joints_are_driven_by_a_message_that_the_plugin_reads(tmp_path: Path) -> None:
+    sim, _ = simulated(tmp_path, "arm.urdf", URDF, type_="std_msgs/msg/String")
+    sim.actuate("shoulder", 1.5)
+    sim.step_synchronous(10)
+    assert sim.data.qvel[0] > 0.5
+    with pytest.raises(ModelError, match=r"a String is no command by itself: .*'shoulder'"):
+        sim.command("turn", String(data="left"))
 
 
 def test_a_joint_that_has_an_actuator_is_not_driven_twice(tmp_path: Path) -> None:

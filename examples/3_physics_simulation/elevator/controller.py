@@ -3,6 +3,7 @@
 import os
 
 from neuros.hooks import neuros_function, neuros_initialise
+from neuros.time import to_seconds
 
 LEVEL_HEIGHTS_M = (0.0, 3.0, 6.0, 9.0)
 CLOSE_M, SLOW_M_PER_S = 0.02, 0.02
@@ -19,8 +20,7 @@ def start(node):
 def control(node, cabin):
     tour = node.get_user_data()
     if has_arrived(cabin, LEVEL_HEIGHTS_M[tour[0]]):
-        time_s = cabin.header.stamp.sec + cabin.header.stamp.nanosec * 1e-9
-        node.get_logger().info(f"level {tour[0]} after {time_s:.2f} s")
+        node.get_logger().info(f"level {tour[0]} after {to_seconds(cabin):.2f} s")
         if len(tour) == 1:
             node.shutdown("the tour is over")
         else:

@@ -6,6 +6,7 @@ from homing import Homing, Phase
 
 from neuros.hooks import Optional, neuros_function, neuros_initialise
 from neuros.snn import derive_seed
+from neuros.time import to_seconds
 
 PERIOD_S = 0.02
 
@@ -26,8 +27,7 @@ def act(node, estimate, touch):
     before = homing.phase
     ahead_m_s, yaw_rad_s = homing.step(estimate.vector.z, touch.data, PERIOD_S)
     if homing.phase is not before:
-        stamp = estimate.header.stamp
-        node.get_logger().info(f"{homing.phase.value}, {stamp.sec + stamp.nanosec * 1e-9:.2f} s")
+        node.get_logger().info(f"{homing.phase.value}, {to_seconds(estimate):.2f} s")
     if homing.phase is Phase.DONE:
         node.set_result("walls_met", homing.walls_met)
         node.shutdown("stood at the remembered heading")

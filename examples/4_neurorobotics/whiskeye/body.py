@@ -33,9 +33,7 @@ def act(node, commands):
 
 def senses(node, sim):
     message = node.make_packet("senses")
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(
-        round(sim.sim_time * 1e9), 10**9
-    )
+    message.header.stamp = node.now()
     message.header.frame_id = "body"
     for index in range(sim.model.njnt):
         is_slide = sim.model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE

@@ -7,6 +7,7 @@ from head_direction import HeadDirectionNetwork
 from snn import GyroIntegrator
 
 from neuros.hooks import Optional, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 
 LOOK_AHEAD_RAD = math.pi / 2  # of the gimbal: the two cameras of the head look forward and up
 RATE_RAD_S = float(os.environ.get("RATE", "1.0"))
@@ -30,12 +31,11 @@ def think(node, senses):
 
 
 def estimate(node, senses):
-    stamp = senses.imu.header.stamp
-    stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+    stamp_ns = to_nanoseconds(senses.imu)
     if stamp_ns == 0:  # the first message: the gyroscope has not fired yet
         return None
     packet = node.make_packet("estimate")
-    packet.header.stamp = stamp
+    packet.header.stamp = senses.imu.header.stamp
     packet.header.frame_id = "world"
     packet.vector.z = node.get_user_data().integrate(stamp_ns, senses.imu.angular_velocity.z)
     return packet

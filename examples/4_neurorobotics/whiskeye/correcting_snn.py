@@ -6,7 +6,8 @@ import os
 from typing import Any
 
 from correction import GATE, CorrectedIntegrator
-from views import stamp_ns
+
+from neuros.time import to_nanoseconds
 
 
 def start_integrator(node: Any) -> None:
@@ -27,8 +28,8 @@ def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any]:
     integrator = node.get_user_data()
     if odom_correction is not None:
         seen = odom_correction.vector
-        integrator.vision.see(stamp_ns(odom_correction), seen.z, seen.x, seen.y)
-    headings_rad = integrator.integrate(stamp_ns(imu), imu.angular_velocity.z)
+        integrator.vision.see(to_nanoseconds(odom_correction), seen.z, seen.x, seen.y)
+    headings_rad = integrator.integrate(to_nanoseconds(imu), imu.angular_velocity.z)
     packets = node.make_packet("estimate"), node.make_packet("uncorrected")
     for packet, heading_rad in zip(packets, headings_rad, strict=True):
         packet.header.stamp, packet.header.frame_id = imu.header.stamp, "world"

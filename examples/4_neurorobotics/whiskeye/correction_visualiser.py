@@ -10,9 +10,9 @@ import math
 from dataclasses import asdict
 
 from heading_error import compare, heading_error, yaw_of
-from views import stamp_ns
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds, to_seconds
 from neuros.visualise import VisualiseImages, VisualiseLines, VisualiseRotations
 
 COLOURS = {"uncorrected": "C0", "vision": "C2", "corrected": "C3"}
@@ -37,7 +37,7 @@ class Headings:
         self.views.add_image(PREDICTED)
 
     def keep(self, name, packet):
-        stamp, heading_rad = stamp_ns(packet), packet.vector.z
+        stamp, heading_rad = to_nanoseconds(packet), packet.vector.z
         if not math.isnan(heading_rad):  # of vision, where there was no picture
             self.told[name][stamp] = heading_rad
             self.angles.plot(NAMES[name], heading_rad, stamp * 1e-9)
@@ -51,7 +51,7 @@ def start(node):
 # One hook per series: none waits for another.
 @neuros_function(inputs="truth")
 def show_truth(node, pose):
-    headings, q, stamp = node.get_user_data(), pose.pose.orientation, stamp_ns(pose)
+    headings, q, stamp = node.get_user_data(), pose.pose.orientation, to_nanoseconds(pose)
     headings.truths[stamp] = yaw_of(q.x, q.y, q.z, q.w)
     headings.angles.plot(TRUTH, q, stamp * 1e-9)
 
@@ -73,12 +73,12 @@ def show_corrected(node, estimate):
 
 @neuros_function(inputs="prediction_error")
 def show_prediction_error(node, error):
-    node.get_user_data().surprise.plot(SURPRISE, error.vector.x, stamp_ns(error) * 1e-9)
+    node.get_user_data().surprise.plot(SURPRISE, error.vector.x, to_seconds(error))
 
 
 @neuros_function(inputs="predicted_view")
 def show_predicted_view(node, view):
-    node.get_user_data().views.plot(PREDICTED, view, stamp_ns(view) * 1e-9)
+    node.get_user_data().views.plot(PREDICTED, view, to_seconds(view))
 
 
 @neuros_finalise()

@@ -8,9 +8,9 @@ import csv
 import math
 
 from heading_error import yaw_of
-from views import stamp_ns
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds, to_seconds
 from neuros.visualise import VisualiseLines, VisualiseRotations
 
 TRUTH, ESTIMATE, REMEMBERED = "true", "estimate", "remembered"
@@ -46,7 +46,7 @@ def start(node):
 
 @neuros_function(inputs=["truth", "touch"])
 def show_truth(node, pose, touch):
-    homing, stamp = node.get_user_data(), stamp_ns(pose)
+    homing, stamp = node.get_user_data(), to_nanoseconds(pose)
     q, place, half = pose.pose.orientation, pose.pose.position, len(touch.data) // 2
     sides_n = sum(touch.data[:half]), sum(touch.data[half:])
     homing.rows.append((stamp, place.x, place.y, yaw_of(q.x, q.y, q.z, q.w), *sides_n))
@@ -59,13 +59,13 @@ def show_truth(node, pose, touch):
 
 @neuros_function(inputs="estimate")
 def show_estimate(node, estimate):
-    angle_rad, time_s = estimate.vector.z, stamp_ns(estimate) * 1e-9
+    angle_rad, time_s = estimate.vector.z, to_seconds(estimate)
     node.get_user_data().headings.plot(ESTIMATE, angle_rad, time_s)
 
 
 @neuros_function(inputs="remembered")
 def keep(node, remembered):
-    node.get_user_data().remembered = stamp_ns(remembered), remembered.vector.z
+    node.get_user_data().remembered = to_nanoseconds(remembered), remembered.vector.z
 
 
 @neuros_finalise()

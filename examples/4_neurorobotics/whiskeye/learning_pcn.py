@@ -14,9 +14,10 @@ import os
 
 import numpy as np
 from pcn import Predictor
-from views import code_of, heading_of, stamp_ns, view_of
+from views import code_of, heading_of, view_of
 
 from neuros.hooks import Optional, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 
 RATES = (1e-3, 2e-4)  # of learning, first and last epoch: what it knows is not thrown away
 TESTED_EVERY = 4
@@ -84,12 +85,12 @@ def start(node):
 )
 def look(node, left, right, heading):
     learner = node.get_user_data()
-    if learner.name(stamp_ns(heading), heading.vector.z):
+    if learner.name(to_nanoseconds(heading), heading.vector.z):
         before, after = learner.learn()
         report(node, learner, before, after)
     packets = learner.predictor.packets(node, left, right)
     if left.height and packets[0].vector.x > float(os.environ.get("GATE", "0.12")):
-        learner.keep(stamp_ns(left), view_of(left, right))
+        learner.keep(to_nanoseconds(left), view_of(left, right))
     return packets
 
 

@@ -9,6 +9,7 @@ import math
 from heading_error import compare, heading_error, yaw_of
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 from neuros.visualise import VisualiseLines, VisualiseRotations
 
 TRUTH, ESTIMATE, ERROR = "true heading", "estimate of the network", "error"
@@ -34,7 +35,7 @@ def start(node):
 @neuros_function(inputs="truth")
 def show_truth(node, pose):
     headings = node.get_user_data()
-    q, stamp = pose.pose.orientation, stamp_ns(pose)
+    q, stamp = pose.pose.orientation, to_nanoseconds(pose)
     headings.truths[stamp] = yaw_of(q.x, q.y, q.z, q.w)
     headings.angles.plot(TRUTH, q, stamp * 1e-9)
 
@@ -42,7 +43,7 @@ def show_truth(node, pose):
 @neuros_function(inputs="estimate")
 def show_estimate(node, estimate):
     headings = node.get_user_data()
-    stamp = stamp_ns(estimate)
+    stamp = to_nanoseconds(estimate)
     headings.estimates[stamp] = estimate.vector.z
     headings.angles.plot(ESTIMATE, estimate.vector.z, stamp * 1e-9)
 
@@ -60,8 +61,3 @@ def report(node):
     for name in ("samples", "rms_deg", "max_deg", "gain", "drift_deg_s"):
         node.set_result(name, getattr(error, name))
     node.get_logger().info(f"head-direction error: {error}; picture: {headings.angles.file}")
-
-
-def stamp_ns(packet):
-    """The stamp of a packet, in nanoseconds of simulated time."""
-    return packet.header.stamp.sec * 1_000_000_000 + packet.header.stamp.nanosec

@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 from predictive_coding import PredictiveCodingNetwork
-from views import heading_of, picture_of, stamp_ns, view_of
+from views import heading_of, picture_of, view_of
 
 from neuros.errors import NodeError
 from neuros.hooks import Optional, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 
 HOW = (
     "train it with training.json, and name its file: "
@@ -39,7 +40,7 @@ class Eyes:
         """All pairs that are complete now, oldest first."""
         complete = []
         for eye, picture in enumerate((left, right)):
-            stamp = stamp_ns(picture)
+            stamp = to_nanoseconds(picture)
             other = self._waiting.pop(stamp, None)
             if other is None:
                 self._waiting[stamp] = (eye, picture)

@@ -6,6 +6,7 @@ import os
 from head_direction import HeadDirectionNetwork
 
 from neuros.hooks import neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 
 WINDOW_NS = 20_000_000
 
@@ -51,12 +52,9 @@ def start(node):
 
 @neuros_function(inputs="imu", outputs="estimate")
 def integrate(node, imu):
-    stamp = imu.header.stamp
-    heading_rad = node.get_user_data().integrate(
-        stamp.sec * 1_000_000_000 + stamp.nanosec, imu.angular_velocity.z
-    )
+    heading_rad = node.get_user_data().integrate(to_nanoseconds(imu), imu.angular_velocity.z)
     estimate = node.make_packet("estimate")
-    estimate.header.stamp = stamp
+    estimate.header.stamp = imu.header.stamp
     estimate.header.frame_id = "world"
     estimate.vector.z = heading_rad
     return estimate

@@ -51,11 +51,6 @@ def heading_of(code: Floats) -> float:
     return _READ.of_rates(np.maximum(code, 0.0) ** 4).angle_rad
 
 
-def stamp_ns(packet: Any) -> int:
-    """The stamp of a packet, in nanoseconds of simulated time."""
-    return packet.header.stamp.sec * 1_000_000_000 + packet.header.stamp.nanosec
-
-
 def _averaged(*images: Any) -> NDArray[np.float64]:
     """Mean colours of blocks of pixels, 16 x 12 of each image, one after the other."""
     small = []

@@ -13,6 +13,7 @@ from heading_error import heading_error, yaw_of
 from heading_plot import HeadingPlot
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+from neuros.time import to_nanoseconds
 
 
 class Headings:
@@ -39,7 +40,7 @@ def start(node):
 @neuros_function(inputs="estimate")
 def keep_estimate(node, estimate):
     headings = node.get_user_data()
-    headings.estimates[stamp_ns(estimate)] = estimate.vector.z
+    headings.estimates[to_nanoseconds(estimate)] = estimate.vector.z
     headings.redraw_if_due()
 
 
@@ -47,7 +48,7 @@ def keep_estimate(node, estimate):
 def keep_truth(node, pose):
     headings = node.get_user_data()
     q = pose.pose.orientation
-    headings.truths[stamp_ns(pose)] = yaw_of(q.x, q.y, q.z, q.w)
+    headings.truths[to_nanoseconds(pose)] = yaw_of(q.x, q.y, q.z, q.w)
     headings.redraw_if_due()
 
 
@@ -75,8 +76,3 @@ def write_csv(path, estimates, truths):
         for stamp in sorted({*estimates, *truths}):
             pair = (series.get(stamp) for series in (estimates, truths))
             rows.writerow([stamp, *("" if value is None else repr(value) for value in pair)])
-
-
-def stamp_ns(packet):
-    """The stamp of a packet, in nanoseconds of simulated time."""
-    return packet.header.stamp.sec * 1_000_000_000 + packet.header.stamp.nanosec

@@ -112,6 +112,30 @@ class Cameras:
 
     def render(self, data: Any, camera: int, image: npt.NDArray[np.uint8]) -> None:
         """Fill ``image`` with what a camera sees: RGB, shape (height, width, 3), top row first."""
+        height, width, _ = image.shape
+        held, area = self._draw(data, camera, width, height)
+        pixels = self._pixels.get(image.shape)
+        if pixels is None:
+            pixels = self._pixels[image.shape] = np.empty(image.shape, np.uint8)
+        mujoco.mjr_readPixels(pixels, None, area, held.context)
+        image[:] = pixels[::-1]  # OpenGL counts rows from the bottom
+
+    def depth(self, data: Any, camera: int, width: int, height: int) -> npt.NDArray[np.float32]:
+        """Metres along the optical axis, shape (height, width), top row first.
+
+        ``inf`` where nothing is in front of the model's far plane, ``-inf`` at its near plane.
+        """
+        held, area = self._draw(data, camera, width, height)
+        read = np.empty((height, width), np.float32)
+        mujoco.mjr_readPixels(None, read, area, held.context)
+        eye = held.scene.camera[0]
+        near, far = float(eye.frustum_near), float(eye.frustum_far)
+        # Depth is 1 at the near plane and 0 at the far one, and linear in 1 / distance.
+        inverse = read[::-1].astype(np.float64) * (1 / near - 1 / far) + 1 / far
+        found = np.where(read[::-1] > 0, 1 / inverse, np.inf)
+        return np.where(read[::-1] < 1, found, -np.inf).astype(np.float32)
+
+    def _draw(self, data: Any, camera: int, width: int, height: int) -> tuple[_Resources, Any]:
         if self._resources is not None and self._resources.model is not self._model:
             self.close()
         if self._resources is None:
@@ -122,14 +146,9 @@ class Cameras:
         held.camera.fixedcamid = camera
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, held.option, None, held.camera, every, held.scene)
-        height, width, _ = image.shape
         area = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(area, held.scene, held.context)
-        pixels = self._pixels.get(image.shape)
-        if pixels is None:
-            pixels = self._pixels[image.shape] = np.empty(image.shape, np.uint8)
-        mujoco.mjr_readPixels(pixels, None, area, held.context)
-        image[:] = pixels[::-1]  # OpenGL counts rows from the bottom
+        return held, area
 
     def close(self) -> None:
         """Free the OpenGL context; the next image makes a new one."""
@@ -146,6 +165,7 @@ class Cameras:
             gl = make_context(buffer.offwidth, buffer.offheight)
             gl.make_current()
             context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
         scene = mujoco.MjvScene(self._model, maxgeom=_MAX_GEOMS)
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._fine

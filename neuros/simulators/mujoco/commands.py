@@ -98,8 +98,9 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
         return None
     drive = _read_drive(port.mujoco, faults) if drives else None
     if port.type not in _MESSAGE_TYPES:
-        text = f"input '{port.name}' is a {port.type}; a command is {either(tuple(_MESSAGE_TYPES))}"
-        faults.add(key, text)
+        if drive is None:  # with one, the plugin may read the message, and drive joint by joint
+            known = either(tuple(_MESSAGE_TYPES))
+            faults.add(key, f"input '{port.name}' is a {port.type}; a command is {known}")
     elif (sizes := _MESSAGE_TYPES[port.type][1]) and len(names) not in sizes:
         some = either([str(size) for size in sizes])
         faults.add(key, f"a {port.type} drives {some} actuators, not {len(names)}")
@@ -174,7 +175,7 @@ def bind_commands(
             if find(model, (sort,), name, declared.pointer, problems)
         ]
         found = [find(model, ("actuator",), name, declared.pointer, problems) for name in known]
-        read, _ = _MESSAGE_TYPES[declared.type]
+        read, _ = _MESSAGE_TYPES.get(declared.type, (_refuse, ()))
         command = read(model, [actuator for _, actuator in filter(None, found)], declared.input)
         commands[declared.input] = _checked(declared.input, command)
     return commands
@@ -198,6 +199,19 @@ def _checked(where: str, command: Command) -> Command:
         return controls
 
     return run
+
+
+def _refuse(model: Any, actuators: list[int], where: str) -> Command:
+    """For a message of the user's own: its plugin reads it, and drives the joints itself."""
+    names = [names_of(model, "actuator")[index] for index in actuators]
+
+    def read(packet: Packet) -> Controls:
+        raise ModelError(
+            f"input '{where}': a {type(packet).__name__} is no command by itself: drive its joints"
+            f" one by one, as by actuate('{names[0]}', value)"
+        )
+
+    return read
 
 
 def _float(model: Any, actuators: list[int], where: str) -> Command:

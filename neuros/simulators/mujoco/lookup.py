@@ -16,6 +16,7 @@ _SORTS = {
     "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
     "camera": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
     "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
 }
 

@@ -16,7 +16,7 @@ import json
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,132 +31,24 @@ from neuros.simulators.mujoco.lookup import (
     Problems,
     did_you_mean,
     either,
-    find,
     is_list_of_names,
     names_of,
 )
-
-Vector: TypeAlias = "list[float]"
-"""3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
-
-_WORLD_FRAME = "world"
-
-
-@dataclass(frozen=True)
-class SensorDeclaration:
-    """A sensor behind an output. ``pointer`` is the place of its ``mujoco`` key in the file."""
-
-    output: str
-    type: str
-    kind: str
-    elements: tuple[str, ...]
-    rate_hz: float
-    pointer: str
-    width: int = 640
-    height: int = 480
-
-
-class Sensor:
-    """A sensor behind an output, bound to a model; one subclass for each kind.
-
-    The first line of a subclass's docstring describes it in the schema.
-
-    Attributes:
-        kind: what ``"sensor"`` in a node file says.
-        types: the message types that it can fill.
-        list_types: those of them that take a list of elements.
-        sorts: the sorts of elements it measures, empty for none; the first that has the name wins.
-        is_optional: whether the element may be left out.
-        keys: further keys of its declaration, in pixels.
-        declared: the declaration.
-        elements: sort and id of each element that it names.
-    """
-
-    kind: ClassVar[str]
-    types: ClassVar[tuple[str, ...]]
-    list_types: ClassVar[tuple[str, ...]] = ()
-    sorts: ClassVar[tuple[str, ...]] = ()
-    is_optional: ClassVar[bool] = False
-    keys: ClassVar[tuple[str, ...]] = ()
-
-    def __init__(
-        self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
-    ) -> None:
-        self.declared, self.model, self.cameras = declared, model, cameras
-        pointer = f"{declared.pointer}/element"
-        found = [find(model, self.sorts, name, pointer, problems) for name in declared.elements]
-        self.elements = [element for element in found if element]
-        if len(self.elements) == len(found):
-            self.bind(problems)
-
-    def bind(self, problems: Problems) -> None:
-        """Prepare to measure the elements, once; what is wrong with them is reported."""
-
-    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        """Fill a message from the data right after ``mj_forward``."""
-        raise NotImplementedError
-
-
-def _set_time(time: Any, time_ns: int) -> None:
-    """Set a ``builtin_interfaces/Time``."""
-    time.sec, time.nanosec = divmod(time_ns, 1_000_000_000)
-
-
-def _set_header(header: Any, time_ns: int, frame: str) -> None:
-    _set_time(header.stamp, time_ns)
-    header.frame_id = frame
-
-
-def _set_vector(vector: Any, values: Vector) -> None:
-    vector.x, vector.y, vector.z = values
-
-
-def _set_quaternion(quaternion: Any, values: Vector) -> None:
-    """ROS writes the real part last, MuJoCo first."""
-    quaternion.w, quaternion.x, quaternion.y, quaternion.z = values
-
-
-class _Place:
-    """The frame of a site, or of a body (its own frame, not the one of its inertia)."""
-
-    def __init__(self, model: Any, sort: str, index: int) -> None:
-        self._model, self._is_site, self.index = model, sort == "site", index
-        objects = mujoco.mjtObj
-        self.object = (objects.mjOBJ_SITE if self._is_site else objects.mjOBJ_XBODY).value
-        self._spatial, self._turned = np.zeros(6), np.zeros(4)
-        if self._is_site:
-            self._body = int(model.site_bodyid[index])
-            self._in_body = model.site_quat[index]
-
-    def position(self, data: Any) -> Vector:
-        """In the world, metres."""
-        positions = data.site_xpos if self._is_site else data.xpos
-        return _listed(positions[self.index])
-
-    def orientation(self, data: Any) -> Vector:
-        """In the world, a unit quaternion."""
-        if not self._is_site:
-            return _listed(data.xquat[self.index])
-        mujoco.mju_mulQuat(self._turned, data.xquat[self._body], self._in_body)
-        return _listed(self._turned)
-
-    def angular_velocity(self, data: Any) -> Vector:
-        """In the frame of the place, rad/s: a gyroscope."""
-        mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
-        return _listed(self._spatial[:3])
-
-    def acceleration(self, data: Any) -> Vector:
-        """In the frame of the place, m/s^2, gravity included: an accelerometer."""
-        # mj_forward leaves the accelerations out unless a sensor of the model needs them.
-        if not getattr(data, "flg_rnepost", False):
-            mujoco.mj_rnePostConstraint(self._model, data)
-        mujoco.mj_objectAcceleration(self._model, data, self.object, self.index, self._spatial, 1)
-        return _listed(self._spatial[3:])
-
-
-def _listed(values: Any) -> Vector:
-    numbers: Vector = values.tolist()
-    return numbers
+from neuros.simulators.mujoco.ranging import CameraInfo, Depth, Lidar
+from neuros.simulators.mujoco.readings import Reading, Transforms
+from neuros.simulators.mujoco.sensor_base import (
+    PICTURE,
+    WORLD_FRAME,
+    Place,
+    Sensor,
+    SensorDeclaration,
+    Vector,
+    listed,
+    set_header,
+    set_quaternion,
+    set_vector,
+)
+from neuros.time import to_stamp
 
 
 @dataclass(frozen=True)
@@ -168,10 +60,10 @@ class _OwnSensor:
     variance: float
 
     def read(self, data: Any) -> Vector:
-        return _listed(data.sensordata[self.start : self.end])
+        return listed(data.sensordata[self.start : self.end])
 
 
-def _own_sensor(model: Any, sensor_type: Any, place: _Place) -> _OwnSensor | None:
+def _own_sensor(model: Any, sensor_type: Any, place: Place) -> _OwnSensor | None:
     """The model's first sensor of a type at a place that is measured in the world's frame."""
     for index in range(model.nsensor):
         if (
@@ -238,7 +130,7 @@ class Imu(Sensor):
     sorts = ("site", "body")
 
     def bind(self, problems: Problems) -> None:
-        self._place = place = _Place(self.model, *self.elements[0])
+        self._place = place = Place(self.model, *self.elements[0])
         kinds = mujoco.mjtSensor
         self._gyro = _own_sensor(self.model, kinds.mjSENS_GYRO, place)
         self._accelerometer = _own_sensor(self.model, kinds.mjSENS_ACCELEROMETER, place)
@@ -247,13 +139,13 @@ class Imu(Sensor):
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         place, gyro, accelerometer = self._place, self._gyro, self._accelerometer
         orientation = self._orientation
-        _set_header(packet.header, time_ns, self.declared.elements[0])
+        set_header(packet.header, time_ns, self.declared.elements[0])
         velocity = gyro.read(data) if gyro else place.angular_velocity(data)
         acceleration = accelerometer.read(data) if accelerometer else place.acceleration(data)
         attitude = orientation.read(data) if orientation else place.orientation(data)
-        _set_vector(packet.angular_velocity, velocity)
-        _set_vector(packet.linear_acceleration, acceleration)
-        _set_quaternion(packet.orientation, attitude)
+        set_vector(packet.angular_velocity, velocity)
+        set_vector(packet.linear_acceleration, acceleration)
+        set_quaternion(packet.orientation, attitude)
         if gyro:
             packet.angular_velocity_covariance[::4] = gyro.variance
         if accelerometer:
@@ -270,15 +162,15 @@ class Pose(Sensor):
     sorts = ("site", "body")
 
     def bind(self, problems: Problems) -> None:
-        self._place = _Place(self.model, *self.elements[0])
+        self._place = Place(self.model, *self.elements[0])
         self._is_stamped = self.declared.type.endswith("Stamped")
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         if self._is_stamped:
-            _set_header(packet.header, time_ns, _WORLD_FRAME)
+            set_header(packet.header, time_ns, WORLD_FRAME)
         pose = packet.pose if self._is_stamped else packet
-        _set_vector(pose.position, self._place.position(data))
-        _set_quaternion(pose.orientation, self._place.orientation(data))
+        set_vector(pose.position, self._place.position(data))
+        set_quaternion(pose.orientation, self._place.orientation(data))
 
 
 class JointStates(Sensor):
@@ -308,7 +200,7 @@ class JointStates(Sensor):
         self._speeds = self.model.jnt_dofadr[joints]
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        _set_time(packet.header.stamp, time_ns)
+        packet.header.stamp = to_stamp(nanoseconds=time_ns)
         packet.name = list(self._names)
         packet.position = array("d", data.qpos[self._positions].tobytes())
         packet.velocity = array("d", data.qvel[self._speeds].tobytes())
@@ -355,10 +247,10 @@ class Contacts(Sensor):
             case "std_msgs/msg/Float64MultiArray":
                 packet.data = [each.normal_force(data) for each in self._touches]
             case "geometry_msgs/msg/WrenchStamped":
-                _set_header(packet.header, time_ns, _WORLD_FRAME)
+                set_header(packet.header, time_ns, WORLD_FRAME)
                 force, torque = touch.wrench(data)
-                _set_vector(packet.wrench.force, force.tolist())
-                _set_vector(packet.wrench.torque, torque.tolist())
+                set_vector(packet.wrench.force, force.tolist())
+                set_vector(packet.wrench.torque, torque.tolist())
 
 
 class Camera(Sensor):
@@ -367,11 +259,12 @@ class Camera(Sensor):
     kind = "camera"
     types = ("sensor_msgs/msg/Image",)
     sorts = ("camera",)
-    keys = ("width", "height")
+    keys = PICTURE
+    is_rendered = True
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         width, height = self.declared.width, self.declared.height
-        _set_header(packet.header, time_ns, self.declared.elements[0])
+        set_header(packet.header, time_ns, self.declared.elements[0])
         packet.width, packet.height, packet.step = width, height, 3 * width
         packet.encoding = "rgb8"
         # rclpy checks lists and bytes element by element; an array is taken unchanged.
@@ -388,11 +281,15 @@ class Clock(Sensor):
     types = ("rosgraph_msgs/msg/Clock",)
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        _set_time(packet.clock, time_ns)
+        packet.clock = to_stamp(nanoseconds=time_ns)
 
 
 SENSORS: Mapping[str, type[Sensor]] = {
-    sensor.kind: sensor for sensor in (Imu, Pose, JointStates, Contacts, Camera, Clock)
+    sensor.kind: sensor
+    for sensor in (
+        *(Imu, Pose, JointStates, Contacts, Reading, Lidar, Depth, CameraInfo, Transforms),
+        *(Camera, Clock),
+    )
 }
 
 
@@ -424,14 +321,14 @@ def _declaration(port: Port, pointer: str, problems: Problems) -> SensorDeclarat
     rate: Any = port.mujoco.get("rate")
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < float("inf"):
         faults.add("rate", f"{rate!r} is not a positive number (firings per simulated second)")
-    pixels = {key: port.mujoco[key] for key in sensor.keys if key in port.mujoco}
-    for key, value in pixels.items():
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16384:
-            faults.add(key, f"{value!r} is not a number of pixels from 1 to 16384")
+    options = {key: port.mujoco.get(key, sensor.keys[key].default) for key in sensor.keys}
+    for key, value in options.items():
+        if not sensor.keys[key].holds(value):
+            faults.add(key, f"{value!r} is not {sensor.keys[key].what}")
     if faults.found:
         return None
     return SensorDeclaration(
-        port.name, port.type, sensor.kind, elements, float(rate), pointer, **pixels
+        port.name, port.type, sensor.kind, elements, float(rate), pointer, options
     )
 
 

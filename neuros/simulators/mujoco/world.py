@@ -18,12 +18,8 @@ from neuros.simulators.convert.urdf import read_urdf
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.lookup import Problems, has_any, names_of
-from neuros.simulators.mujoco.sensors import (
-    Sensor,
-    SensorDeclaration,
-    bind_sensors,
-    read_sensors,
-)
+from neuros.simulators.mujoco.sensor_base import Sensor, SensorDeclaration
+from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
@@ -86,7 +82,7 @@ class World:
         self.schedule = self._make_schedule(problems)
         self._bound = self._bind(self.model, problems)
         problems.raise_any()
-        if any(sensor.kind == "camera" for sensor in self._sensors):
+        if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # what is missing is said now, and not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
@@ -310,7 +306,7 @@ def _compile_spec(spec: Any, where: str) -> Any:
 
 def _prepare_rendering(spec: Any, sensors: Iterable[SensorDeclaration], *, fine: bool) -> None:
     """Make the off-screen buffer large enough for every camera, and cheap unless ``fine``."""
-    cameras = [sensor for sensor in sensors if sensor.kind == "camera"]
+    cameras = [sensor for sensor in sensors if SENSORS[sensor.kind].is_rendered]
     buffer = spec.visual.global_
     for camera in cameras:
         buffer.offwidth = max(buffer.offwidth, camera.width)

@@ -1,0 +1,202 @@
+"""Readings of the sensors that a model declares itself, and transforms of its elements."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from neuros.ports import Packet
+from neuros.simulators.mujoco.lookup import Problems, names_of
+from neuros.simulators.mujoco.sensor_base import (
+    WORLD_FRAME,
+    Sensor,
+    Vector,
+    listed,
+    set_header,
+    set_quaternion,
+    set_vector,
+)
+
+_OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
+"""From the axes of MuJoCo's cameras (y up, looking along -z) to those of REP 103 (y down, z)."""
+_FLOATS = "std_msgs/msg/Float64MultiArray"
+# Measured at a site, along its axes.
+_LOCAL = {"accelerometer", "velocimeter", "gyro", "force", "torque", "magnetometer", "rangefinder"}
+_INFRARED = 1
+
+
+class _Form(NamedTuple):
+    """How a message takes a reading.
+
+    Attributes:
+        numbers: how many it holds.
+        put: fills it.
+        kinds: MuJoCo's kinds of sensors that it is for; empty: any with so many numbers.
+    """
+
+    numbers: int
+    put: Callable[[Packet, Vector, Reading], object]
+    kinds: tuple[str, ...] = ()
+
+
+def _put_wrench(packet: Packet, values: Vector, sensor: Reading) -> None:
+    set_vector(getattr(packet.wrench, sensor.kinds[0]), values)
+
+
+def _put_field(packet: Packet, values: Vector, sensor: Reading) -> None:
+    set_vector(packet.magnetic_field, values)
+    packet.magnetic_field_covariance[::4] = sensor.noise**2
+
+
+def _put_range(packet: Packet, values: Vector, sensor: Reading) -> None:
+    packet.radiation_type = _INFRARED
+    packet.max_range = sensor.cutoff or float("inf")
+    # MuJoCo's -1 is "nothing there": +inf in REP 117.
+    packet.range = values[0] if values[0] >= 0 else float("inf")
+
+
+_FORMS: Mapping[str, _Form] = {
+    "std_msgs/msg/Float64": _Form(1, lambda p, v, _: setattr(p, "data", v[0])),
+    "sensor_msgs/msg/Range": _Form(1, _put_range, ("rangefinder",)),
+    "geometry_msgs/msg/Vector3": _Form(3, lambda p, v, _: set_vector(p, v)),
+    "geometry_msgs/msg/Vector3Stamped": _Form(3, lambda p, v, _: set_vector(p.vector, v)),
+    "geometry_msgs/msg/PointStamped": _Form(
+        3, lambda p, v, _: set_vector(p.point, v), ("framepos", "subtreecom")
+    ),
+    "geometry_msgs/msg/WrenchStamped": _Form(3, _put_wrench, ("force", "torque")),
+    "sensor_msgs/msg/MagneticField": _Form(3, _put_field, ("magnetometer",)),
+    "geometry_msgs/msg/Quaternion": _Form(4, lambda p, v, _: set_quaternion(p, v)),
+    "geometry_msgs/msg/QuaternionStamped": _Form(
+        4, lambda p, v, _: set_quaternion(p.quaternion, v)
+    ),
+}
+
+
+class Reading(Sensor):
+    """The reading of a sensor of the model (MJCF's sensor); a list of them: all their numbers.
+
+    Units and axes are MuJoCo's, along those of the site for ``gyro`` and the like. ``force`` and
+    ``torque`` fill their half of a WrenchStamped: what a child does to its parent. Any sensor fits
+    into a Float64MultiArray, as MuJoCo has it. No noise is added.
+
+    Attributes:
+        kinds: MuJoCo's kind of each sensor, ``"gyro"``.
+        noise, cutoff: of the first.
+    """
+
+    kind = "reading"
+    types = (_FLOATS, *_FORMS)
+    list_types = (_FLOATS,)
+    sorts = ("sensor",)
+
+    def bind(self, problems: Problems) -> None:
+        model, indices = self.model, [index for _, index in self.elements]
+        self._places = [
+            slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
+            for i in indices
+        ]
+        self.kinds = [
+            mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_").lower()
+            for i in indices
+        ]
+        self.noise = float(model.sensor_noise[indices[0]])
+        self.cutoff = float(model.sensor_cutoff[indices[0]])
+        self._frame = self._frame_of(indices[0])
+        self._form = _FORMS.get(self.declared.type)
+        count = int(model.sensor_dim[indices[0]])
+        fitting = [name for name, form in _FORMS.items() if self._fits(form, count)]
+        if self._form is not None and self.declared.type not in fitting:
+            numbers = "1 number" if count == 1 else f"{count} numbers"
+            problems.add(
+                f"{self.declared.pointer}/element",
+                f"the {self.kinds[0]} '{self.declared.elements[0]}' measures {numbers}, which fill"
+                f" {' or '.join([*fitting, _FLOATS])}, but output '{self.declared.output}' is a"
+                f" {self.declared.type}",
+            )
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        if self._form is None:
+            values = np.concatenate([data.sensordata[place] for place in self._places])
+            packet.data = array("d", values.tobytes())
+            return
+        if hasattr(packet, "header"):
+            set_header(packet.header, time_ns, self._frame)
+        self._form.put(packet, listed(data.sensordata[self._places[0]]), self)
+
+    def _fits(self, form: _Form, count: int) -> bool:
+        return form.numbers == count and (not form.kinds or self.kinds[0] in form.kinds)
+
+    def _frame_of(self, index: int) -> str:
+        """The frame whose axes the reading is along; empty where it has none."""
+        model, kind = self.model, self.kinds[0]
+        if kind in _LOCAL:
+            sort, element = model.sensor_objtype[index], model.sensor_objid[index]
+        elif not kind.startswith(("frame", "subtree")):
+            return ""
+        elif model.sensor_refid[index] < 0:
+            return WORLD_FRAME
+        else:
+            sort, element = model.sensor_reftype[index], model.sensor_refid[index]
+        return mujoco.mj_id2name(model, int(sort), int(element)) or ""
+
+
+class Transforms(Sensor):
+    """Transforms of bodies, sites and cameras, for /tf; of all named bodies if none is given.
+
+    The parent of each is the nearest body above it that is among them, else ``world``. A camera's
+    frame is the optical one of REP 103, as its pictures have it: z forward, x right, y down.
+    """
+
+    kind = "tf"
+    types = list_types = ("tf2_msgs/msg/TFMessage",)
+    sorts = ("body", "site", "camera")
+    is_optional = True
+
+    def bind(self, problems: Problems) -> None:
+        model, bodies = self.model, names_of(self.model, "body")
+        elements = self.elements or [("body", i) for i, name in enumerate(bodies) if i and name]
+        self._elements = elements
+        self._names = list(self.declared.elements) or [bodies[index] for _, index in elements]
+        places = {index: place for place, (sort, index) in enumerate(elements) if sort == "body"}
+        self._parents: list[int | None] = []
+        for sort, index in elements:
+            above = index if sort == "body" else -1
+            body = {"site": model.site_bodyid, "camera": model.cam_bodyid}.get(sort)
+            body = int(model.body_parentid[index] if body is None else body[index])
+            while body and (body not in places or body == above):
+                body = int(model.body_parentid[body])
+            self._parents.append(places.get(body) if body else None)
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        from geometry_msgs.msg import TransformStamped
+
+        poses = [self._pose(data, sort, index) for sort, index in self._elements]
+        for name, parent, (position, turned) in zip(self._names, self._parents, poses, strict=True):
+            stamped = TransformStamped(child_frame_id=name)
+            frame = WORLD_FRAME if parent is None else self._names[parent]
+            set_header(stamped.header, time_ns, frame)
+            if parent is not None:
+                at, back = np.zeros(3), np.zeros(4)
+                mujoco.mju_negPose(at, back, *poses[parent])
+                moved, rotated = np.zeros(3), np.zeros(4)
+                mujoco.mju_mulPose(moved, rotated, at, back, position, turned)
+                position, turned = moved, rotated
+            set_vector(stamped.transform.translation, listed(position))
+            set_quaternion(stamped.transform.rotation, listed(turned))
+            packet.transforms.append(stamped)
+
+    def _pose(self, data: Any, sort: str, index: int) -> tuple[Any, Any]:
+        if sort == "body":
+            return data.xpos[index], data.xquat[index]
+        turned = np.zeros(4)
+        if sort == "site":
+            mujoco.mju_mat2Quat(turned, data.site_xmat[index])
+            return data.site_xpos[index], turned
+        optical = np.zeros(4)
+        mujoco.mju_mat2Quat(turned, data.cam_xmat[index])
+        mujoco.mju_mulQuat(optical, turned, _OPTICAL)
+        return data.cam_xpos[index], optical

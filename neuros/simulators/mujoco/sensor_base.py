@@ -1,0 +1,174 @@
+"""What sensors of MuJoCo have in common: declaration, base class, frames, parts of messages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, TypeAlias
+
+import mujoco
+import numpy as np
+
+from neuros.ports import Packet
+from neuros.simulators.mujoco.cameras import Cameras
+from neuros.simulators.mujoco.lookup import Problems, find
+from neuros.time import to_stamp
+
+Vector: TypeAlias = "list[float]"
+"""3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
+
+WORLD_FRAME = "world"
+
+
+class Key(NamedTuple):
+    """A key of a declaration that holds a number.
+
+    Attributes:
+        default: its value where it is left out.
+        what: what it must be, for messages.
+    """
+
+    default: float
+    what: str
+    is_whole: bool = False
+    least: float = -math.inf
+    most: float = math.inf
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value is right."""
+        kinds = int if self.is_whole else (int, float)
+        is_number = isinstance(value, kinds) and not isinstance(value, bool)
+        return is_number and math.isfinite(value) and self.least <= value <= self.most
+
+
+def pixels(default: int) -> Key:
+    """The key of a width or height."""
+    return Key(default, "a number of pixels from 1 to 16384", is_whole=True, least=1, most=16384)
+
+
+PICTURE: Mapping[str, Key] = MappingProxyType({"width": pixels(640), "height": pixels(480)})
+
+
+@dataclass(frozen=True)
+class SensorDeclaration:
+    """A sensor behind an output. ``pointer`` is the place of its ``mujoco`` key in the file."""
+
+    output: str
+    type: str
+    kind: str
+    elements: tuple[str, ...]
+    rate_hz: float
+    pointer: str
+    options: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def width(self) -> int:
+        """Pixels per row, of a camera."""
+        return int(self.options["width"])
+
+    @property
+    def height(self) -> int:
+        """Rows of pixels."""
+        return int(self.options["height"])
+
+
+class Sensor:
+    """A sensor behind an output, bound to a model; one subclass for each kind.
+
+    The first line of a subclass's docstring describes it in the schema.
+
+    Attributes:
+        kind: what ``"sensor"`` in a node file says.
+        types: the message types that it can fill.
+        list_types: those of them that take a list of elements.
+        sorts: the sorts of elements it measures, empty for none; the first that has the name wins.
+        is_optional: whether the element may be left out.
+        keys: further keys of its declaration.
+        is_rendered: whether it takes pictures.
+        declared: the declaration.
+        elements: sort and id of each element that it names.
+    """
+
+    kind: ClassVar[str]
+    types: ClassVar[tuple[str, ...]]
+    list_types: ClassVar[tuple[str, ...]] = ()
+    sorts: ClassVar[tuple[str, ...]] = ()
+    is_optional: ClassVar[bool] = False
+    keys: ClassVar[Mapping[str, Key]] = MappingProxyType({})
+    is_rendered: ClassVar[bool] = False
+
+    def __init__(
+        self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
+    ) -> None:
+        self.declared, self.model, self.cameras = declared, model, cameras
+        pointer = f"{declared.pointer}/element"
+        found = [find(model, self.sorts, name, pointer, problems) for name in declared.elements]
+        self.elements = [element for element in found if element]
+        if len(self.elements) == len(found):
+            self.bind(problems)
+
+    def bind(self, problems: Problems) -> None:
+        """Prepare to measure the elements, once; what is wrong with them is reported."""
+
+    def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
+        """Fill a message from the data right after ``mj_forward``."""
+        raise NotImplementedError
+
+
+def set_header(header: Any, time_ns: int, frame: str) -> None:
+    header.stamp = to_stamp(nanoseconds=time_ns)
+    header.frame_id = frame
+
+
+def set_vector(vector: Any, values: Vector) -> None:
+    vector.x, vector.y, vector.z = values
+
+
+def set_quaternion(quaternion: Any, values: Vector) -> None:
+    """ROS writes the real part last, MuJoCo first."""
+    quaternion.w, quaternion.x, quaternion.y, quaternion.z = values
+
+
+class Place:
+    """The frame of a site, or of a body (its own frame, not the one of its inertia)."""
+
+    def __init__(self, model: Any, sort: str, index: int) -> None:
+        self._model, self._is_site, self.index = model, sort == "site", index
+        objects = mujoco.mjtObj
+        self.object = (objects.mjOBJ_SITE if self._is_site else objects.mjOBJ_XBODY).value
+        self._spatial, self._turned = np.zeros(6), np.zeros(4)
+        if self._is_site:
+            self._body = int(model.site_bodyid[index])
+            self._in_body = model.site_quat[index]
+
+    def position(self, data: Any) -> Vector:
+        """In the world, metres."""
+        positions = data.site_xpos if self._is_site else data.xpos
+        return listed(positions[self.index])
+
+    def orientation(self, data: Any) -> Vector:
+        """In the world, a unit quaternion."""
+        if not self._is_site:
+            return listed(data.xquat[self.index])
+        mujoco.mju_mulQuat(self._turned, data.xquat[self._body], self._in_body)
+        return listed(self._turned)
+
+    def angular_velocity(self, data: Any) -> Vector:
+        """In the frame of the place, rad/s: a gyroscope."""
+        mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
+        return listed(self._spatial[:3])
+
+    def acceleration(self, data: Any) -> Vector:
+        """In the frame of the place, m/s^2, gravity included: an accelerometer."""
+        # mj_forward leaves the accelerations out unless a sensor of the model needs them.
+        if not getattr(data, "flg_rnepost", False):
+            mujoco.mj_rnePostConstraint(self._model, data)
+        mujoco.mj_objectAcceleration(self._model, data, self.object, self.index, self._spatial, 1)
+        return listed(self._spatial[3:])
+
+
+def listed(values: Any) -> Vector:
+    numbers: Vector = values.tolist()
+    return numbers
