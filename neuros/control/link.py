@@ -29,7 +29,7 @@ class ControlLink:
         self.stream = stream
         self.peer = peer
         self._accepted = {kind_of(each): each for each in accepted}
-        self._rest = b""
+        self._parts: list[bytes] = []  # of a line whose end has not arrived
 
     def fileno(self) -> int:
         """For selectors."""
@@ -69,7 +69,12 @@ class ControlLink:
             return None
         if not data:
             return None
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        end = data.rfind(b"\n")
+        if end < 0:
+            self._parts.append(data)
+            return []
+        lines = b"".join([*self._parts, data[:end]]).split(b"\n")
+        self._parts = [data[end + 1 :]]
         return lines
 
     def decode(self, line: bytes) -> Message:

@@ -90,16 +90,17 @@ class NodeRuntime:
         self.failures = Failures(self.name, file.node.plugin, self._logger, fail)
         self._guard = self.failures.guard
         self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
+        sampler = Sampler()
         self._services = PluginServices(
             middleware.packets,
             middleware.loop,
             self._time,
             self.failures,
             lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
+            lambda look: setattr(sampler, "look_at_world", look),
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
-        sampler = Sampler()
         instruments: list[Instrument] = [self._time, sampler]
         if recorder is not None:
             self._recorder = NodeRecorder(
