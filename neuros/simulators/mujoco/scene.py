@@ -160,7 +160,8 @@ def geometry(model: Any) -> dict[str, Any]:
     """What is drawn of a model, ready for JSON; lengths in metres, quaternions as w, x, y, z.
 
     ``bodies`` have the pose of the initial state; ``moving`` are those with a row in each frame, in
-    its order, before ``moving_cameras``. Geoms, sites, lights and cameras are relative to their
+    its order, before ``moving_cameras``; ``roots`` are those of them on which the others hang,
+    bodies with joints first. Geoms, sites, lights and cameras are relative to their
     body. Geoms of groups that MuJoCo's viewer hides, skins, flexes and tendons are left out.
     """
     data = mujoco.MjData(model)
@@ -173,6 +174,10 @@ def geometry(model: Any) -> dict[str, Any]:
             for body in range(model.nbody)
         ],
         "moving": moving.bodies,
+        "roots": sorted(
+            (body for body in moving.bodies if model.body_parentid[body] not in moving.bodies),
+            key=lambda body: model.body_mocapid[body] >= 0,
+        ),
         "moving_cameras": moving.cameras,
         "geoms": list(_geoms(model, meshes)),
         "sites": list(_sites(model)),

@@ -5,6 +5,7 @@ const SEGMENTS = 24;
 const POSE = 7; // x, y, z; w, x, y, z of the quaternion
 const CONTACT = 6; // point and normal
 const MOST_CONTACTS = 500;
+const MOST_STEP_BACK = 8;
 const [SPOT, DIRECTIONAL] = [0, 1];
 // MuJoCo adds up colours as they are, without a gamma; Three.js divides what falls on them by pi.
 const LIGHT = Math.PI;
@@ -37,7 +38,10 @@ export class Scene {
     this.geometry = geometry;
     this.isDirty = true;
     this.root = new THREE.Scene();
-    this.renderer = new THREE.WebGLRenderer({antialias: true});
+    // Smooth edges are dear where there is no graphics card.
+    const hasCard = document.createElement("canvas")
+      .getContext("webgl2", {failIfMajorPerformanceCaveat: true}) !== null;
+    this.renderer = new THREE.WebGLRenderer({antialias: hasCard});
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.bodies = geometry.bodies.map((body) => placed(new THREE.Group(), body));
     this.root.add(...this.bodies);
@@ -74,12 +78,23 @@ export class Scene {
     this.resize();
   }
 
-  get cameraNames() { return this.geometry.cameras.map((camera) => camera.name); }
+  // What one may look with, by name: the free camera, the same along with a body, the model's own.
+  get views() {
+    const {roots, bodies, cameras} = this.geometry;
+    return new Map([
+      ...roots.map((body) => [`follow ${bodies[body].name || `body ${body}`}`, {body}]),
+      ["free camera", {}],
+      ...cameras.map((camera, number) => [`camera ${camera.name}`, {camera: number}]),
+    ]);
+  }
 
-  // Look through a camera of the model, or with -1 through the free one.
-  look(number) {
-    this.camera = this.cameras[number] ?? this.free;
+  // Look with one of the views.
+  look({body, camera}) {
+    this.camera = this.cameras[camera] ?? this.free;
     this.controls.enabled = this.camera === this.free;
+    this.followed = this.bodies[body];
+    if (this.followed && !this.hasMoved) this.move(this.followed.position, this.controls.target);
+    this.before = this.followed?.position.clone();
     this.resize();
   }
 
@@ -87,6 +102,26 @@ export class Scene {
   lookAs(other) {
     this.free.position.copy(other.free.position);
     this.controls.target.copy(other.controls.target);
+    this.hasMoved = true;
+    this.controls.update();
+  }
+
+  // Move the free camera and what it looks at.
+  move(to, from) {
+    const way = to.clone().sub(from);
+    this.free.position.add(way);
+    this.controls.target.add(way);
+    this.controls.update();
+  }
+
+  // Step back until all that moves by itself is in view, unless it is far away.
+  fit() {
+    const {extent} = this.geometry.view;
+    const {target} = this.controls;
+    const far = Math.max(...this.geometry.roots.map(
+      (body) => this.bodies[body].position.distanceTo(target)));
+    const factor = Math.max(1, Math.min(far / extent, MOST_STEP_BACK));
+    this.free.position.sub(target).multiplyScalar(factor).add(target);
     this.controls.update();
   }
 
@@ -110,6 +145,12 @@ export class Scene {
       to.set(second[at + 4], second[at + 5], second[at + 6], second[at + 3]);
       object.quaternion.slerpQuaternions(from, to, share);
     });
+    if (this.followed) {
+      this.move(this.followed.position, this.before);
+      this.before.copy(this.followed.position);
+    }
+    if (!this.hasMoved) this.fit();
+    this.hasMoved = true;
     this.isDirty = true;
   }
 
@@ -278,12 +319,12 @@ function shapeOf({shape, size: [a, b, c]}, view) {
   }[shape]();
 }
 
-// A 2-D texture lies on the x-y plane: so many times per object, or per metre.
+// A 2-D texture lies on the x-y plane: so many times per object, or per two metres.
 function mapped(geometry, {texture, repeat, size, shape, is_uniform: isUniform}) {
   if (texture === undefined || (shape === "mesh" && geometry.attributes.uv)) return geometry;
   const {position} = geometry.attributes;
   const uv = new Float32Array(2 * position.count);
-  const per = (axis) => repeat[axis] / (isUniform || !size[axis] ? 1 : 2 * size[axis]);
+  const per = (axis) => repeat[axis] / (isUniform || !size[axis] ? 2 : 2 * size[axis]);
   for (let place = 0; place < position.count; place += 1) {
     uv[2 * place] = position.getX(place) * per(0) + 0.5;
     uv[2 * place + 1] = -position.getY(place) * per(1) - 0.5;

@@ -7,7 +7,6 @@ import {want, WORLD} from "./wants.js";
 const LIBRARY = "static/vendor/three.iife.min.js";
 const FRAME_MS = 1000 / 31; // of a screen with 60 Hz, every second frame
 const FRESH_MS = 1000;
-const FREE = -1;
 
 export class Worlds {
   constructor() {
@@ -20,7 +19,8 @@ export class Worlds {
     this.shown.addEventListener("change", () => this.switch());
     this.contacts.addEventListener("change", () => this.switch());
     this.sites.addEventListener("change", () => this.scene?.showSites(this.sites.checked));
-    this.camera.addEventListener("change", () => this.scene?.look(Number(this.camera.value)));
+    this.camera.addEventListener("change",
+      () => this.scene?.look(this.scene.views.get(this.camera.value)));
     this.node.addEventListener("change", () => {
       this.camera.replaceChildren();
       this.load();
@@ -87,10 +87,9 @@ export class Worlds {
       this.fault.textContent = "";
       scene.showSites(this.sites.checked);
       const chosen = this.camera.value;
-      this.camera.replaceChildren(element("option", {value: FREE}, "free camera"),
-        ...scene.cameraNames.map((each, number) => element("option", {value: number}, each)));
-      if (chosen) this.camera.value = chosen;
-      scene.look(Number(this.camera.value));
+      this.camera.replaceChildren(...[...scene.views.keys()].map((each) => new Option(each)));
+      if (scene.views.has(chosen)) this.camera.value = chosen;
+      scene.look(scene.views.get(this.camera.value));
     } catch (error) {
       this.fault.textContent = error.message;
       this.version = this.versions.get(name); // until there is another one
