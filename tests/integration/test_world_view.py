@@ -1,0 +1,87 @@
+"""The 3-D view of the dashboard, in a real browser: what is looked at are drawn pixels."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from launching import start
+from PIL import Image
+from viewers.dashboard.browser import DEADLINE_MS, browser_page
+from viewers.dashboard.visitor import Visitor, address
+
+PROJECT = Path(__file__).with_name("turning")
+IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 2"
+
+
+def picture(page: Any) -> Any:
+    """The pixels of the view: rows, columns, and red, green and blue as signed numbers."""
+    png = page.locator("#world canvas").screenshot()
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def where(pixels: Any, colour: int) -> Any:
+    """Rows and columns of the pixels in which this channel is by far the strongest."""
+    others = np.delete(pixels, colour, axis=2).max(axis=2)
+    return np.argwhere(pixels[:, :, colour] > others + 60)
+
+
+def wait_until(condition: Callable[[], Any]) -> None:
+    give_up_s = time.monotonic() + DEADLINE_MS / 1000
+    while not condition():
+        assert time.monotonic() < give_up_s, "deadline passed"
+
+
+def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
+    in_process = ("--dashboard", "--backend", "in-process")
+    with start(PROJECT, *in_process, cwd=tmp_path) as running, browser_page(500, 700) as page:
+        url = address(running)
+        visitor = Visitor(url)
+        assert visitor.get("/world/robot", "") == 403
+        assert visitor.get("/world/nobody") == 404
+        page.goto(url)
+        page.wait_for_function(IS_DRAWN)
+
+        # The model's own camera looks down on a red arm, which turns about a green ball.
+        page.select_option("#world-camera", "camera above")
+        wait_until(lambda: len(where(picture(page), 1)) > 50)
+        ball = where(picture(page), 1).mean(axis=0)
+        assert ball == pytest.approx(
+            np.array(picture(page).shape[:2]) / 2, abs=15
+        )  # the arm covers a part
+        sides: set[bool] = set()
+
+        def has_been_left_and_right() -> bool:
+            arm = where(picture(page), 0)
+            if len(arm) > 50:
+                sides.add(bool(arm[:, 1].mean() > ball[1]))
+            return len(sides) == 2
+
+        wait_until(has_been_left_and_right)
+
+        # It stands still with the run.
+        page.click("#pause")
+        page.wait_for_selector("#phase.paused")
+        wait_until(lambda: np.array_equal(picture(page), picture(page)))
+        still = picture(page)
+
+        # The user turns the free camera with the mouse, also then.
+        page.select_option("#world-camera", "follow arm")
+        wait_until(lambda: not np.array_equal(picture(page), still))
+        before = picture(page)
+        page.locator("#world canvas").drag_to(
+            page.locator("#world canvas"),
+            source_position={"x": 150, "y": 200},
+            target_position={"x": 350, "y": 250},
+        )
+        wait_until(lambda: not np.array_equal(picture(page), before))
+        assert len(where(picture(page), 0)) > 50
+
+        assert visitor.post("/do/stop") == 204
+        page.wait_for_selector("#phase.ended")
+        assert running.finish().exit_code == 0
