@@ -100,8 +100,10 @@ def encode(message: Message) -> bytes:
     """A message as one line."""
     content = {"kind": kind_of(type(message)), **vars(message)}
     text = json.dumps(content, ensure_ascii=False, default=_plain)
-    # What is no character cannot be written anywhere: both ends see its escape in its place.
-    return _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text).encode() + b"\n"
+    if not text.isascii():
+        # What is no character cannot be written anywhere: both ends see its escape in its place.
+        text = _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text)
+    return text.encode() + b"\n"
 
 
 def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Message:

@@ -15,7 +15,10 @@ from PIL import Image
 from viewers.dashboard.browser import DEADLINE_MS, browser_page
 from viewers.dashboard.visitor import Visitor, address
 
+from neuros.cli.main import main
+
 PROJECT = Path(__file__).with_name("turning")
+OPTIONS = ("--dashboard", "--record", "--backend", "in-process")
 IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 2"
 
 
@@ -38,8 +41,10 @@ def wait_until(condition: Callable[[], Any]) -> None:
 
 
 def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
-    in_process = ("--dashboard", "--backend", "in-process")
-    with start(PROJECT, *in_process, cwd=tmp_path) as running, browser_page(500, 700) as page:
+    with (
+        start(PROJECT, *OPTIONS, cwd=tmp_path) as running,
+        browser_page(500, 700) as page,
+    ):
         url = address(running)
         visitor = Visitor(url)
         assert visitor.get("/world/robot", "") == 403
@@ -84,4 +89,19 @@ def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
 
         assert visitor.post("/do/stop") == 204
         page.wait_for_selector("#phase.ended")
-        assert running.finish().exit_code == 0
+        finished = running.finish()
+        assert finished.exit_code == 0
+
+        # The recorded run is one file, which needs no server.
+        assert main(["report", str(finished.run_folder)]) == 0
+        page.goto(f"file://{finished.run_folder}/report/world_robot.html")
+        page.wait_for_function(IS_DRAWN.replace("> 2", "> 0"))
+        page.select_option("#camera", "camera above")
+        wait_until(lambda: len(where(picture(page), 0)) > 50)
+        begin = picture(page)
+        page.locator("#time").evaluate(
+            "(slider) => { slider.value = 0.3; slider.dispatchEvent(new Event('input')); }"
+        )
+        wait_until(lambda: np.abs(picture(page) - begin).max() > 60)
+        page.click("#play")
+        page.wait_for_function("() => Number(document.querySelector('#time').value) > 0.35")
