@@ -120,8 +120,9 @@ export class Scene {
     const {target} = this.controls;
     const far = Math.max(...this.geometry.roots.map(
       (body) => this.bodies[body].position.distanceTo(target)));
-    const factor = Math.max(1, Math.min(far / extent, MOST_STEP_BACK));
-    this.free.position.sub(target).multiplyScalar(factor).add(target);
+    const distance = 1.5 * Math.min(far, MOST_STEP_BACK * extent);
+    const way = this.free.position.clone().sub(target);
+    this.free.position.copy(target).add(way.setLength(Math.max(distance, way.length())));
     this.controls.update();
   }
 
