@@ -49,7 +49,11 @@ export class Worlds {
     if (name !== this.source) return;
     if (frames) this.player.add(frames);
     const isFresh = performance.now() - this.loadedMs < FRESH_MS;
-    if (this.isOn && version !== this.version && !isFresh) this.load();
+    if (this.isOn && this.isStale && !isFresh) this.load();
+  }
+
+  get isStale() {
+    return this.name !== this.source || this.version !== this.versions.get(this.source);
   }
 
   get isOn() { return this.shown.checked && this.isInView; }
@@ -64,8 +68,9 @@ export class Worlds {
       });
     }
     if (!this.isOn) return;
-    if (this.version !== this.versions.get(this.source)) this.load();
-    requestAnimationFrame(this.tick);
+    if (this.isStale) this.load();
+    if (!this.isTicking) requestAnimationFrame(this.tick);
+    this.isTicking = true;
   }
 
   // The geometry of the chosen node, whenever there is another one.
@@ -92,7 +97,7 @@ export class Worlds {
       scene.look(scene.views.get(this.camera.value));
     } catch (error) {
       this.fault.textContent = error.message;
-      this.version = this.versions.get(name); // until there is another one
+      [this.name, this.version] = [name, this.versions.get(name)]; // until there is another one
     }
     this.isLoading = false;
     this.loadedMs = performance.now();
@@ -100,6 +105,7 @@ export class Worlds {
   }
 
   tick(nowMs) {
+    this.isTicking = this.isOn;
     if (!this.isOn) return;
     requestAnimationFrame(this.tick);
     if (!this.scene || nowMs - (this.drawnMs ?? 0) < FRAME_MS) return;
