@@ -1,4 +1,4 @@
-"""Reads a dashboard as its page does: the stream of events, and two fields that are plotted."""
+"""Reads a dashboard as its page does: the stream of events, fields that are plotted, worlds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from typing import Any
 from urllib.parse import urljoin
 from urllib.request import HTTPCookieProcessor, OpenerDirector, build_opener
 
+from neuros.control import WORLD
+
 _TIMEOUT_S = 30.0
 
 Plotted = dict[str, dict[str, list[str]]]
-"""By node and output, the fields."""
+"""By node and output, the fields; for the output ``#world`` the node's world in 3-D."""
 
 
 class Viewer:
@@ -41,7 +43,9 @@ class Viewer:
 
     def _want(self, browser: OpenerDirector, page: str) -> None:
         wanted = {
-            node: {port: {"fields": fields} for port, fields in ports.items()}
+            node: {
+                port: {"fields": fields, "frames": port == WORLD} for port, fields in ports.items()
+            }
             for node, ports in self._plotted.items()
         }
         body = json.dumps({"page": page, "wanted": wanted}).encode()

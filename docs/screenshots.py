@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import sync_playwright
+from tutorial_files import files_of, steps
 
 from neuros.viewers.web import await_server
 
@@ -75,6 +76,30 @@ def shoot_dashboard(page: Any) -> None:
         page.screenshot(path=FIGURES / "dashboard.png")
 
 
+def shoot_world(page: Any) -> None:
+    """The vehicle of the tutorial, and WhiskEye, in 3-D."""
+    with tempfile.TemporaryDirectory() as folder:
+        for step in steps():
+            for name, text in files_of(step).items():
+                Path(folder, name).parent.mkdir(exist_ok=True)
+                Path(folder, name).write_text(text, "utf-8")
+        world_of(page, Path(folder, "vehicle"), FIGURES / "world_view.png", 3)
+    world_of(page, WHISKEYE, FIGURES / "world_view_whiskeye.jpg", 1, *LONG)
+
+
+def world_of(page: Any, project: Path, file: Path, sim_s: float, *arguments: str) -> None:
+    """The 3-D view of a project, after so many simulated seconds."""
+    with page_of(project, "dashboard", "--dashboard", *arguments) as url:
+        page.goto(url)
+        page.wait_for_function(
+            "(sim_s) => document.querySelector('#world').dataset.drawn > 3 &&"
+            " Number(document.querySelector('#times').textContent.split(' ')[1]) > sim_s",
+            arg=sim_s,
+            timeout=DEADLINE_MS,
+        )
+        page.locator("#world-section").screenshot(path=file)
+
+
 def shoot_rerun(page: Any) -> None:
     """WhiskEye as ``--visualisations`` shows it where there is no RViz."""
     with page_of(WHISKEYE, "visualisations", "-z", *LONG) as url:
@@ -92,6 +117,7 @@ def main() -> None:
         )
         page = browser.new_page(viewport={"width": 1300, "height": 1000})
         shoot_dashboard(page)
+        shoot_world(page)
         shoot_rerun(page)
         browser.close()
 

@@ -256,6 +256,10 @@ class TransportKind(ABC):
         """
 
 
+WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
+"""Shows a simulated world to an observer, for JSON, from any thread: what it wants, its number."""
+
+
 class NodeContext(Protocol):
     """The ``node`` that hooks receive, as far as simulators need it."""
 
@@ -282,6 +286,9 @@ class NodeContext(Protocol):
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
+
+    def show_world(self, look: WorldLook) -> None:
+        """Let observers look at a simulated world; see :mod:`neuros.simulators.mujoco.scene`."""
 
     def submit(self, packets: Mapping[str, Packet], cancelled: Callable[[], bool]) -> bool:
         """Send from another thread, as if a hook with those outputs had returned them.

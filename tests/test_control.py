@@ -25,7 +25,7 @@ from neuros.control import (
     Probed,
     Report,
 )
-from neuros.control.link import decode, encode, kind_of
+from neuros.control.link import ControlLink, decode, encode, kind_of
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
@@ -79,6 +79,26 @@ def test_a_message_comes_out_as_it_went_in(message: Message) -> None:
     assert line.endswith(b"\n")
     assert line.count(b"\n") == 1
     assert decode(line, ACCEPTED, "node 'a'") == message
+
+
+class Pieces:
+    """A stream that gives bytes piece by piece."""
+
+    def __init__(self, *pieces: bytes) -> None:
+        self._pieces = list(pieces)
+
+    def recv(self, size: int) -> bytes:
+        return self._pieces.pop(0)
+
+
+def test_messages_come_out_wherever_the_stream_was_cut() -> None:
+    stop, long = encode(control.Stop()), encode(control.Say("x" * 10_000))
+    data = stop + long + stop + long
+    for size in (1, 7, 4096, len(stop), len(data)):
+        pieces = [data[begin : begin + size] for begin in range(0, len(data), size)]
+        link = ControlLink(Pieces(*pieces), control.TO_NODES, "it")  # type: ignore[arg-type]
+        found = [message for _ in pieces for message in link.receive() or ()]
+        assert found == [control.Stop(), control.Say("x" * 10_000)] * 2
 
 
 def test_half_a_character_arrives_as_its_escape() -> None:

@@ -1,4 +1,5 @@
-"""What a dashboard costs a run: off, on with nobody looking, and open with two fields plotted.
+"""What a dashboard costs a run: off, on with nobody looking, open with two fields plotted, and with
+the world in 3-D as well.
 
 WhiskEye, strict, a process per node. Whoever looks is a thread of this program, not a browser: what
 a browser takes to draw is not a cost of NeuROS.
@@ -12,11 +13,13 @@ import resource
 from benchmarks.live import live
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.subjects.whiskeye import RATE, SIMULATED_S, SLICES, WHISKEYE
-from benchmarks.viewer import viewing
+from benchmarks.viewer import Plotted, viewing
+from neuros.control import WORLD
 
-OFF, CLOSED, OPEN = "off", "closed", "open"
+OFF, CLOSED, OPEN, IN_3D = "off", "closed", "open", "3-D"
 WORK = "processor_s"
-PLOTTED = {"snn": {"estimate": ["vector.z"]}, "robot": {"imu": ["angular_velocity.z"]}}
+PLOTTED: Plotted = {"snn": {"estimate": ["vector.z"]}, "robot": {"imu": ["angular_velocity.z"]}}
+SHOWN: dict[str, Plotted] = {OPEN: PLOTTED, IN_3D: {**PLOTTED, "robot": {WORLD: []}}}
 SEEN = ("figures", "samples")
 
 
@@ -24,7 +27,8 @@ def subject(is_quick: bool) -> Subject:
     """Simulated seconds per run."""
     simulated_s = SIMULATED_S * (0.2 if is_quick else 1.0)
     candidates: dict[str, Measurement] = {
-        state: functools.partial(whiskeye, state, simulated_s) for state in (OFF, CLOSED, OPEN)
+        state: functools.partial(whiskeye, state, simulated_s)
+        for state in (OFF, CLOSED, OPEN, IN_3D)
     }
     cases = tuple(
         Case(
@@ -34,7 +38,11 @@ def subject(is_quick: bool) -> Subject:
             Figure(OFF, figure),
             "without",
         )
-        for state, label in ((CLOSED, "on, nobody looks"), (OPEN, "open"))
+        for state, label in (
+            (CLOSED, "on, nobody looks"),
+            (OPEN, "open"),
+            (IN_3D, "open, in 3-D"),
+        )
         for what, unit, figure in (
             ("real-time factor", "", RATE),
             ("processor time of the whole run", "s", WORK),
@@ -58,8 +66,8 @@ def whiskeye(state: str, simulated_s: float) -> dict[str, float]:
         {"nodes.robot.environment.DURATION": simulated_s},
         () if state == OFF else ("--dashboard",),
     ) as run:
-        if state == OPEN:
-            with viewing(run.printed(r"dashboard: (\S+)\n"), PLOTTED) as viewer:
+        if state in SHOWN:
+            with viewing(run.printed(r"dashboard: (\S+)\n"), SHOWN[state]) as viewer:
                 record = run.finished()
             if not all(viewer.counts.get(event) for event in SEEN):
                 raise RuntimeError(f"the dashboard has shown {viewer.counts}")

@@ -239,6 +239,7 @@ def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.findings import findings_of
     from neuros.analysis.page import report_page
     from neuros.analysis.run_record import open_for_review
+    from neuros.analysis.world_page import world_pages
 
     run = open_for_review(options.run)
     findings = findings_of(run)
@@ -253,8 +254,11 @@ def _report(options: argparse.Namespace) -> int:
     folder = options.output or options.run / "report"
     text = report_page(run, findings, {t: (text, data) for t, text, data in figures.values()})
     files = {f"{name}.png": data for name, (_, _, data) in figures.items()}
-    _write(folder, {**files, _PAGE: text.encode()})
+    worlds = {f"world_{node}.html": page.encode() for node, page in world_pages(run).items()}
+    _write(folder, {**files, _PAGE: text.encode(), **worlds})
     print(f"{folder / _PAGE}: {len(figures)} figures")
+    for name in worlds:
+        print(f"{folder / name}: the world in 3-D")
     return 0
 
 

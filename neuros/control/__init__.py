@@ -28,6 +28,10 @@ ELSEWHERE_VARIABLE = "NEUROS_ELSEWHERE"
 # ---------------------------------------------------------------------- what messages are made of
 
 
+WORLD = "#world"
+"""Stands for a port where an observer asks for the simulated world of a node."""
+
+
 class SentCounts(TypedDict):
     """Counters of an outgoing connection."""
 

@@ -29,7 +29,7 @@ class ControlLink:
         self.stream = stream
         self.peer = peer
         self._accepted = {kind_of(each): each for each in accepted}
-        self._rest = b""
+        self._parts: list[bytes] = []  # of a line whose end has not arrived
 
     def fileno(self) -> int:
         """For selectors."""
@@ -69,7 +69,12 @@ class ControlLink:
             return None
         if not data:
             return None
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        end = data.rfind(b"\n")
+        if end < 0:
+            self._parts.append(data)
+            return []
+        lines = b"".join([*self._parts, data[:end]]).split(b"\n")
+        self._parts = [data[end + 1 :]]
         return lines
 
     def decode(self, line: bytes) -> Message:
@@ -95,8 +100,10 @@ def encode(message: Message) -> bytes:
     """A message as one line."""
     content = {"kind": kind_of(type(message)), **vars(message)}
     text = json.dumps(content, ensure_ascii=False, default=_plain)
-    # What is no character cannot be written anywhere: both ends see its escape in its place.
-    return _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text).encode() + b"\n"
+    if not text.isascii():
+        # What is no character cannot be written anywhere: both ends see its escape in its place.
+        text = _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text)
+    return text.encode() + b"\n"
 
 
 def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Message:

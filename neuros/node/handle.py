@@ -14,7 +14,7 @@ from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import EventLoop, Logger, Packets
+from neuros.ports import EventLoop, Logger, Packets, WorldLook
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
@@ -27,6 +27,7 @@ class PluginServices:
 
     Args:
         ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
+        show_world: called with what shows the simulated world of the node.
 
     Attributes:
         closers: called once when the node ends, last added first.
@@ -44,6 +45,7 @@ class PluginServices:
         time: SimulatedTime,
         failures: Failures,
         ask_for_end: Callable[..., object],
+        show_world: Callable[[WorldLook], None],
     ) -> None:
         self.engine: Engine | None = None
         self.is_ending = False
@@ -53,6 +55,7 @@ class PluginServices:
         self.time = time
         self._failures = failures
         self._ask_for_end = ask_for_end
+        self.show_world = show_world
         self.closers: list[Callable[[], None]] = []
 
     def stop(self) -> None:
@@ -292,6 +295,10 @@ class NodeHandle:
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
         self._services.time.own(read_s)
+
+    def show_world(self, look: WorldLook) -> None:
+        """Let observers look at a simulated world, as the dashboard does."""
+        self._services.show_world(look)
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""

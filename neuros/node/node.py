@@ -25,6 +25,7 @@ from neuros.node.plugin import load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
+from neuros.node.world_log import WorldLog
 from neuros.ports import Middleware, PacketRecorder, Way
 from neuros.project.model import Connection, NodeFile, Port
 
@@ -91,16 +92,17 @@ class NodeRuntime:
         self.failures = Failures(self.name, file.node.plugin, self._logger, fail)
         self._guard = self.failures.guard
         self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
+        sampler = Sampler()
         self._services = PluginServices(
             middleware.packets,
             middleware.loop,
             self._time,
             self.failures,
             lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
+            lambda look: self.reports.show_world(look),
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
-        sampler = Sampler()
         instruments: list[Instrument] = [self._time, sampler]
         if recorder is not None:
             self._recorder = NodeRecorder(
@@ -122,7 +124,10 @@ class NodeRuntime:
             on_first_hook=lambda: tell(FirstHook(self.name)),
             on_initialised=on_initialised,
         )
-        self.reports = NodeReports(file, middleware, self._transport, self._time, sampler, clock)
+        world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
+        self.reports = NodeReports(
+            file, middleware, self._transport, self._time, sampler, clock, world_log
+        )
         node, tap = file.node, self._effects.tap
         arrivals = {
             c: tap(Way.RECEIVED, node.input(c.destination_input), c)

@@ -173,7 +173,7 @@ class NodeProcess:
         if self._stack_file is not None:
             self._stack_file.renew()
         for node in tuple(self._nodes):
-            node.reports.write_packet_log()
+            node.reports.write_logs()
             self._tell(node.reports.report(is_final=is_final))
 
     def _probe(self, number: int) -> None:

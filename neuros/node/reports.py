@@ -14,7 +14,8 @@ from neuros.hooks import HookKind, HookSpec
 from neuros.node.packet_log import PacketLog
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import Logger, Middleware, Transport
+from neuros.node.world_log import WorldLog
+from neuros.ports import Logger, Middleware, Transport, WorldLook
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import SESSION
 from neuros.stacks import LONG_S, Stack, stack_in
@@ -33,6 +34,7 @@ class NodeReports:
     _time: SimulatedTime
     _sampler: Sampler
     _clock: Callable[[], int]
+    _world_log: WorldLog | None = None
     _engine: Engine | None = None
     _packet_log: PacketLog | None = None
 
@@ -51,10 +53,18 @@ class NodeReports:
                 f" {subscription.name} are acknowledged on arrival and dropped"
             )
 
-    def write_packet_log(self) -> None:
-        """Write out when packets were sent and taken. Any thread."""
+    def show_world(self, look: WorldLook) -> None:
+        """Let observers look at the simulated world of the node, and the recording, if any."""
+        self._sampler.look_at_world = look
+        if self._world_log is not None:
+            self._world_log.write(look)
+
+    def write_logs(self) -> None:
+        """Write out when packets were sent and taken, and how the world has moved. Any thread."""
         if self._packet_log is not None:
             self._packet_log.write()
+        if self._world_log is not None and self._sampler.look_at_world is not None:
+            self._world_log.write(self._sampler.look_at_world)
 
     def report(self, *, is_final: bool = False) -> Report:
         """State and counters. Any thread."""

@@ -19,8 +19,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from neuros.control import WORLD
 from neuros.node.instruments import Observe, Tap
-from neuros.ports import Way
+from neuros.ports import Way, WorldLook
 
 MOST_VALUES = 20
 """Packets per question of which chosen fields are read."""
@@ -81,10 +82,12 @@ class Sampler:
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
             each observer; empty without requests.
+        look_at_world: shows the simulated world of the node, ``None`` where it has none.
     """
 
     def __init__(self) -> None:
         self.requests: dict[str, list[_Request]] = {}
+        self.look_at_world: WorldLook | None = None
         self._asked: dict[int, dict[str, _Request]] = {}
         self._taps: list[tuple[str, Tap, Observe]] = []
 
@@ -112,10 +115,16 @@ class Sampler:
 
         Of each port: ``fields``, paths like ``pose.position.x`` or ``data[3]``, read of up to
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
-        ``most_elements``); ``image``, a small picture of one packet.
+        ``most_elements``); ``image``, a small picture of one packet. ``#world`` stands for the
+        simulated world of the node, which is shown at once.
         """
         asked = self._asked.get(asker, {})
         answers = {port: answer for port, request in asked.items() if (answer := request.answer())}
+        if WORLD in wanted and self.look_at_world is not None:
+            try:
+                answers[WORLD] = dict(self.look_at_world(wanted[WORLD], asker))
+            except Exception as error:  # that it cannot be shown is no fault of the node's
+                answers[WORLD] = {"fault": f"{type(error).__name__}: {error}"}
         self._asked[asker] = {port: _Request(each) for port, each in wanted.items()}
         waiting: dict[str, list[_Request]] = {}
         for requests in self._asked.values():

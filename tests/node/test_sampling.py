@@ -10,6 +10,7 @@ from geometry_msgs.msg import Point, Polygon, PoseStamped
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Bool, Float64MultiArray
 
+from neuros.control import WORLD
 from neuros.node.sampling import (
     MOST_ELEMENTS,
     MOST_VALUES,
@@ -31,6 +32,21 @@ def test_what_nobody_asks_for_is_not_looked_at() -> None:
     assert not sampler.requests
     sampler.note("imu", object())
     assert sampler.ask({}) == {}
+
+
+def test_a_simulated_world_is_shown_at_once_to_who_asks_for_it() -> None:
+    sampler = Sampler()
+    assert sampler.ask({WORLD: {}}) == {}  # this node has none
+    sampler.look_at_world = lambda wanted, asker: {"seen": [wanted, asker]}
+    assert sampler.ask({"imu": {}}) == {}
+    assert sampler.ask({WORLD: {"frames": True}}, 7) == {WORLD: {"seen": [{"frames": True}, 7]}}
+    assert not sampler.requests
+
+
+def test_a_world_that_cannot_be_shown_is_told_and_ends_no_run() -> None:
+    sampler = Sampler()
+    sampler.look_at_world = lambda wanted, asker: {"z": 1 / 0}
+    assert "ZeroDivisionError" in sampler.ask({WORLD: {}})[WORLD]["fault"]
 
 
 def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:

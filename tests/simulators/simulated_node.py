@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import ModelError
+from neuros.ports import WorldLook
 from neuros.project.model import Node, Port
 
 DEADLINE_S = 10.0
@@ -92,6 +93,7 @@ class SimulatedNode:
         self.closers: list[Callable[[], None]] = []
         self.failures: list[BaseException] = []
         self.read_time_s: Callable[[], float] = lambda: -1.0
+        self.look_at_world: WorldLook | None = None
 
     def make_packet(self, output: str) -> Any:
         package, _, name = self.description.output(output).type.split("/")
@@ -108,6 +110,9 @@ class SimulatedNode:
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         self.read_time_s = read_s
+
+    def show_world(self, look: WorldLook) -> None:
+        self.look_at_world = look
 
     def on_close(self, callback: Callable[[], None]) -> None:
         self.closers.append(callback)

@@ -17,6 +17,7 @@ from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
 from neuros.simulators.mujoco.commands import Controls, control
 from neuros.simulators.mujoco.lookup import did_you_mean
+from neuros.simulators.mujoco.scene import WorldView
 from neuros.simulators.mujoco.timing import FreeRun, StepLock
 from neuros.simulators.mujoco.world import World
 
@@ -59,6 +60,7 @@ class MuJoCo:
     ) -> None:
         self._node, self._clock, self._wait = node, clock, wait
         self._world = World(node, model, fine=fine_rendering)
+        self._view = WorldView(lambda: (self.model, self.data, self.sim_time))
         self._lock = StepLock()
         self._unread: dict[str, Packet] = {}
         self._run: FreeRun | None = None
@@ -69,6 +71,7 @@ class MuJoCo:
             )
         self._is_over = False
         node.own_simulated_time(lambda: self.sim_time)
+        node.show_world(self._view.look)
         node.on_close(self.close)
 
     # ---- what it is -------------------------------------------------------------------------
@@ -242,7 +245,8 @@ class MuJoCo:
         return due
 
     def _advance_to(self, target: int) -> None:
-        world = self._world
+        world, view = self._world, self._view
+        view.is_stepping = True
         while world.steps < target:
             firing = world.schedule.next_firing(world.steps)
             stop = target if firing is None else min(firing, target)
@@ -250,6 +254,9 @@ class MuJoCo:
             due = world.schedule.due(world.steps)
             if due:
                 self._unread.update(world.sense(due))
+            if view.is_watched:
+                view.note()
+        view.is_stepping = False
         if self._viewer is not None:
             self._viewer.sync()
 

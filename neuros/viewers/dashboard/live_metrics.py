@@ -15,6 +15,7 @@ from statistics import fmean
 from typing import Any
 
 from neuros.control import (
+    WORLD,
     Ended,
     LogRecord,
     LookAll,
@@ -43,6 +44,7 @@ _LATE_S = 2.0
 _PERIOD_S = 0.2
 _PER_NODE_S = 0.0125
 _PATIENCE_S = 1.0
+_GEOMETRY_S = 20.0
 
 
 class Latency:
@@ -309,6 +311,7 @@ class LiveRun:
         self._link = link
         self._names = set(names)
         self._metrics = LiveMetrics()
+        self._geometries: dict[str, asyncio.Future[str]] = {}
         self._answered: set[str] = set()
         self._has_answered = asyncio.Event()
         self._is_over = asyncio.Event()
@@ -333,6 +336,24 @@ class LiveRun:
         if not self._is_over.is_set():
             self._link.send(message)
 
+    async def geometry(self, node: str) -> str | None:
+        """The geometry of a node's simulated world, as JSON; ``None`` if it shows none."""
+        if node not in self._names:
+            return None
+        loop = asyncio.get_running_loop()
+        asked = self._geometries.setdefault(node, loop.create_future())
+        try:
+            return await asyncio.wait_for(asyncio.shield(asked), _GEOMETRY_S)
+        except asyncio.TimeoutError:
+            return None
+
+    def _wanted(self) -> Mapping[str, Mapping[str, Any]]:
+        """What pages show of packets and worlds, and the geometries that they wait for."""
+        wanted = self._pages.wanted()
+        for node in self._geometries:
+            wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
+        return wanted
+
     async def _ask(self) -> None:
         period_s = max(_PERIOD_S, _PER_NODE_S * len(self._names))
         while True:
@@ -340,7 +361,7 @@ class LiveRun:
             self._answered.clear()
             self._has_answered.clear()
             asked_s = time.monotonic()
-            self.tell(LookAll(self._pages.wanted()))
+            self.tell(LookAll(self._wanted()))
             # A node whose hook holds Python's global lock answers late: the others need not wait.
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)
@@ -394,6 +415,9 @@ class LiveRun:
     def _show_samples(self, node: str, samples: Mapping[str, dict[str, Any]]) -> None:
         shown = {}
         for port, sample in samples.items():
+            geometry = sample.pop("geometry", None)
+            if geometry is not None and (asked := self._geometries.pop(node, None)):
+                asked.set_result(geometry)
             for row in sample.get("values", ()):
                 row[0] -= self._start_s
             if "image" in sample:

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 _MOST_WAITING = 100
+_FLAGS = ("all", "image", "frames", "contacts")
 
 Wanted = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By node and port, what is to be sampled (see :class:`neuros.node.sampling.Sampler`)."""
@@ -23,8 +24,7 @@ def wanted_of(asked: Any) -> Wanted:
         str(node): {
             str(port): {
                 "fields": [str(field) for field in each.get("fields", ())],
-                "all": bool(each.get("all")),
-                "image": bool(each.get("image")),
+                **{flag: bool(each.get(flag)) for flag in _FLAGS},
             }
             for port, each in ports.items()
         }
@@ -117,7 +117,7 @@ class Pages:
                 for port, each in ports.items():
                     into = merged.setdefault(node, {}).setdefault(port, {"fields": []})
                     into["fields"] = list(dict.fromkeys([*into["fields"], *each.get("fields", ())]))
-                    for flag in ("all", "image"):
+                    for flag in _FLAGS:
                         into[flag] = bool(into.get(flag) or each.get(flag))
         return merged
 

@@ -5,6 +5,7 @@ method   path          what it does
 ======== ============= ===========================================================
 GET      /             the page
 GET      /static/...   what it consists of
+GET      /world/NODE   the geometry of a node's simulated world
 GET      /events       a stream of server-sent events, as long as the page is open
 POST     /want         what the page shows of packets: ``{"page": ..., "wanted": ...}``
 POST     /do/pause     the run stands still
@@ -139,6 +140,7 @@ class Dashboard:
             routes=[
                 Route("/", self._index),
                 Route("/events", self._events),
+                Route("/world/{node}", self._world),
                 Route("/want", self._want, methods=["POST"]),
                 Route("/do/{what}", self._do, methods=["POST"]),
                 Mount("/static", StaticFiles(directory=STATIC)),
@@ -156,6 +158,12 @@ class Dashboard:
 
     async def _events(self, _: Request) -> Response:
         return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
+
+    async def _world(self, request: Request) -> Response:
+        geometry = await self._run.geometry(request.path_params["node"])
+        if geometry is None:
+            return JSONResponse({"error": "this node shows no world"}, 404)
+        return Response(geometry, media_type="application/json", headers=_HEADERS)
 
     async def _stream(self) -> AsyncIterator[str]:
         name, page = self._pages.open()

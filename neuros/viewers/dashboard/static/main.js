@@ -9,6 +9,7 @@ import {Log} from "./log.js";
 import {Series} from "./series.js";
 import {Tables} from "./tables.js";
 import * as wants from "./wants.js";
+import {Worlds} from "./worlds.js";
 
 const log = new Log();
 let view = null;
@@ -19,7 +20,7 @@ let lastFigures = null;
 const handlers = {
   begin(plan) {
     log.clear();
-    wants.begin(plan.page, plan.sources);
+    wants.begin(plan.page, plan.sources, plan.nodes.filter((node) => node.is_here));
     if (view) return; // the same run, seen again: charts and selection stay
     document.title = `${plan.project} – NeuROS`;
     document.querySelector("#project").textContent = plan.project;
@@ -31,6 +32,7 @@ const handlers = {
       graph: new Graph(document.querySelector("#graph"), plan, select),
       tables: new Tables(plan, select),
       images: new Images(plan.sources),
+      worlds: new Worlds(),
     };
     series.restore();
     window.neuros = view; // for the console of the browser
@@ -49,6 +51,7 @@ const handlers = {
       view.details.showSample(name, sample);
       view.series.show(name, sample);
       view.images.show(name, sample);
+      view.worlds.show(name, sample);
     }
   },
   phase(phase) {

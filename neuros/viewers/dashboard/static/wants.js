@@ -1,10 +1,13 @@
 // What this page shows of packets, so that nodes sample that and nothing else.
 
-const wanted = new Map(); // "node.port" -> {node, port, fields: Set, all, image}
+export const WORLD = "#world"; // in place of a port: the simulated world of a node, if it has one
+
+// "node.port" -> {node, port, fields: Set, all, image; of a world: frames, contacts}
+const wanted = new Map();
 let page = null;
 let timer = null;
 
-export function begin(name, sources) {
+export function begin(name, sources, nodes) {
   page = name;
   for (const source of sources) {
     const before = wanted.get(source.name);
@@ -13,6 +16,10 @@ export function begin(name, sources) {
       fields: before ? before.fields : new Set(), all: before ? before.all : false,
       image: before ? before.image : false,
     });
+  }
+  for (const {name: node} of nodes) {
+    const name = `${node}.${WORLD}`;
+    wanted.set(name, wanted.get(name) ?? {node, port: WORLD, fields: new Set()});
   }
   tell();
 }
@@ -34,10 +41,10 @@ export function wantAllOf(source) {
 function tell() {
   const asked = {};
   for (const entry of wanted.values()) {
-    if (!entry.fields.size && !entry.all && !entry.image) continue;
+    if (!entry.fields.size && !entry.all && !entry.image && entry.port !== WORLD) continue;
     asked[entry.node] ??= {};
     asked[entry.node][entry.port] = {
-      fields: [...entry.fields], all: entry.all, image: entry.image,
+      ...entry, fields: [...entry.fields],
     };
   }
   if (page !== null) {

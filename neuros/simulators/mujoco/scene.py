@@ -1,0 +1,380 @@
+"""A world as a browser draws it: geometry of the compiled model, once, and poses of what moves.
+
+Nothing is rendered here. The geometry is JSON; arrays in it are compressed (zlib) and in base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+FRAMES_PER_S = 30
+_PERIOD_S = 1 / FRAMES_PER_S
+_WATCHED_S = 2.0
+_MOST_FRAMES = 60
+_MOST_GROUP = 2  # as MuJoCo's own viewer: elements of the groups 3 to 5 are hidden at first
+_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+_SHAPES = {
+    mujoco.mjtGeom.mjGEOM_PLANE.value: "plane",
+    mujoco.mjtGeom.mjGEOM_HFIELD.value: "mesh",
+    mujoco.mjtGeom.mjGEOM_SPHERE.value: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE.value: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID.value: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER.value: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX.value: "box",
+    mujoco.mjtGeom.mjGEOM_MESH.value: "mesh",
+    mujoco.mjtGeom.mjGEOM_SDF.value: "mesh",
+}
+# What a plugin may change while the world runs.
+_LOOKS = ("geom_rgba", "geom_size", "geom_pos", "geom_quat", "mat_rgba", "site_rgba", "site_pos")
+
+
+class WorldView:
+    """What observers see of a world: its geometry, and poses while they ask for them.
+
+    The thread that steps calls :meth:`stepping` and :meth:`note`, any other one :meth:`look`.
+
+    Args:
+        world: gives the model and the data of now, and the simulated time in seconds.
+        clock: wall clock in seconds.
+
+    Attributes:
+        is_watched: whether :meth:`note` is wanted after each step.
+        is_stepping: whether the data may change now.
+    """
+
+    def __init__(
+        self,
+        world: Callable[[], tuple[Any, Any, float]],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._world, self._clock = world, clock
+        self.is_watched = self.is_stepping = False
+        self._watched_until_s = self._next_s = self._begin_s = clock()
+        self._frames: deque[tuple[int, list[Any]]] = deque(maxlen=_MOST_FRAMES)
+        self._count = 0
+        self._given: dict[int, int] = {}
+        self._model: Any = None
+        self._models = 0
+        self._moving = _Moving.of(None)
+        self._wants_contacts = False
+
+    def note(self) -> None:
+        """Keep the poses of now, at most 30 times per second."""
+        now_s = self._clock()
+        if now_s > self._watched_until_s:
+            self.is_watched = False
+        elif now_s >= self._next_s:
+            self._next_s = max(self._next_s + _PERIOD_S, now_s)
+            self._count += 1
+            self._frames.append((self._count, self._frame(now_s)))
+
+    def look(self, wanted: Mapping[str, Any], asker: int) -> dict[str, Any]:
+        """The version of the geometry, and what is wanted.
+
+        Args:
+            wanted: ``frames``: poses since the asker's last question, and from now on;
+                ``contacts``: points of contact with them; ``geometry``: that of this version.
+        """
+        model, *_ = self._world()
+        if model is not self._model:
+            self._moving = _Moving.of(model)
+            self._frames.clear()
+            self._model, self._models = model, self._models + 1
+        found: dict[str, Any] = {"version": f"{self._models}-{_crc_of_looks(model):x}"}
+        if wanted.get("geometry"):
+            found["geometry"] = json.dumps({**found, **geometry(model)})
+        if wanted.get("frames"):
+            found["frames"] = self._frames_for(asker, bool(wanted.get("contacts")))
+        return found
+
+    def _frames_for(self, asker: int, wants_contacts: bool) -> list[list[Any]]:
+        now_s = self._clock()
+        self._watched_until_s, self._wants_contacts = now_s + _WATCHED_S, wants_contacts
+        self.is_watched = True  # first: if a step begins now, its end is noted
+        last = self._given.get(asker, self._count)
+        frames = [frame for number, frame in tuple(self._frames) if number > last]
+        if not frames and not self.is_stepping:  # it may stand still for long
+            frame = self._frame(now_s)
+            if not self.is_stepping:
+                frames.append(frame)
+        self._given[asker] = self._count
+        return frames
+
+    def _frame(self, now_s: float) -> list[Any]:
+        """Wall and simulated time in seconds, poses, and contacts if they are wanted."""
+        _, data, sim_s = self._world()
+        frame = [round(now_s - self._begin_s, 4), sim_s, _text(self._moving.poses(data))]
+        if self._wants_contacts:
+            contact = data.contact
+            frame.append(_text(np.hstack([contact.pos, contact.frame[:, :3]])))
+        return frame
+
+
+class _Moving:
+    """What moves in a model: bodies by joints, mocap, or their parents; cameras that track.
+
+    Attributes:
+        bodies, cameras: their numbers.
+    """
+
+    def __init__(self, bodies: list[int], cameras: list[int]) -> None:
+        self.bodies, self.cameras = bodies, cameras
+
+    @classmethod
+    def of(cls, model: Any) -> _Moving:
+        if model is None:
+            return cls([], [])
+        moves = [False] * model.nbody
+        for body in range(1, model.nbody):  # parents come first
+            moves[body] = bool(
+                moves[model.body_parentid[body]]
+                or model.body_jntnum[body]
+                or model.body_mocapid[body] >= 0
+            )
+        return cls(
+            [body for body in range(model.nbody) if moves[body]],
+            [camera for camera in range(model.ncam) if model.cam_mode[camera]],
+        )
+
+    def poses(self, data: Any) -> Any:
+        """A row of x, y, z in metres and a quaternion (w, x, y, z) for each, in the world."""
+        rows = np.empty((len(self.bodies) + len(self.cameras), 7))
+        count = len(self.bodies)
+        rows[:count, :3], rows[:count, 3:] = data.xpos[self.bodies], data.xquat[self.bodies]
+        for row, camera in zip(rows[count:], self.cameras, strict=True):
+            row[:3] = data.cam_xpos[camera]
+            mujoco.mju_mat2Quat(row[3:], data.cam_xmat[camera])
+        return rows
+
+
+def geometry(model: Any) -> dict[str, Any]:
+    """What is drawn of a model, ready for JSON; lengths in metres, quaternions as w, x, y, z.
+
+    ``bodies`` have the pose of the initial state; ``moving`` are those with a row in each frame, in
+    its order, before ``moving_cameras``; ``roots`` are those of them on which the others hang,
+    bodies with joints first. Geoms, sites, lights and cameras are relative to their
+    body. Geoms of groups that MuJoCo's viewer hides, skins, flexes and tendons are left out.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    moving, visual, headlight = _Moving.of(model), model.vis, model.vis.headlight
+    meshes = _Meshes(model)
+    return {
+        "bodies": [
+            {"name": model.body(body).name, **_pose(data.xpos[body], data.xquat[body])}
+            for body in range(model.nbody)
+        ],
+        "moving": moving.bodies,
+        "roots": sorted(
+            (body for body in moving.bodies if model.body_parentid[body] not in moving.bodies),
+            key=lambda body: model.body_mocapid[body] >= 0,
+        ),
+        "moving_cameras": moving.cameras,
+        "geoms": list(_geoms(model, meshes)),
+        "sites": list(_sites(model)),
+        "meshes": meshes.found,
+        "textures": [_texture(model, number) for number in range(model.ntex)],
+        "lights": list(_lights(model)),
+        "cameras": [
+            {
+                "name": model.camera(camera).name or f"camera {camera}",
+                "body": int(model.cam_bodyid[camera]),
+                **_pose(model.cam_pos[camera], model.cam_quat[camera]),
+                "fovy": float(model.cam_fovy[camera]),
+            }
+            for camera in range(model.ncam)
+        ],
+        "view": {
+            "center": model.stat.center.tolist(),
+            "extent": float(model.stat.extent),
+            "azimuth": float(visual.global_.azimuth),
+            "elevation": float(visual.global_.elevation),
+            "fovy": float(visual.global_.fovy),
+            "near": float(visual.map.znear * model.stat.extent),
+            "far": float(visual.map.zfar * model.stat.extent),
+            "contact_radius": float(visual.scale.contactwidth * model.stat.meansize),
+        },
+        "headlight": {
+            "ambient": headlight.ambient.tolist(),
+            "diffuse": headlight.diffuse.tolist() if headlight.active else [0, 0, 0],
+        },
+    }
+
+
+def _geoms(model: Any, meshes: _Meshes) -> Iterator[dict[str, Any]]:
+    for geom in range(model.ngeom):
+        kind = int(model.geom_type[geom])
+        material, rgba = int(model.geom_matid[geom]), model.geom_rgba[geom]
+        if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
+            rgba = model.mat_rgba[material]
+        if kind not in _SHAPES or model.geom_group[geom] > _MOST_GROUP or rgba[3] == 0:
+            continue
+        found = {
+            "shape": _SHAPES[kind],
+            "size": model.geom_size[geom].tolist(),
+            "body": int(model.geom_bodyid[geom]),
+            **_pose(model.geom_pos[geom], model.geom_quat[geom]),
+            "rgba": rgba.tolist(),
+        }
+        if _SHAPES[kind] == "mesh":
+            found["mesh"] = meshes.number(kind, int(model.geom_dataid[geom]))
+        if material >= 0:
+            found |= _material(model, material)
+        yield found
+
+
+def _material(model: Any, material: int) -> dict[str, Any]:
+    found = {
+        "emission": float(model.mat_emission[material]),
+        "specular": float(model.mat_specular[material]),
+        "shininess": float(model.mat_shininess[material]),
+    }
+    textures = model.mat_texid[material]
+    roles = (mujoco.mjtTextureRole.mjTEXROLE_RGB, mujoco.mjtTextureRole.mjTEXROLE_RGBA)
+    texture = next((int(textures[role]) for role in roles if textures[role] >= 0), None)
+    if texture is not None:
+        found |= {
+            "texture": texture,
+            "repeat": model.mat_texrepeat[material].tolist(),
+            "is_uniform": bool(model.mat_texuniform[material]),
+        }
+    return found
+
+
+def _sites(model: Any) -> Iterator[dict[str, Any]]:
+    for site in range(model.nsite):
+        if model.site_group[site] <= _MOST_GROUP:
+            material, rgba = int(model.site_matid[site]), model.site_rgba[site]
+            if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
+                rgba = model.mat_rgba[material]
+            yield {
+                "shape": _SHAPES[int(model.site_type[site])],
+                "size": model.site_size[site].tolist(),
+                "body": int(model.site_bodyid[site]),
+                **_pose(model.site_pos[site], model.site_quat[site]),
+                "rgba": rgba.tolist(),
+            }
+
+
+def _lights(model: Any) -> Iterator[dict[str, Any]]:
+    for light in range(model.nlight):
+        if model.light_active[light]:
+            yield {
+                "type": int(model.light_type[light]),
+                "body": int(model.light_bodyid[light]),
+                "pos": model.light_pos[light].tolist(),
+                "dir": model.light_dir[light].tolist(),
+                "diffuse": model.light_diffuse[light].tolist(),
+                "ambient": model.light_ambient[light].tolist(),
+                "cutoff": float(model.light_cutoff[light]),
+            }
+
+
+class _Meshes:
+    """The meshes and height fields that geoms use, each once."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._numbers: dict[tuple[bool, int], int] = {}
+        self.found: list[dict[str, str]] = []
+
+    def number(self, kind: int, data_id: int) -> int:
+        """The place of a mesh among those found."""
+        is_field = kind == mujoco.mjtGeom.mjGEOM_HFIELD.value
+        if (is_field, data_id) not in self._numbers:
+            self._numbers[is_field, data_id] = len(self.found)
+            self.found.append((self._field if is_field else self._mesh)(data_id))
+        return self._numbers[is_field, data_id]
+
+    def _mesh(self, mesh: int) -> dict[str, str]:
+        """Vertices with normals (and texture coordinates), of which each face names three.
+
+        MuJoCo numbers vertices, normals and coordinates apart; a browser has one number for all.
+        """
+        model = self._model
+
+        def part(name: str, kind: str, first: Any, count: Any) -> Any:
+            begin = first[mesh]
+            return getattr(model, f"mesh_{name}")[begin : begin + count[mesh]].astype(kind)
+
+        faces = (model.mesh_faceadr, model.mesh_facenum)
+        columns = [(part("face", "i8", *faces), "position", "vert")]
+        columns.append((part("facenormal", "i8", *faces), "normal", "normal"))
+        if model.mesh_texcoordnum[mesh]:
+            columns.append((part("facetexcoord", "i8", *faces), "uv", "texcoord"))
+        key = np.zeros(3 * model.mesh_facenum[mesh], "i8")
+        for numbers, *_ in columns:
+            key = key * (int(numbers.max(initial=0)) + 1) + numbers.ravel()
+        _, firsts, index = np.unique(key, return_index=True, return_inverse=True)
+        found = {"index": _packed(index.astype("<u4"))}
+        for numbers, name, of in columns:
+            values = part(
+                of, "<f4", getattr(model, f"mesh_{of}adr"), getattr(model, f"mesh_{of}num")
+            )
+            found[name] = _packed(values[numbers.ravel()[firsts]])
+        return found
+
+    def _field(self, field: int) -> dict[str, str]:
+        """The surface of a height field; the browser works out its normals."""
+        model = self._model
+        rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        begin = model.hfield_adr[field]
+        heights = model.hfield_data[begin : begin + rows * columns]
+        half_x, half_y, height, _ = model.hfield_size[field]
+        x, y = np.meshgrid(
+            np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows)
+        )
+        points = np.stack([x.ravel(), y.ravel(), heights * height], axis=1)
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        a, b, c, d = corner, corner + 1, corner + columns, corner + columns + 1
+        faces = np.stack([a, b, d, a, d, c], axis=1)
+        return {"position": _packed(points.astype("<f4")), "index": _packed(faces.astype("<u4"))}
+
+
+def _texture(model: Any, texture: int) -> dict[str, Any]:
+    width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
+    channels, begin = int(model.tex_nchannel[texture]), model.tex_adr[texture]
+    pixels = model.tex_data[begin : begin + width * height * channels]
+    colours = pixels.reshape(-1, channels)
+    is_rgb = channels >= 3
+    rgba = np.full((width * height, 4), 255, "u1")
+    rgba[:, :3] = colours[:, :3] if is_rgb else colours[:, :1]
+    if channels == 4:
+        rgba[:, 3] = colours[:, 3]
+    kind = mujoco.mjtTexture(model.tex_type[texture])
+    return {
+        "kind": kind.name.removeprefix("mjTEXTURE_").lower(),
+        "width": width,
+        "height": height,
+        # A cube texture is drawn as its mean colour.
+        "mean": (rgba.mean(axis=0) / 255).tolist(),
+        "rgba": "" if kind == mujoco.mjtTexture.mjTEXTURE_CUBE else _packed(rgba),
+    }
+
+
+def _pose(position: Any, quaternion: Any) -> dict[str, list[float]]:
+    return {"pos": position.tolist(), "quat": quaternion.tolist()}
+
+
+def _text(values: Any) -> str:
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
+
+
+def _packed(values: Any) -> str:
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 1)).decode()
+
+
+def _crc_of_looks(model: Any) -> int:
+    crc = 0
+    for name in _LOOKS:
+        crc = zlib.crc32(getattr(model, name).tobytes(), crc)
+    return crc
