@@ -36,6 +36,7 @@ REACHED = {
 BY_NAME = {
     "ros": (
         "api/test_python_api.py",
+        "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "api/test_sweep.py",
         "executors/test_sweeps_elsewhere.py",

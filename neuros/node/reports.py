@@ -51,6 +51,12 @@ class NodeReports:
                 f" {subscription.name} are acknowledged on arrival and dropped"
             )
 
+    def begin_anew(self, engine: Engine) -> None:
+        """The node was reset, and has this engine now."""
+        self._engine = engine
+        if self._packet_log is not None:
+            self._packet_log.begin_anew(engine)
+
     def write_packet_log(self) -> None:
         """Write out when packets were sent and taken. Any thread."""
         if self._packet_log is not None:
@@ -134,7 +140,7 @@ def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:
         tuple(
             HookDeclaration(spec.kind, spec.inputs, tuple(port.name for port in spec.outputs))
             for spec in specs
-            if spec.kind is not HookKind.FINALISE
+            if spec.is_scheduled
         ),
         tuple(spec.name for spec in specs if spec.kind is HookKind.FINALISE),
     )
