@@ -211,6 +211,7 @@ def test_a_run_that_has_ended_or_failed_can_be_reset(tmp_path: Path) -> None:
     assert s.runs[0].reason == "counter ended the project: ten were thrown"
 
 
+@ACCEPTANCE
 def test_a_plugin_that_cannot_be_loaded_again_fails_the_run(tmp_path: Path) -> None:
     made = cart(tmp_path)
     with neuros.Project.from_file(made).session(backend="in-process") as s:
