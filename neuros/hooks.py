@@ -36,6 +36,7 @@ __all__ = [
     "neuros_finalise",
     "neuros_function",
     "neuros_initialise",
+    "neuros_reset",
     "neuros_tick",
 ]
 
@@ -62,11 +63,12 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class HookKind(Enum):
-    """When a hook runs: once at the start, at every tick, on its inputs, or once at the end."""
+    """When a hook runs: at the start, at every tick, on its inputs, at a reset, or at the end."""
 
     INITIALISE = "initialise"
     TICK = "tick"
     FUNCTION = "function"
+    RESET = "reset"
     FINALISE = "finalise"
 
 
@@ -113,6 +115,11 @@ class HookSpec:
         return _where(self.function)
 
     @property
+    def is_scheduled(self) -> bool:
+        """Whether the engine of a node runs it."""
+        return self.kind not in (HookKind.RESET, HookKind.FINALISE)
+
+    @property
     def sends_unasked(self) -> bool:
         """Whether it can send without having received: a tick, or no required input."""
         if self.kind is HookKind.TICK:
@@ -125,6 +132,14 @@ def neuros_initialise(
 ) -> Callable[[_Function], _Function]:
     """Mark a hook that runs once, when every receiver of the node's outputs is there."""
     return _marker(HookKind.INITIALISE, inputs, outputs)
+
+
+def neuros_reset(inputs: Ports = None, outputs: Ports = None) -> Callable[[_Function], _Function]:
+    """Mark a hook that runs in the place of the initialise hooks when a session resets the node.
+
+    A plugin that has one stays loaded, with its user data.
+    """
+    return _marker(HookKind.RESET, inputs, outputs)
 
 
 def neuros_tick(

@@ -35,7 +35,9 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_gym_environments.py",
         "api/test_python_api.py",
+        "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "api/test_sweep.py",
         "executors/test_sweeps_elsewhere.py",

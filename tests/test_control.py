@@ -129,7 +129,8 @@ def test_half_a_character_arrives_as_its_escape() -> None:
         (b'{"kind": "report", "node": "a", "metrics": 3}', "metrics is 3, and must be an object"),
         (
             b'{"kind": "hooks", "node": "a", "hooks": [{"kind": "tock"}], "finalise": []}',
-            "hooks[0].kind is 'tock', and must be one of initialise, tick, function, finalise",
+            "hooks[0].kind is 'tock', and must be one of initialise, tick, function, reset,"
+            " finalise",
         ),
         (
             b'{"kind": "drain", "last_round": {"a": [0, "1"]}}',

@@ -9,13 +9,15 @@ from pathlib import Path
 
 from neuros.backends.containers import find_container, misspelt
 from neuros.distribution import WORKSPACE
-from neuros.errors import Problem, ProjectError
+from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
+from neuros.project.model import Project
 from neuros.project.modules import why_not
 from neuros.project.scanner import display_name, place_of
+from neuros.recording.provenance import seeds
 
 _LONG_BYTES = 1 << 20
 """A file of a container's folder from this size on is data, not a recipe."""
@@ -53,6 +55,23 @@ def load_with_messages(
         raise ProjectError(problems)
     doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces), *_unknown_plugins(loaded))
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
+
+
+def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
+    """By node, the variables of its environment that give it this seed.
+
+    A seed is a variable in the ``environment`` of a node whose name contains SEED.
+
+    Raises:
+        UsageError: if no node has one.
+    """
+    found = seeds(project.nodes)
+    if not found:
+        raise UsageError(
+            f"seed {seed}: no node of {project.name} has an environment variable with SEED in its"
+            " name: add the one that its plugin reads to its environment"
+        )
+    return {name: dict.fromkeys(variables, str(int(seed))) for name, variables in found.items()}
 
 
 def _misspelt(loaded: Loaded) -> Iterator[Problem]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
-from neuros.api.loading import load_with_messages
+from neuros.api.loading import load_with_messages, seed_variables
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request
 from neuros.api.run import Run
@@ -197,15 +198,22 @@ class Project:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
             RunError: if it has ended meanwhile.
         """
-        from neuros.api.session import Session, with_session_inputs  # they bring rclpy
+        from neuros.api.session import Held, Session, with_session_inputs  # they bring rclpy
 
         if options.nodes:
             raise UsageError("nodes: a session holds all nodes of its project")
-        project, messages = self._load_for_run(options)
-        held, inputs = with_session_inputs(project, options.take_over)
-        live = self._live(held, messages, options, is_held=True)
-        live.begin()
-        return Session(live, project, inputs, messages.paths)
+        count = itertools.count(1)
+
+        def start(seed: int | None) -> Held:
+            output = _numbered(options.output, next(count))
+            own = replace(options, seed=seed, output=output)
+            project, messages = self._load_for_run(own)
+            held, inputs = with_session_inputs(project, options.take_over)
+            live = self._live(held, messages, own, is_held=True)
+            live.begin()
+            return Held(live, project, frozenset(inputs), messages.paths)
+
+        return Session(start, options.seed)
 
     def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
         """As another machine, or a later time, has it: read again."""
@@ -248,8 +256,12 @@ class Project:
         names = (options.namespace, options.remap)
         loaded, messages = load_with_messages(self._path, texts, *names)
         if options.seed is not None:
-            seeds = _seed_texts(loaded.project, options.seed)
-            loaded, messages = load_with_messages(self._path, [*texts, *seeds], *names)
+            texts += [
+                f"nodes.{node}.{_ENVIRONMENT}.{name}={value}"
+                for node, variables in seed_variables(loaded.project, options.seed).items()
+                for name, value in variables.items()
+            ]
+            loaded, messages = load_with_messages(self._path, texts, *names)
         for warning in loaded.warnings:
             if warning not in self._said:
                 self._said.add(warning)
@@ -280,23 +292,6 @@ def value_text(path: str, value: Any) -> str:
         raise UsageError(f"{path}: {error}") from error
 
 
-def _seed_texts(project: Described, seed: int) -> tuple[str, ...]:
-    """Overrides that give this seed to every node that has one.
-
-    A seed is a variable in the ``environment`` of a node whose name contains SEED.
-
-    Raises:
-        UsageError: if no node has one.
-    """
-    places = [
-        f"nodes.{node.name}.{_ENVIRONMENT}.{name}"
-        for node in project.nodes
-        for name in node.environment
-        if "SEED" in name.upper()
-    ]
-    if not places:
-        raise UsageError(
-            f"seed {seed}: no node of {project.name} has an environment variable with SEED in its"
-            " name: add the one that its plugin reads to its environment"
-        )
-    return tuple(f"{place}={int(seed)}" for place in places)
+def _numbered(output: str | os.PathLike[str] | None, number: int) -> str | None:
+    """The run folder of a run of a session: ``out``, ``out-2``, ``out-3``."""
+    return None if output is None else os.fspath(output) + (f"-{number}" if number > 1 else "")

@@ -24,6 +24,7 @@ from typing import Any
 
 from neuros.analysis.run_record import run_table
 from neuros.api.live import LiveRun
+from neuros.api.loading import seed_variables
 from neuros.api.run import Run
 from neuros.backends.control_sockets import connect
 from neuros.control import (
@@ -35,10 +36,12 @@ from neuros.control import (
     NewestPacket,
     NodeStatus,
     Pause,
+    Reset,
     Resume,
     Settle,
     Settled,
     StepAll,
+    WasReset,
     Watch,
 )
 from neuros.control.link import ControlLink
@@ -71,30 +74,39 @@ class Session:
 
     Attributes:
         folder: the run folder.
+        runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(
-        self, live: LiveRun, project: Project, inputs: Sequence[str], messages: Sequence[Path]
-    ) -> None:
-        self._live = live
-        self._project = project
-        self._inputs = set(inputs)
-        self.folder = live.folder
+    def __init__(self, start: Callable[[int | None], Held], seed: int | None) -> None:
+        self._start = start
+        self._seed = seed
         self._packets = RosPackets()
         self._lock = threading.RLock()
         self._number = 0
         self._newest: dict[str, NewestPacket] = {}
-        self._decoded: dict[str, tuple[int, Any]] = {}
-        self._sim_times: Mapping[str, float] = {}
+        self.runs: list[Run] = []
+        self._hold(start(seed))
+
+    def _hold(self, held: Held) -> None:
+        """Take a run that has just been started."""
+        self._live, self._project, self._inputs = held.live, held.project, held.inputs
+        self.folder = held.live.folder
         self._run: Run | None = None
-        sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
+        sys.path[:0] = [path for path in map(str, held.messages) if path not in sys.path]
         try:
             self._link = self._connect()
             self._link.send(Watch())
-            self._advance(0, None)
+            self._begin()
         except BaseException:
-            live.end()
+            held.live.end()
             raise
+
+    def _begin(self) -> None:
+        """Forget packets and times, and wait until the initialise hooks have run."""
+        self._newest = {name: NewestPacket(0, "") for name in self._newest}
+        self._decoded: dict[str, tuple[int, Any]] = {}
+        self._sim_times: Mapping[str, float] = {}
+        self._advance(0, None)
 
     # ------------------------------------------------------------------ time
 
@@ -169,6 +181,55 @@ class Session:
                 self._link.send(Pause())
             return self._run is None and self._advance(0, None)
 
+    def reset(self, seed: int | None = None) -> None:
+        """Bring every node back to where it was when the session began, with a seed.
+
+        The same seed gives the same packets from then on. Where all nodes are in one process, and
+        nothing is recorded, they are loaded anew in it, or their ``@neuros_reset`` hooks run; else
+        the run is ended, drained, and a new one takes its place (see :attr:`runs`). A run that has
+        ended or failed can be reset, too.
+
+        Args:
+            seed: for every variable with SEED in its name in the environment of a node; ``None``:
+                that of before.
+
+        Raises:
+            UsageError: if there is a seed, and no node takes one.
+            ProjectError, EnvironmentFault, RunError: as for the start of a session.
+        """
+        with self._lock:
+            seed = self._seed if seed is None else seed
+            variables = {} if seed is None else seed_variables(self._project, seed)
+            if not self._reset_in_place(variables):
+                self.runs.append(self.close("the session was reset"))
+                self._hold(self._start(seed))
+            self._seed = seed
+
+    def _reset_in_place(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+        """Whether the nodes could be reset in their process."""
+        answers: list[WasReset] = []
+
+        def is_answer(message: Message) -> bool:
+            if isinstance(message, WasReset):
+                answers.append(message)
+            return bool(answers)
+
+        if self._run is not None or not self._has_come_to_rest():
+            return False
+        self._link.send(Reset(variables))
+        if not self._wait_for(is_answer, None):
+            self._check_running()
+        if answers[0].why_not:
+            return False
+        self._begin()
+        return True
+
+    def _has_come_to_rest(self) -> bool:
+        try:
+            return self._advance(0, None)
+        except RunError:
+            return False
+
     # ------------------------------------------------------------------ packets
 
     def __getitem__(self, output: str) -> SessionOutput:
@@ -227,11 +288,11 @@ class Session:
                 self._check_running()
         return found
 
-    def close(self) -> Run:
+    def close(self, reason: str = "the session was closed") -> Run:
         """End the run, drained, and return what it has left behind; a second time the same."""
         with self._lock:
             if self._run is None:
-                self._live.stop("the session was closed")
+                self._live.stop(reason)
                 self._end()
             assert self._run is not None
             return self._run
@@ -385,6 +446,22 @@ class Session:
         if self._run is not None:
             self._run.check()
             raise RunError(f"the run has ended: {self._run.reason}", self._run.exit_code)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A run that stands still from its start, for a session.
+
+    Attributes:
+        project: as it is described, without the inputs of the session.
+        inputs: the names of these.
+        messages: folders of its message packages, for ``sys.path``.
+    """
+
+    live: LiveRun
+    project: Project
+    inputs: frozenset[str]
+    messages: Sequence[Path]
 
 
 @dataclass(frozen=True)

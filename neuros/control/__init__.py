@@ -271,6 +271,13 @@ class AtRest(Message):
     packets: Mapping[str, NewestPacket]
 
 
+@dataclass(frozen=True)
+class WasReset(Message):
+    """In answer to ``reset``; ``why_not``: why the run has to be started anew in its place."""
+
+    why_not: str
+
+
 # ---------------------------------------------------------------------- to nodes
 
 
@@ -342,6 +349,13 @@ class Settle(Message):
 
     number: int
     known: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Reset(Message):
+    """While nothing moves, be as after the start; ``variables``: of environments, by node."""
+
+    variables: Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -434,13 +448,15 @@ class Ended(Message):
 
 FROM_NODES: Sequence[type[Message]] = (
     *(Hello, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation, Heard),
-    *(NodeStatus, AtRest),
+    *(NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
     *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
-    *(Settle, Deliver),
+    *(Settle, Deliver, Reset),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (
-    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver),
+    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver, Reset),
 )
-TO_OBSERVERS: Sequence[type[Message]] = (NodeStatus, PhaseChanged, LogRecord, Ended, Settled)
+TO_OBSERVERS: Sequence[type[Message]] = (
+    *(NodeStatus, PhaseChanged, LogRecord, Ended, Settled, WasReset),
+)

@@ -97,7 +97,7 @@ class Engine:
         self.all_hooks = [
             Hook(spec, ports.inputs_of(spec), self.outputs)
             for spec in specs
-            if spec.kind is not HookKind.FINALISE
+            if spec.is_scheduled
         ]
         for hook in self.all_hooks:
             self._schedule.add(hook)

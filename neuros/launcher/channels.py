@@ -31,9 +31,11 @@ from neuros.control import (
     NodeStatus,
     Pause,
     PhaseChanged,
+    Reset,
     Resume,
     Step,
     StepAll,
+    WasReset,
     Watch,
 )
 from neuros.control.link import ControlLink, encode
@@ -117,6 +119,11 @@ class Channels:
     def greeted(self) -> set[str]:
         """The nodes whose processes have said hello."""
         return {name for names in self._nodes.values() for name in names}
+
+    @property
+    def process_count(self) -> int:
+        """How many node processes have said hello."""
+        return len(self._nodes)
 
     def send_to(self, link: ControlLink, message: Message) -> None:
         """Send to one; what does not go through now goes with the next, or :meth:`flush`."""
@@ -261,6 +268,13 @@ class Observers:
                 self._pause.begin()
             case Resume():
                 self._pause.end()
+            case Reset():
+                if self._channels.process_count == 1:
+                    self._channels.send(message)
+                else:
+                    self._channels.send_to(link, WasReset("its nodes are in several processes"))
+            case WasReset():
+                self.tell(message)
             case Deliver(node=node):
                 self._channels.send_to_node(node, message)
             case StepAll(count):

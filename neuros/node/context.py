@@ -91,12 +91,9 @@ class ContextSwitch:
             project: modules from below this folder are private to the node.
             log_file: where its standard output and error go, ``None`` to leave them.
         """
-        environ = dict(self._process.environ)
-        for key, value in environment.items():
-            environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
         return Context(
             environment,
-            environ,
+            self._environ_with(environment),
             [*([str(plugin.parent)] if plugin else []), *self._process.path],
             str(project) + os.sep,
             None if log_file is None else _open_log(log_file),
@@ -136,10 +133,35 @@ class ContextSwitch:
         """Give the process its own context back (but for its output, if a node has a log)."""
         self.enter(self._process)
 
+    def why_bound(self, context: Context) -> str:
+        """Which library holds state of this node outside of its modules; empty if none does."""
+        names = [each.name for each in self._owned.values() if each.owner is context]
+        return f"{names[0]} has been imported, whose state is that of the process" if names else ""
+
+    def renew(
+        self, context: Context, environment: Mapping[str, str], *, forgets_modules: bool
+    ) -> None:
+        """Give a context these variables, as :meth:`make_context` does, and what it began with.
+
+        It is not in place afterwards. ``forgets_modules``: those of the node are imported anew.
+        """
+        self.leave()
+        self._changes.clear()
+        context.variables = dict(environment)
+        context.environ = self._environ_with(environment)
+        if forgets_modules:
+            context.modules.clear()
+
     def hide_from_nodes(self, project: Path) -> None:
         """Let nodes load modules below this folder anew, even if the process has them already."""
         self._process.project = str(project) + os.sep
         self._known_modules = -1
+
+    def _environ_with(self, environment: Mapping[str, str]) -> dict[Any, Any]:
+        environ = dict(self._process.environ)
+        for key, value in environment.items():
+            environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
+        return environ
 
     def _find_modules(self, context: Context) -> None:
         """Note which modules of the process are private to a node."""

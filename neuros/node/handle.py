@@ -33,6 +33,7 @@ class PluginServices:
         closers: called once when the node ends, last added first.
         engine: the node's, ``None`` until its plugin is loaded.
         is_ending: whether no further hook starts.
+        results: what the plugin has noted.
         make_packet: a new message with default values, for a type in ROS notation.
         time: that of the node, if it has one.
         waiting_threads: those that wait until packets that they have offered are sent.
@@ -46,6 +47,7 @@ class PluginServices:
         failures: Failures,
         ask_for_end: Callable[..., object],
         show_world: Callable[[WorldLook], None],
+        results: Results,
     ) -> None:
         self.engine: Engine | None = None
         self.is_ending = False
@@ -56,6 +58,7 @@ class PluginServices:
         self._failures = failures
         self._ask_for_end = ask_for_end
         self.show_world = show_world
+        self.results = results
         self.closers: list[Callable[[], None]] = []
 
     def stop(self) -> None:
@@ -72,9 +75,9 @@ class PluginServices:
 
     def close(self) -> None:
         """Give up what the plugin holds, last opened first."""
-        for close in reversed(self.closers):
+        while self.closers:
             try:
-                close()
+                self.closers.pop()()
             except BaseException as error:  # the others must still be closed
                 self._failures.report(as_node_error(error, "failed while it was closed: "))
 
@@ -122,7 +125,6 @@ class NodeHandle:
         self._services = services
         self._types = {port.name: port.type for port in file.node.outputs}
         self._user_data: Any = None
-        self._results = Results(self.run_dir)
 
     @property
     def name(self) -> str:
@@ -231,7 +233,7 @@ class NodeHandle:
             NodeError: for anything else.
         """
         try:
-            self._results.set(name, value)
+            self._services.results.set(name, value)
         except (TypeError, ValueError) as error:
             raise NodeError(f"set_result: '{name}' cannot be kept: {error}") from error
 
@@ -334,6 +336,11 @@ class Results:
     def __init__(self, folder: Path) -> None:
         self._file = folder / "results.json"
         self._values: dict[str, Any] = {}
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._values = {}
+        self._file.unlink(missing_ok=True)
 
     def set(self, name: str, value: Any) -> None:
         """Keep a value. Raises ``TypeError`` or ``ValueError`` for what JSON does not know."""

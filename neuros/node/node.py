@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.effects import NodeEffects
 from neuros.node.failures import Failures
-from neuros.node.handle import NodeHandle, PluginServices
+from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NewestPackets, NodeRecorder
 from neuros.node.plugin import load_plugin
 from neuros.node.reports import NodeReports
@@ -50,7 +50,7 @@ class NodeRuntime:
     Attributes:
         newest: the newest packets, where they are kept.
         engine: ``None`` until :meth:`load`.
-        specs: the hooks of its plugin, once that is loaded.
+        specs: the hooks of its plugin, once that is loaded; after a reset, those that hold then.
         handle: the ``node`` that hooks receive.
         failures: reports its errors.
         reports: what it says of itself.
@@ -75,13 +75,15 @@ class NodeRuntime:
         self.file = file
         self.name = file.node.name
         self.specs: Sequence[HookSpec] = ()
+        self._plugin: Sequence[HookSpec] = ()
+        self._has_timer = False
         self.engine: Engine | None = None
         self._middleware = middleware
         self._clock = clock
         self._make_engine = make_engine
         self._tell = tell
         self._contexts = contexts
-        environment = {**file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
+        environment = self._environment({})
         plugin = None if file.node.module else file.node.plugin
         self._context = contexts.make_context(environment, plugin, file.folders.project, log_file)
         self._enter = partial(contexts.enter, self._context)
@@ -100,6 +102,7 @@ class NodeRuntime:
             self.failures,
             lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
             lambda look: self.reports.show_world(look),
+            Results(self.run_dir),
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
@@ -168,24 +171,64 @@ class NodeRuntime:
         self._enter()
         self._transport.open(self)
         self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
-        node = self.file.node
-        self.specs = with_clocks(node, load_plugin(node.plugin, self.name, node.module))
-        types = {port.name: self._packet_type(port) for port in node.outputs}
-        specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
-        self.engine = self._services.engine = self._make_engine(
-            node, self.file.connections, specs, self._effects, self._clock, types
-        )
-        if self._is_held:
-            self.engine.pause()
-        self._time.clock = self.engine.sim_clock
-        self.reports.open(self.engine, self._logger)
+        self._load_plugin()
+        self.reports.open(self._make(), self._logger)
 
     def start(self) -> None:
         """Let the engine run hooks as soon as every receiver is there."""
-        if any(spec.kind is HookKind.TICK for spec in self.specs):
-            engine = self._loaded
-            self._middleware.loop.add_timer(lambda: engine.next_due_ns, self.on_timer)
+        if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
+            self._has_timer = True
+            self._middleware.loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
         self._guard(self._loaded.start)
+
+    @property
+    def why_not_reset(self) -> str:
+        """Why its process has to be started anew for a reset; empty if :meth:`reset` will do."""
+        node = self.file.node
+        if self._recorder is not None:
+            return "packets are recorded"
+        if self._resets:
+            return ""
+        if node.module or not node.plugin.is_relative_to(self.file.folders.project):
+            return f"the plugin of {self.name} is not in the project's folder"
+        if self._middleware.has_foreign_entities(self.file):
+            return f"the plugin of {self.name} has made ROS entities"
+        return self._contexts.why_bound(self._context)
+
+    def reset(self, variables: Mapping[str, str]) -> None:
+        """Be as after :meth:`load`, with these variables in the environment.
+
+        Nothing may be under way to the node or from it. A plugin with reset hooks stays loaded, and
+        these take the place of its initialise hooks; any other is finalised and loaded anew.
+
+        Raises:
+            PluginError, HookError: as :meth:`load`.
+        """
+        is_kept = bool(self._resets)
+        self._loaded.stop_hooks()
+        if not is_kept:
+            self._enter()
+            self._finalise_hooks()
+            self._services.close()
+            self.handle.set_user_data(None)
+        environment = self._environment(variables)
+        self._contexts.renew(self._context, environment, forgets_modules=not is_kept)
+        self._enter()
+        self._time.begin_anew(keeps_owner=is_kept)
+        self._services.results.clear()
+        self.newest.by_output.clear()
+        if is_kept:
+            self.specs = [
+                replace(spec, kind=HookKind.INITIALISE) if spec.kind is HookKind.RESET else spec
+                for spec in self._plugin
+                if spec.kind is not HookKind.INITIALISE
+            ]
+        else:
+            self._load_plugin()
+        engine = self._make()
+        self.reports.begin_anew(engine)
+        for connection in engine.send_windows:
+            engine.on_registered(connection)
 
     def drain(self, last_round: Sequence[int] = ()) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
@@ -215,10 +258,7 @@ class NodeRuntime:
         self.stop()
         self._enter()
         if self.engine is not None:
-            for spec in self.specs:
-                if spec.kind is HookKind.FINALISE:
-                    self._tell(Finalising(self.name, spec.name))
-                    self._guard(partial(self._effects.finalise, spec))
+            self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
         self._tell(Finalising(self.name, ""))
         if self._recorder is not None:
             self._recorder.close()
@@ -268,6 +308,39 @@ class NodeRuntime:
         self._guard(self._loaded.on_timer)
 
     # ------------------------------------------------------------------ inside
+
+    def _environment(self, variables: Mapping[str, str]) -> dict[str, str]:
+        own = {**self.file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
+        return {**own, **variables}
+
+    def _load_plugin(self) -> None:
+        node = self.file.node
+        self.specs = self._plugin = with_clocks(
+            node, load_plugin(node.plugin, self.name, node.module)
+        )
+
+    def _make(self) -> Engine:
+        """The engine for the hooks of now."""
+        node = self.file.node
+        types = {port.name: self._packet_type(port) for port in node.outputs}
+        specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
+        self.engine = self._services.engine = self._make_engine(
+            node, self.file.connections, specs, self._effects, self._clock, types
+        )
+        if self._is_held:
+            self.engine.pause()
+        self._time.clock = self.engine.sim_clock
+        return self.engine
+
+    def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
+        for spec in self.specs:
+            if spec.kind is HookKind.FINALISE:
+                begin(spec.name)
+                self._guard(partial(self._effects.finalise, spec))
+
+    @property
+    def _resets(self) -> list[HookSpec]:
+        return [spec for spec in self._plugin if spec.kind is HookKind.RESET]
 
     def _packet_type(self, port: Port) -> PacketType:
         packets = self._middleware.packets

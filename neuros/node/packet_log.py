@@ -24,6 +24,7 @@ out once per second.
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from array import array
 from collections.abc import Iterator, Mapping
@@ -62,6 +63,16 @@ class PacketLog:
         self._hooks_written = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
+
+    def begin_anew(self, engine: Engine) -> None:
+        """Give up what has been written: the node was reset, and has this engine now."""
+        with self._lock:
+            self._engine = engine
+            self._written.clear()
+            self._hooks_written = 0
+            for digests in self._digests.values():
+                del digests[:]
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def write(self) -> None:
         """Write what has come since the last time. Any thread, but the node's own hooks go on."""

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import neuros.control as control
@@ -77,6 +77,7 @@ class NodeProcess:
         self._early_lock = threading.Lock()
         self._has_failed = False
         self._settle_number = 0
+        self._has_been_reset = False
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
@@ -133,6 +134,9 @@ class NodeProcess:
         if isinstance(message, control.Settle):
             self._settle_number = message.number
             self._settle(message)
+            return
+        if isinstance(message, control.Reset):
+            self._reset(message.variables)
             return
         for node in self._nodes:
             match message:
@@ -200,6 +204,26 @@ class NodeProcess:
         elif not self._is_ending:
             self._tell(_at_rest(self._nodes, message))
 
+    def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
+        """Bring all nodes back to their start, if nothing of theirs is beyond reach."""
+        assert self._middleware is not None
+        why_not = next((why for node in self._nodes if (why := node.why_not_reset)), "")
+        threads = [t for t in threading.enumerate() if not isinstance(t, ControlThread)]
+        if threads != [threading.main_thread()]:
+            why_not = why_not or f"a plugin has a thread ({threads[-1].name})"
+        if not why_not:
+            for node in self._nodes:
+                try:
+                    node.reset(variables.get(node.name, {}))
+                except NeurosError as error:
+                    self._fail(node.name, error)
+                    return
+                self._tell(declared(node.name, node.specs))
+            self._has_been_reset = True
+            for node in self._nodes:
+                self._middleware.loop.post(node.start)
+        self._tell(control.WasReset(why_not))
+
     def _explain(self) -> None:
         """Report why nothing moves, but for nodes whose hook runs."""
         for node in tuple(self._nodes):
@@ -263,9 +287,19 @@ class NodeProcess:
                 log_file=_log_file(file) if self._own_logs else None,
                 duration_sim_s=self._duration_sim_s,
                 is_held=self._is_held,
-                on_initialised=_keep_for_good,
+                on_initialised=self._keep_for_good,
             )
         )
+
+    def _keep_for_good(self) -> None:
+        """Leave what exists after initialisation to itself: modules, networks, figures.
+
+        It stays to the end, and each full round of the garbage collector would go through all of
+        it, for 40 ms in the midst of a run. What comes after a reset goes with the next one.
+        """
+        if not self._has_been_reset:
+            gc.collect()
+            gc.freeze()
 
     def _has_free_threads(self) -> bool:
         """Whether there is a thread, besides NeuROS's own, that does not wait for a connection."""
@@ -476,16 +510,6 @@ def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtR
         {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
         packets,
     )
-
-
-def _keep_for_good() -> None:
-    """Leave what exists after initialisation to itself: modules, networks, figures.
-
-    It stays to the end, and each full round of the garbage collector would go through all of it,
-    for 40 ms in the midst of a run.
-    """
-    gc.collect()
-    gc.freeze()
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

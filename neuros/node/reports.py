@@ -53,6 +53,12 @@ class NodeReports:
                 f" {subscription.name} are acknowledged on arrival and dropped"
             )
 
+    def begin_anew(self, engine: Engine) -> None:
+        """The node was reset, and has this engine now."""
+        self._engine = engine
+        if self._packet_log is not None:
+            self._packet_log.begin_anew(engine)
+
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at the simulated world of the node, and the recording, if any."""
         self._sampler.look_at_world = look
@@ -144,7 +150,7 @@ def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:
         tuple(
             HookDeclaration(spec.kind, spec.inputs, tuple(port.name for port in spec.outputs))
             for spec in specs
-            if spec.kind is not HookKind.FINALISE
+            if spec.is_scheduled
         ),
         tuple(spec.name for spec in specs if spec.kind is HookKind.FINALISE),
     )

@@ -69,6 +69,13 @@ class SimulatedTime:
             return to_stamp(nanoseconds=self.clock.now_ns or 0)
         return to_stamp(nanoseconds=time.time_ns())
 
+    def begin_anew(self, *, keeps_owner: bool) -> None:
+        """The node was reset; ``keeps_owner``: the simulator that has the time goes on."""
+        if not (keeps_owner and self._is_owned):
+            self._read_s, self._is_owned = None, False
+        self.expected_end_s = None
+        self._timeline = Timeline()
+
     def own(self, read_s: Callable[[], float]) -> None:
         """Take it from a simulator, rather than from a clock that the node publishes."""
         self._read_s = read_s

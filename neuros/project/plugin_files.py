@@ -28,6 +28,7 @@ _ARGUMENTS = {
     "neuros_initialise": ("inputs", "outputs"),
     "neuros_tick": ("seconds", "inputs", "outputs", "sim_seconds"),
     "neuros_function": ("inputs", "outputs"),
+    "neuros_reset": ("inputs", "outputs"),
     "neuros_finalise": (),
 }
 _FOR_TOOLS = ("HookKind", "HookSpec", "InputSpec", "OutputSpec", "hook_specs_of")

@@ -1,0 +1,310 @@
+"""Environments of Gymnasium whose world is a project."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from std_msgs.msg import Float64
+from test_stepped_sessions import ACCEPTANCE, cart
+
+import neuros
+import neuros.gym
+from neuros.errors import ProjectError, UsageError
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "7_learning" / "cartpole"
+PAGE = ROOT / "docs" / "gymnasium.md"
+POSITION, VELOCITY = "cart.joints.position", "cart.joints.velocity"
+OBSERVED = [f"{POSITION}[2]", f"{VELOCITY}[2]"]
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def cart_pole(**others: Any) -> gymnasium.Env[Any, Any]:
+    arguments: dict[str, Any] = {
+        "action": "policy.force",
+        "observation": OBSERVED,
+        "reward": lambda env: 1.0,
+        "done": lambda env: abs(env.observation[POSITION][1]) > 0.2,
+        "model": "cart.xml",
+        "max_episode_steps": 50,
+    }
+    return neuros.gym.make(EXAMPLE / "project.json", **(arguments | others))
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[gymnasium.Env[Any, Any]]:
+    made = cart_pole(output=tmp_path_factory.mktemp("gym") / "run")
+    yield made
+    made.close()
+
+
+def episode(env: gymnasium.Env[Any, Any], seed: int | None, steps: int = 5) -> list[Any]:
+    """The observations of an episode in which the cart is pushed to the right."""
+    found = [env.reset(seed=seed)[0]]
+    found += [env.step(np.array([0.5]))[0] for _ in range(steps)]
+    return [each[POSITION].tolist() for each in found]
+
+
+def test_the_checker_of_gymnasium_finds_no_fault(env: gymnasium.Env[Any, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_a_seed_gives_one_sequence_of_episodes(env: gymnasium.Env[Any, Any]) -> None:
+    first = [episode(env, 7), episode(env, None)]
+    assert [episode(env, 7), episode(env, None)] == first
+    assert first[0] != first[1] != episode(env, 8)
+
+
+def test_ranges_of_an_action_are_those_of_its_actuators(env: gymnasium.Env[Any, Any]) -> None:
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+
+def test_an_episode_ends_when_it_is_done_or_long_enough(env: gymnasium.Env[Any, Any]) -> None:
+    env.reset(seed=1)
+    for _ in range(50):
+        seen, reward, terminated, truncated, info = env.step(np.array([1.0]))
+        if terminated:
+            break
+    assert reward == 1.0
+    assert abs(seen[POSITION][1]) > 0.2
+    assert not truncated
+    assert 0.1 < info["sim_time"] < 1.0
+    seen, _ = env.reset(seed=1)
+    ends = []
+    for _ in range(50):
+        seen, _, *end, _ = env.step(np.array([4.0 * seen[POSITION][1]]))
+        ends.append(end)
+    assert ends == 49 * [[False, False]] + [[False, True]]
+
+
+@ACCEPTANCE
+def test_the_policy_of_the_project_gives_the_packets_of_its_own_run(
+    tmp_path: Path, env: gymnasium.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is learnt in an environment holds for the node in the project."""
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    from policy import push
+
+    weights = np.loadtxt(EXAMPLE / "weights.txt")
+    taken_over = env.unwrapped.session  # type: ignore[attr-defined]
+    taken_over.reset(seed=5)
+    project = neuros.Project.from_file(EXAMPLE)
+    with project.session(backend="in-process", seed=5, output=tmp_path / "run") as s:
+        for _ in range(5):
+            joints = taken_over["cart.joints"].packet
+            assert joints == s["cart.joints"].packet
+            force = push(weights, joints.position, joints.velocity)
+            taken_over.send("cart.force", Float64(data=force))
+            taken_over.step()
+            s.step()
+
+
+@ACCEPTANCE
+class TestVectors:
+    def test_side_by_side_in_one_process_and_in_several(self, tmp_path: Path) -> None:
+        found = []
+        for kind in (SyncVectorEnv, AsyncVectorEnv):
+            envs = kind([cart_pole, cart_pole])
+            try:
+                seen, _ = envs.reset(seed=[3, 4])
+                assert seen[POSITION].shape == (2, 2)
+                seen, rewards, *_ = envs.step(np.array([[0.5], [0.5]]))
+                assert rewards.tolist() == [1.0, 1.0]
+                found.append(seen[POSITION].tolist())
+            finally:
+                envs.close()
+        assert found[0] == found[1]
+        assert found[0][0] != found[0][1]
+
+
+SENDER = """
+from neuros.hooks import neuros_function, Optional
+
+@neuros_function(inputs=[Optional("order"), Optional("flag")], outputs=["scan", "imu", "done"])
+def step(node, order, flag):
+    scan, imu, done = (node.make_packet(name) for name in ("scan", "imu", "done"))
+    scan.data = bytes([1, 2, 3, 4, 5, 6])
+    imu.header.stamp.sec = 5
+    imu.angular_velocity.z = 2.0 if order is None else order.linear.x
+    imu.orientation_covariance[8] = 9.0
+    done.data = flag is not None and flag.data
+    return scan, imu, done
+"""
+
+
+@pytest.fixture
+def sensors(tmp_path: Path) -> Path:
+    """A node with messages of many kinds."""
+    (tmp_path / "sender.py").write_text(SENDER)
+
+    def port(name: str, kind: str) -> dict[str, str]:
+        return {"name": name, "type": kind}
+
+    node = {
+        "name": "robot",
+        "plugin": "sender.py",
+        "container": "neuros_python",
+        "inputs": [port("order", "geometry_msgs/msg/Twist"), port("flag", "std_msgs/msg/Bool")],
+        "outputs": [
+            port("scan", "sensor_msgs/msg/Image"),
+            port("imu", "sensor_msgs/msg/Imu"),
+            port("done", "std_msgs/msg/Bool"),
+        ],
+    }
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
+    return tmp_path
+
+
+NOT_CONNECTED = pytest.mark.filterwarnings("ignore:.*of node 'robot' is not connected")
+
+
+@NOT_CONNECTED
+def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
+    env = neuros.gym.make(
+        sensors,
+        action=["robot.order", "robot.flag"],
+        observation=["robot.scan.data[2,3]", "robot.imu", "robot.imu.angular_velocity"],
+        reward=lambda env: env.observation["robot.imu.angular_velocity"][2],
+        done=lambda env: env.session["robot.done"].packet.data,
+        ranges={"robot.order": (-2, [1, 2, 3, 4, 5, 6])},
+    )
+    try:
+        seen = env.observation_space
+        assert isinstance(seen, gymnasium.spaces.Dict)
+        assert seen["robot.scan.data"] == gymnasium.spaces.Box(0, 255, (2, 3), np.uint8)
+        # 4 of the orientation, 3 + 3 of the rates, and three times 9 covariances: no stamp.
+        assert seen["robot.imu"].shape == (37,)
+        assert isinstance(env.action_space, gymnasium.spaces.Dict)
+        order = env.action_space["robot.order"]
+        assert order == gymnasium.spaces.Box(
+            np.full(6, -2.0), np.arange(1.0, 7.0), dtype=np.float64
+        )
+        assert env.action_space["robot.flag"] == gymnasium.spaces.Box(0, 1, (1,), np.uint8)
+        first, _ = env.reset(seed=1)
+        assert env.observation_space.contains(first)
+        assert first["robot.scan.data"].tolist() == [[1, 2, 3], [4, 5, 6]]
+        assert first["robot.imu"][12] == 9.0
+        assert first["robot.imu.angular_velocity"].tolist() == [0.0, 0.0, 2.0]
+        action = {"robot.order": np.array([0.5, 0, 0, 0, 0, 0]), "robot.flag": np.array([1])}
+        seen_then, reward, terminated, *_ = env.step(action)
+        assert reward == seen_then["robot.imu.angular_velocity"][2] == 0.5
+        assert terminated
+    finally:
+        env.close()
+
+
+@NOT_CONNECTED
+@pytest.mark.parametrize(
+    ("changed", "complaint"),
+    [
+        ({"observation": "robot.scann"}, r"did you mean 'robot\.scan'\?"),
+        ({"observation": "robot.order"}, "no such output"),
+        ({"observation": "robot.imu.rate"}, r"there are robot\.imu\.orientation\.x, "),
+        ({"observation": "robot.scan.data"}, r"length of robot\.scan\.data is not known: .*\[3\]'"),
+        ({"observation": "robot.imu[7]"}, "its messages have 37 numbers, not 7"),
+        ({"observation": "robot"}, r"say node\.port, node\.port\.field or"),
+        ({"action": "robot.imu"}, "the output is connected to no input"),
+        ({"ranges": {"robot.imu": (0, 1)}}, "ranges: 'robot.imu' is none of robot.order, robot"),
+        ({"ranges": {"robot.order": (0, [1, 2])}}, "range of robot.order: "),
+        ({"model": "nothing.xml"}, "nothing.xml"),
+    ],
+)
+def test_what_cannot_be_is_said_with_what_can(
+    sensors: Path, changed: dict[str, Any], complaint: str
+) -> None:
+    arguments = {"action": "robot.order", "observation": "robot.done", "reward": float}
+    with pytest.raises(UsageError, match=complaint):
+        neuros.gym.make(sensors, **(arguments | changed))
+    assert not (sensors / "runs").exists()
+
+
+@ACCEPTANCE
+@NOT_CONNECTED
+def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors: Path) -> None:
+    arguments = {"action": "robot.order", "observation": "robot.scan.data[7]", "reward": float}
+    env = neuros.gym.make(sensors, **arguments)
+    try:
+        with pytest.raises(UsageError, match=r"robot\.scan\.data holds 6 numbers, not 7"):
+            env.reset()
+    finally:
+        env.close()
+
+
+@ACCEPTANCE
+@NOT_CONNECTED
+def test_a_project_that_waits_for_a_command_gets_one_at_each_reset(tmp_path: Path) -> None:
+    def brain(**others: Any) -> gymnasium.Env[Any, Any]:
+        return neuros.gym.make(
+            cart(tmp_path / str(len(others))),
+            action="robot.pose",
+            observation="brain.command",
+            reward=float,
+            **others,
+        )
+
+    for folder in ("0", "1"):
+        (tmp_path / folder).mkdir()
+    waiting, served = brain(), brain(initial_action=[4.0])
+    try:
+        with pytest.raises(UsageError, match=r"brain\.command has sent nothing.*initial_action"):
+            waiting.reset()
+        for _ in range(2):
+            assert served.reset()[0].tolist() == [-2.0]
+    finally:
+        waiting.close()
+        served.close()
+
+
+def test_a_project_with_problems_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    (tmp_path / "project.json").write_text("{}")
+    with pytest.raises(ProjectError):
+        neuros.gym.make(tmp_path, action="a.b", observation="a.c", reward=float)
+
+
+def test_without_gymnasium_the_command_that_installs_it_is_told() -> None:
+    program = "import sys; sys.modules['gymnasium'] = None\nimport neuros.gym"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert re.search(r"EnvironmentFault: neuros\.gym needs Gymnasium.*(extras rl|\[rl\])", last)
+
+
+def test_the_code_of_the_page_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(shutil.copytree(EXAMPLE, tmp_path / "cartpole"))
+    codes = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    exec(compile("\n".join(codes), str(PAGE), "exec"), {"__name__": "page"})
+    assert "steps" in capsys.readouterr().out
+
+
+@ACCEPTANCE
+def test_a_policy_is_learnt_in_two_minutes_and_balances_as_a_node(tmp_path: Path) -> None:
+    made = shutil.copytree(EXAMPLE, tmp_path / "cartpole")
+    (made / "weights.txt").write_text("0\n0\n0\n0\n")
+    project = neuros.Project.from_file(made)
+    before = project.run(backend="in-process", duration="10sim", output=tmp_path / "before")
+    subprocess.run([sys.executable, "train.py"], cwd=made, check=True)
+    for seed in (1, 2, 3):
+        run = project.run(backend="in-process", duration="10sim", seed=seed).check()
+        assert run.node_results["policy"]["upright_s"] > 9.9
+    assert before.node_results["policy"]["upright_s"] < 3.0
