@@ -35,10 +35,13 @@ from neuros.project.suggest import did_you_mean
 from neuros.project.validate import violations
 
 STANDARD_CONTAINERS = frozenset(
-    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
+    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow", "neuros_nir"}
 )
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
+NETWORK_MODULE = "neuros.snn.nir.plugin"
+"""The plugin of nodes with ``"network"``; the file is in the variable :data:`NETWORK`."""
+NETWORK = "NETWORK"
 _T = TypeVar("_T")
 _OWN_VARIABLES = frozenset(
     f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE", "GUARDED_RUN")
@@ -78,6 +81,10 @@ class _Builder:
                     paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
         module, plugin = self._plugin(element)
+        if element.member("network") is not None:
+            module, plugin = NETWORK_MODULE, find_module(NETWORK_MODULE) or Path()
+            environment[NETWORK] = str(self._file(element, "network") or "")
+            paths.append(NETWORK)
         return Node(
             name=element.string("name") or "",
             container=container_in_place_of(element.string("container") or ""),
