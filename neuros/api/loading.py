@@ -13,9 +13,9 @@ from neuros.distribution import WORKSPACE, install_command
 from neuros.errors import Problem, ProjectError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
-from neuros.project.load import NETWORK, NETWORK_MODULE, Loaded, load_project
+from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
-from neuros.project.model import Node
+from neuros.project.model import NETWORK, NETWORK_MODULE, Node
 from neuros.project.modules import why_not
 from neuros.project.scanner import display_name, place_of
 

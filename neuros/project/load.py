@@ -17,7 +17,16 @@ from neuros.project.checks import (
     unread_variables,
 )
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
-from neuros.project.model import Budgets, Connection, Node, Port, Project, parameters_of
+from neuros.project.model import (
+    NETWORK,
+    NETWORK_MODULE,
+    Budgets,
+    Connection,
+    Node,
+    Port,
+    Project,
+    parameters_of,
+)
 from neuros.project.modules import find_module, is_module_name, why_not
 from neuros.project.parsed import (
     ParsedProject,
@@ -39,9 +48,6 @@ STANDARD_CONTAINERS = frozenset(
 )
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
-NETWORK_MODULE = "neuros.snn.nir.plugin"
-"""The plugin of nodes with ``"network"``; the file is in the variable :data:`NETWORK`."""
-NETWORK = "NETWORK"
 _T = TypeVar("_T")
 _OWN_VARIABLES = frozenset(
     f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE", "GUARDED_RUN")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,12 @@ import nir
 import numpy as np
 import pytest
 
+from neuros.api import loading
+from neuros.api.loading import load_with_messages
+from neuros.backends.docker.back_end import _check_modules
+from neuros.errors import ProjectError
 from neuros.project.model import Node, Port
+from neuros.project.split import project_to_json
 from neuros.snn.nir.graph import NetworkError, read_graph
 from neuros.snn.nir.network import Network, discretisation_of, problems_of
 from neuros.testing import PluginHarness
@@ -390,3 +397,71 @@ class TestNode:
             "the parameter 'exporter' must be 'nir', 'norse' or 'snntorch'",
             "the parameter 'reset' must be 'subtract', 'v_reset' or 'none'",
         ]
+
+
+class TestProject:
+    """The key ``network`` of a node."""
+
+    @pytest.fixture
+    def project(self, tmp_path: Path) -> Path:
+        (tmp_path / "net.nir").write_bytes((TRACES / "leaky_zero_now.nir").read_bytes())
+        port = {"type": MULTI, "external_topic": "/topic"}
+        node = {
+            "name": "brain",
+            "container": "neuros_nir",
+            "network": "net.nir",
+            "inputs": [{"name": "input", **port}],
+            "outputs": [{"name": "output", **port}],
+            "parameters": {"exporter": "snntorch"},
+        }
+        (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
+        return tmp_path
+
+    def problems(self, project: Path, *settings: str) -> list[str]:
+        with pytest.raises(ProjectError) as caught:
+            load_with_messages(project, settings)
+        return [f"{each.pointer}: {each.text}" for each in caught.value.problems]
+
+    def test_it_is_a_plugin_of_neuros_with_the_file_in_its_environment(self, project: Path) -> None:
+        loaded, _ = load_with_messages(project)
+        (node,) = loaded.project.nodes
+        assert not loaded.warnings
+        assert node.module == "neuros.snn.nir.plugin"
+        assert node.environment == {"NETWORK": str(project / "net.nir")}
+        assert node.environment_paths == ("NETWORK",)
+
+    def test_what_is_written_for_a_run_is_a_project_of_the_same_nodes(self, project: Path) -> None:
+        nodes = load_with_messages(project)[0].project.nodes
+        (project / "expanded.json").write_text(
+            json.dumps(project_to_json(load_with_messages(project)[0].project))
+        )
+        (again,) = load_with_messages(project / "expanded.json")[0].project.nodes
+        assert replace(again, file=nodes[0].file) == nodes[0]
+
+    def test_its_container_in_docker_has_what_it_needs(self, project: Path) -> None:
+        _check_modules(load_with_messages(project)[0].project.nodes, project)
+
+    def test_a_missing_file_and_one_that_is_no_network_are_told(self, project: Path) -> None:
+        (told,) = self.problems(project, "nodes.brain.network=nor.nir")
+        assert told.startswith("/nodes/0/network: ")
+        assert "nor.nir" in told
+        (project / "net.nir").write_text("nothing")
+        (told,) = self.problems(project)
+        assert told.startswith("/nodes/0/network: net.nir is no network in NIR: ")
+
+    def test_a_plugin_beside_it_is_one_too_many(self, project: Path) -> None:
+        (told,) = self.problems(project, "nodes.brain.plugin=json.decoder")
+        assert told == "/nodes/0: needs exactly one of 'plugin' or 'network'"
+
+    def test_one_that_names_no_exporter_is_warned_of(self, project: Path) -> None:
+        (warning,) = load_with_messages(project, ["nodes.brain.parameters.exporter="])[0].warnings
+        assert "is stepped by NIR's own equations" in warning.text
+
+    def test_without_h5py_here_it_is_left_to_the_node(
+        self, project: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(loading, "find_spec", lambda name: None)
+        (project / "net.nir").write_text("nothing")
+        (warning,) = load_with_messages(project)[0].warnings
+        assert warning.text == "the network is not checked before it runs"
+        assert "nir" in warning.hint
