@@ -53,7 +53,8 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    if problems := [each for node in loaded.project.nodes for each in _network_problems(node)]:
+    nodes = loaded.project.nodes if reads_plugins else ()
+    if problems := [problem for node in nodes for problem in _network_problems(node)]:
         raise ProjectError(problems)
     doubts = (
         *_misspelt(loaded),
@@ -107,7 +108,7 @@ def _network_problems(node: Node) -> Iterator[Problem]:
     if node.module == NETWORK_MODULE and find_spec("h5py"):
         from neuros.snn.nir.network import problems_of
 
-        for text in problems_of(node, Path(node.environment[NETWORK])):
+        for text in problems_of(node, Path(node.environment.get(NETWORK, ""))):
             yield _at_network(node, text)
 
 

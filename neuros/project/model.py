@@ -95,7 +95,7 @@ class Node:
     def plugin_name(self) -> str:
         """What to call the plugin, or the network in its place."""
         if self.module == NETWORK_MODULE:
-            return Path(self.environment[NETWORK]).name
+            return Path(self.environment.get(NETWORK, "")).name
         return self.module or self.plugin.name
 
     @property
