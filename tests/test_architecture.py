@@ -84,6 +84,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
+    "snn.nir.graph": {"numpy", "h5py"},
     "tf": {"geometry_msgs"},
     "snn.kernel": {"numpy", "nest"},
     "simulators.convert": {"mujoco", "numpy"},

@@ -181,7 +181,9 @@ def test_the_page_that_says_more_on_an_option_exists(option: Option) -> None:
     assert not anchor or anchor in anchors(ROOT / "docs" / file)
 
 
-def files_named_in(value: Any, keys: tuple[str, ...] = ("plugin", "script")) -> Iterator[str]:
+def files_named_in(
+    value: Any, keys: tuple[str, ...] = ("plugin", "script", "network")
+) -> Iterator[str]:
     """The plugins and scripts that a project, or node, names."""
     if isinstance(value, dict):
         yield from (value[key] for key in keys if isinstance(value.get(key), str))

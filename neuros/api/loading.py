@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.backends.containers import find_container, misspelt
-from neuros.distribution import WORKSPACE
+from neuros.distribution import WORKSPACE, install_command
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
-from neuros.project.model import Project
+from neuros.project.model import NETWORK, NETWORK_MODULE, Node, Project
 from neuros.project.modules import why_not
 from neuros.project.scanner import display_name, place_of
 from neuros.recording.provenance import seeds
@@ -53,7 +54,15 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    doubts = (*_misspelt(loaded), *_unknown_types(loaded, workspaces), *_unknown_plugins(loaded))
+    nodes = loaded.project.nodes if reads_plugins else ()
+    if problems := [problem for node in nodes for problem in _network_problems(node)]:
+        raise ProjectError(problems)
+    doubts = (
+        *_misspelt(loaded),
+        *_unknown_types(loaded, workspaces),
+        *_unknown_plugins(loaded),
+        *_network_doubts(loaded),
+    )
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
 
@@ -110,6 +119,31 @@ def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
                 hint = f"nothing in {container.folder} names '{package}'"
                 place = place_of(node.file, pointer)
                 yield Problem(display_name(node.file), *place, pointer, text, hint)
+
+
+def _network_problems(node: Node) -> Iterator[Problem]:
+    """What is wrong with the network of a node, as far as this Python can read it."""
+    if node.module == NETWORK_MODULE and find_spec("h5py"):
+        from neuros.snn.nir.network import problems_of
+
+        for text in problems_of(node, Path(node.environment.get(NETWORK, ""))):
+            yield _at_network(node, text)
+
+
+def _network_doubts(loaded: Loaded) -> Iterator[Problem]:
+    for node in loaded.project.nodes:
+        if node.module == NETWORK_MODULE and not find_spec("h5py"):
+            hint = f"h5py is not here: {install_command('nir')}"
+            yield _at_network(node, "the network is not checked before it runs", hint)
+        if node.module == NETWORK_MODULE and "exporter" not in node.parameters:
+            text = "is stepped by NIR's own equations, and other libraries have others"
+            hint = 'say which: "parameters": {"exporter": "snntorch"}, see docs/nir.md'
+            yield _at_network(node, text, hint)
+
+
+def _at_network(node: Node, text: str, hint: str = "") -> Problem:
+    pointer = f"{node.pointer}/network"
+    return Problem(display_name(node.file), *place_of(node.file, pointer), pointer, text, hint)
 
 
 def _names_package(folder: Path, package: str) -> bool:

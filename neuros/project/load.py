@@ -17,7 +17,16 @@ from neuros.project.checks import (
     unread_variables,
 )
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
-from neuros.project.model import Budgets, Connection, Node, Port, Project, parameters_of
+from neuros.project.model import (
+    NETWORK,
+    NETWORK_MODULE,
+    Budgets,
+    Connection,
+    Node,
+    Port,
+    Project,
+    parameters_of,
+)
 from neuros.project.modules import find_module, is_module_name, why_not
 from neuros.project.parsed import (
     ParsedProject,
@@ -35,7 +44,7 @@ from neuros.project.suggest import did_you_mean
 from neuros.project.validate import violations
 
 STANDARD_CONTAINERS = frozenset(
-    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"}
+    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow", "neuros_nir"}
 )
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
@@ -78,6 +87,10 @@ class _Builder:
                     paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
         module, plugin = self._plugin(element)
+        if element.member("network") is not None:
+            module, plugin = NETWORK_MODULE, find_module(NETWORK_MODULE) or Path()
+            environment[NETWORK] = str(self._file(element, "network") or "")
+            paths.append(NETWORK)
         return Node(
             name=element.string("name") or "",
             container=container_in_place_of(element.string("container") or ""),

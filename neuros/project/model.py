@@ -19,6 +19,10 @@ from neuros.project.resources import Access, Resources
 Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, ...]"
 """What a ROS parameter holds here."""
 
+NETWORK_MODULE = "neuros.snn.nir.plugin"
+"""The plugin of nodes with ``"network"``; the file is in the variable :data:`NETWORK`."""
+NETWORK = "NETWORK"
+
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -90,7 +94,9 @@ class Node:
 
     @property
     def plugin_name(self) -> str:
-        """What to call the plugin."""
+        """What to call the plugin, or the network in its place."""
+        if self.module == NETWORK_MODULE:
+            return Path(self.environment.get(NETWORK, "")).name
         return self.module or self.plugin.name
 
     @property

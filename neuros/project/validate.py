@@ -136,6 +136,8 @@ def _validator(name: str, part: str = "") -> Any:
 
 def _sentences(error: Any, root: Element) -> Iterator[Problem]:
     element = root.at(error.absolute_path)
+    if error.validator == "oneOf" and not isinstance(element.value, dict):
+        return  # its type is told
     if "propertyNames" in error.schema_path:
         member = element.value[error.instance]
         yield member.key_problem(

@@ -107,8 +107,8 @@ def _check_modules(nodes: Sequence[Node], project: Path) -> None:
     """
     for node in nodes:
         container = find_container(node.container, project)
-        if node.module and container and container.is_own:
-            package = node.module.partition(".")[0]
+        package = node.module.partition(".")[0]
+        if package not in ("", "neuros") and container and container.is_own:
             raise EnvironmentFault(
                 f"the plugin of node '{node.name}' is {node.module}, and the container"
                 f" {node.container} has no package {package}: name it in"

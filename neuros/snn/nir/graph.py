@@ -1,0 +1,338 @@
+"""Reads the graph of a network out of a file in NIR (HDF5), and puts its nodes in order.
+
+Files come from strangers: kinds, links and sizes are looked at before an array is read. Everything
+that is wrong is told at once. Source of the format: ``nir.serialization``, nir 1.0.8.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuros.distribution import install_command
+from neuros.errors import NodeError
+from neuros.project.suggest import listed
+
+MOST_BYTES = 1 << 30
+"""Of all parameters of a file."""
+MOST_VALUES = 1 << 24
+"""That one node takes, gives or holds."""
+_MOST_NODES, _MOST_EDGES, _DEEPEST, _LONGEST_NAME = 1000, 10_000, 20, 1000
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+_NEURON = ("r", "v_leak")
+_POOL = ("kernel_size", "stride", "padding")
+_CONVOLUTION = ("weight", "bias", "stride", "padding", "dilation", "groups")
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "Input": ("shape",),
+    "Output": (),
+    "Affine": ("weight", "bias"),
+    "Linear": ("weight",),
+    "Scale": ("scale",),
+    "Threshold": ("threshold",),
+    "Delay": ("delay",),
+    "Flatten": ("start_dim", "end_dim"),
+    "Conv1d": _CONVOLUTION,
+    "Conv2d": _CONVOLUTION,
+    "SumPool2d": _POOL,
+    "AvgPool2d": _POOL,
+    "I": ("r",),
+    "IF": ("r", "v_threshold"),
+    "LI": ("tau", *_NEURON),
+    "LIF": ("tau", *_NEURON, "v_threshold"),
+    "CubaLI": ("tau_mem", "tau_syn", *_NEURON),
+    "CubaLIF": ("tau_mem", "tau_syn", *_NEURON, "v_threshold"),
+}
+"""By the kinds of NIR that are supported, beside NIRGraph; a node needs all of them."""
+NEURONS = ("I", "IF", "LI", "LIF", "CubaLI", "CubaLIF")
+"""Those with a state: what they gave in the last step is known before they are stepped."""
+_OPTIONAL = {"v_reset": 0.0, "w_in": 1.0}
+_DIMENSIONS = {"Conv1d": 3, "Conv2d": 4}
+
+
+class NetworkError(NodeError):
+    """All that is wrong with a network, or with the parameters of its node."""
+
+    def __init__(self, problems: list[str]) -> None:
+        self.problems = problems
+        super().__init__("; ".join(problems))
+
+
+@dataclass(frozen=True)
+class Part:
+    """A node of NIR: its kind, its parameters, and the nodes whose outputs it takes the sum of."""
+
+    kind: str
+    values: Mapping[str, Any]
+    sources: tuple[str, ...]
+    is_recurrent: bool = False
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A network without nested graphs: nodes by path (``rnn/lif``), in the order of evaluation.
+
+    A source that comes later in this order is a neuron, of which the last step's output is taken.
+    """
+
+    parts: Mapping[str, Part]
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """Of the nodes of a kind; of ``Input`` and ``Output`` those of the network itself."""
+        return tuple(sorted(path for path, part in self.parts.items() if part.kind == kind))
+
+
+def read_graph(path: Path) -> Graph:
+    """The network in a file.
+
+    Raises:
+        NetworkError: it is no network in NIR, or has what is not supported.
+    """
+    try:
+        import h5py
+    except ImportError:
+        text = f"networks in NIR are read with h5py, which is not here: {install_command('nir')}"
+        raise NetworkError([text]) from None
+    reader = _Reader(h5py)
+    try:
+        with h5py.File(path, "r") as file:
+            reader.read(file)
+    except NetworkError:
+        raise
+    except Exception as error:  # whatever h5py raises on a damaged file
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise NetworkError([f"{path.name} is no network in NIR: {lines[0]}"]) from None
+    if reader.problems:
+        raise NetworkError(reader.problems)
+    return Graph(_in_order(reader))
+
+
+class _Reader:
+    """Reads nodes and edges, and notes what is wrong.
+
+    Attributes:
+        kinds: by path; ``NIRGraph`` for the nested ones.
+        feeders: by path, where its input comes from; of a nested graph its Input and Output.
+    """
+
+    def __init__(self, h5py: Any) -> None:
+        self._h5py = h5py
+        self._bytes_left = MOST_BYTES
+        self.problems: list[str] = []
+        self.kinds: dict[str, str] = {}
+        self.values: dict[str, dict[str, Any]] = {}
+        self.feeders: dict[str, list[str]] = {}
+
+    def read(self, file: Any) -> None:
+        node = self._child(file, "node", self._h5py.Group)
+        kind = self._text(node, "type")
+        if kind != "NIRGraph":
+            raise NetworkError([f"the file holds one {kind or 'thing'}, and no NIRGraph"])
+        self._graph(node, "")
+        for kind in ("Input", "Output"):
+            if not any(k == kind and "/" not in path for path, k in self.kinds.items()):
+                self.problems.append(f"the network has no {kind}")
+
+    def _graph(self, group: Any, prefix: str) -> None:
+        if prefix.count("/") > _DEEPEST:
+            raise NetworkError([f"graphs lie more than {_DEEPEST} deep in each other"])
+        nodes = self._child(group, "nodes", self._h5py.Group)
+        for name in nodes:
+            if len(self.kinds) >= _MOST_NODES:
+                raise NetworkError([f"the network has more than {_MOST_NODES} nodes"])
+            path = prefix + name[:_LONGEST_NAME]
+            node = self._child(nodes, name, self._h5py.Group)
+            kind = self.kinds[path] = self._text(node, "type")
+            self.feeders[path] = []
+            if kind == "NIRGraph":
+                self._graph(node, f"{path}/")
+            elif kind in PARAMETERS:
+                self._parameters(node, path, kind)
+            else:
+                text = f"node '{path}': NIR's {kind} is not supported"
+                self.problems.append(text if kind else f"node '{path}' has no type")
+        for source, target in self._edges(group):
+            self._connect(prefix, source, target)
+
+    def _connect(self, prefix: str, source: str, target: str) -> None:
+        for name in (source, target):
+            if prefix + name not in self.kinds:
+                text = f"there is no node '{prefix}{name}', which an edge names"
+                self.problems.append(text)
+                return
+        start = self._end(prefix + source, "Output")
+        end = self._end(prefix + target, "Input")
+        if start and end and start not in self.feeders[end]:
+            self.feeders[end].append(start)
+
+    def _end(self, path: str, kind: str) -> str:
+        """Where an edge begins or ends that names a nested graph."""
+        if self.kinds[path] != "NIRGraph":
+            return path
+        level = path.count("/") + 1
+        inner = [p for p in self.kinds if p.startswith(f"{path}/") and p.count("/") == level]
+        ends = [p for p in inner if self.kinds[p] == kind]
+        if len(ends) == 1:
+            return ends[0]
+        self.problems.append(f"nested graph '{path}' must have one {kind}, and has {len(ends)}")
+        return ""
+
+    def _edges(self, group: Any) -> Iterator[tuple[str, str]]:
+        edges = self._child(group, "edges", self._h5py.Dataset)
+        if edges.size == 0:
+            return
+        if edges.ndim != 2 or edges.shape[1] != 2 or len(edges) > _MOST_EDGES:
+            raise NetworkError([f"edges must be at most {_MOST_EDGES} pairs of names"])
+        for index in range(len(edges)):  # one by one: names of a file may share their bytes
+            pair = edges[index]
+            if max(map(len, pair)) > _LONGEST_NAME:
+                raise NetworkError([f"an edge has a name of more than {_LONGEST_NAME} bytes"])
+            yield pair[0].decode("utf-8"), pair[1].decode("utf-8")
+
+    def _parameters(self, node: Any, path: str, kind: str) -> None:
+        names = PARAMETERS[kind]
+        missing = [name for name in names if name not in node]
+        if missing:
+            text = f"node '{path}' ({kind}) has no {listed(missing)}"
+            self.problems.append(text)
+            return
+        values = self.values[path] = {name: self._value(node, name, path) for name in names}
+        if kind in NEURONS:
+            for name, default in _OPTIONAL.items():
+                has = name in node
+                values[name] = self._value(node, name, path) if has else np.float32(default)
+        dimensions = getattr(values.get("weight"), "ndim", 2)
+        if dimensions != _DIMENSIONS.get(kind, max(dimensions, 2)):
+            text = f"node '{path}' ({kind}) has weights of {dimensions} dimensions"
+            self.problems.append(text)
+        if kind == "Input" and math.prod(map(int, np.atleast_1d(values["shape"]))) > MOST_VALUES:
+            self.problems.append(f"node '{path}' takes more than {MOST_VALUES} values")
+
+    def _value(self, node: Any, name: str, path: str) -> Any:
+        """A number or an array of them; of ``padding`` a text, too."""
+        dataset = self._child(node, name, self._h5py.Dataset)
+        self._bytes_left -= dataset.nbytes
+        if self._bytes_left < 0:
+            raise NetworkError([f"the parameters are larger than {MOST_BYTES >> 20} MiB"])
+        if self._h5py.check_string_dtype(dataset.dtype) and name == "padding":
+            return self._text(node, name)
+        value = np.asarray(dataset[()])
+        if value.dtype.kind not in "iufb" or not (abs(value) < _LARGEST).all():
+            self.problems.append(f"node '{path}': '{name}' holds what is no number")
+        elif name.startswith("tau") and not (value > 0).all():
+            self.problems.append(f"node '{path}': '{name}' must be above 0")
+        elif name == "shape" and (value.dtype.kind not in "iu" or (value < 1).any()):
+            self.problems.append(f"node '{path}': '{name}' is no shape")
+        return value
+
+    def _text(self, group: Any, name: str) -> str:
+        if name not in group:
+            return ""
+        dataset = self._child(group, name, self._h5py.Dataset)
+        if not self._h5py.check_string_dtype(dataset.dtype) or dataset.shape != ():
+            return ""
+        return str(dataset[()].decode("utf-8"))[:_LONGEST_NAME]
+
+    def _child(self, group: Any, name: str, kind: type) -> Any:
+        """A group or dataset that lies in the file itself."""
+        link = group.get(name, getlink=True)
+        found = group[name] if isinstance(link, self._h5py.HardLink) else None
+        outside = getattr(found, "external", None) or getattr(found, "is_virtual", False)
+        if not isinstance(found, kind) or outside:
+            what = f"{group.name.rstrip('/')}/{name}"
+            raise NetworkError([f"{what} is not what NIR has there"])
+        return found
+
+
+# ---------------------------------------------------------------------- order
+
+
+def _in_order(reader: _Reader) -> dict[str, Part]:
+    """The nodes in the order of evaluation, nested graphs resolved.
+
+    A loop is cut behind a neuron, whose last output is taken: as late in the loop as can be, so
+    that what comes in passes all nodes in one step, and only what goes back takes another one.
+    """
+    sources = _sources(reader)
+    reach, depth = _reach(sources), _depth(sources)
+    order: dict[str, Part] = {}
+    left = sorted(sources)
+    while left:
+        ready = [path for path in left if all(each in order for each in sources[path])]
+        if not ready:
+            ready = [
+                path
+                for path in left
+                if all(
+                    each in order or (reader.kinds[each] in NEURONS and each in reach[path])
+                    for each in sources[path]
+                )
+            ]
+            ready = sorted(ready, key=lambda path: (-depth.get(path, 0), path))[:1]
+        if not ready:
+            raise NetworkError([f"a loop has no neuron that could delay it: {listed(left)}"])
+        for path in ready:
+            left.remove(path)
+            kind = reader.kinds[path]
+            values = reader.values[path]
+            order[path] = Part(kind, values, tuple(sources[path]), path in reach[path])
+    return order
+
+
+def _sources(reader: _Reader) -> dict[str, list[str]]:
+    """By path, the nodes that feed it; Inputs and Outputs of nested graphs are passed through."""
+    inner = {p for p, kind in reader.kinds.items() if kind in ("Input", "Output") and "/" in p}
+    resolved: dict[str, list[str]] = {}
+
+    def origins(path: str, through: tuple[str, ...]) -> list[str]:
+        if path not in inner:
+            return [path]
+        if path in through:
+            raise NetworkError([f"a loop has no neuron that could delay it: {listed(through)}"])
+        if path not in resolved:
+            found = [each for p in reader.feeders[path] for each in origins(p, (*through, path))]
+            if len(found) > _MOST_EDGES:
+                raise NetworkError([f"the network has more than {_MOST_EDGES} edges"])
+            resolved[path] = found
+        return resolved[path]
+
+    sources: dict[str, list[str]] = {}
+    for path, kind in reader.kinds.items():
+        if kind != "NIRGraph" and path not in inner:
+            sources[path] = [each for p in reader.feeders[path] for each in origins(p, ())]
+            if not sources[path] and kind != "Input":
+                raise NetworkError([f"nothing leads to node '{path}' ({kind})"])
+    return sources
+
+
+def _reach(sources: Mapping[str, list[str]]) -> dict[str, set[str]]:
+    """By path, all nodes that its output gets to."""
+    targets: dict[str, set[str]] = {path: set() for path in sources}
+    for path, feeders in sources.items():
+        for each in feeders:
+            targets[each].add(path)
+
+    def from_(path: str) -> set[str]:
+        found, fresh = set[str](), {path}
+        while fresh:
+            fresh = set().union(*(targets[each] for each in fresh)) - found
+            found |= fresh
+        return found
+
+    return {path: from_(path) for path in sources}
+
+
+def _depth(sources: Mapping[str, list[str]]) -> dict[str, int]:
+    """By path, how many edges it is away from the nearest Input."""
+    depth = {path: 0 for path, feeders in sources.items() if not feeders}
+    fresh = set(depth)
+    for level in range(1, len(sources) + 1):
+        fresh = {p for p, feeders in sources.items() if p not in depth and fresh & {*feeders}}
+        depth |= dict.fromkeys(fresh, level)
+    return depth

@@ -1,0 +1,49 @@
+"""The plugin of nodes with ``"network"``: one packet of each input is one step of the network."""
+
+from __future__ import annotations
+
+import os
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuros.errors import NodeError
+from neuros.hooks import neuros_function, neuros_initialise
+from neuros.snn.nir.graph import read_graph
+from neuros.snn.nir.network import Network, discretisation_of
+
+_GRAPH = read_graph(Path(os.environ["NETWORK"]))
+_INPUTS, _OUTPUTS = _GRAPH.names("Input"), _GRAPH.names("Output")
+
+
+@neuros_initialise()
+def build(node: Any) -> None:
+    node.set_user_data(Network(_GRAPH, discretisation_of(node.description.parameters)))
+
+
+@neuros_function(inputs=_INPUTS, outputs=_OUTPUTS)
+def step(node: Any, *packets: Any) -> list[Any]:
+    network, values = node.get_user_data(), {}
+    for name, packet in zip(_INPUTS, packets, strict=True):
+        given, shape = np.asarray(packet.data, np.float32), network.inputs[name]
+        if given.size != np.prod(shape):
+            text = f"input '{name}' has {given.size} values, and the network takes {shape}"
+            raise NodeError(text)
+        values[name] = given.reshape(shape)
+    found = network.step(values)
+    return [_packet(node, name, found[name]) for name in _OUTPUTS]
+
+
+def _packet(node: Any, name: str, values: Any) -> Any:
+    packet = node.make_packet(name)
+    if isinstance(packet.data, array):
+        code = packet.data.typecode
+        packet.data = array(code, values.astype(code).tobytes())
+    elif values.size == 1:
+        packet.data = values.item()
+    else:
+        text = f"output '{name}' carries one value, and the network gives {values.shape}"
+        raise NodeError(text)
+    return packet
