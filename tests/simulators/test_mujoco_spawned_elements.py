@@ -238,3 +238,89 @@ def test_the_published_experiment_declares_the_sensors_of_the_robot_that_it_spaw
     run = launch(project, "--backend", backend, "--duration", "2.1sim", cwd=tmp_path)
     assert run.exit_code == 0, run.output
     assert run.said("visualiser")[:2] == ["1 s: turned 1.0, close", "2 s: turned 2.0, close"]
+
+
+def test_what_is_removed_is_gone_and_all_else_stays_as_it_is(tmp_path: Path) -> None:
+    outputs = {"imu": imu("two/imu")}
+    drive = {"joints": ["two/shoulder"], "drive": "velocity", "kv": 100.0}
+    _, sim = simulation(tmp_path, outputs, {"go": (FLOATS, drive)}, spawned=("one", "two"))
+    _, other = simulation(tmp_path, outputs, {"go": (FLOATS, drive)}, spawned=("one", "two"))
+    for each in (sim, other):
+        each.command("go", Float64MultiArray(data=[3.0]))
+        each.actuate("two/turn", 1.0)
+        each.data.body("two/body").xfrc_applied[5] = 0.5
+        each.step_synchronous(10)
+    sim.remove_entity("one")
+    assert not [name for name in ("one/body", "one/arm") if name in sim_bodies(sim)]
+    assert sim.model.nu == other.model.nu - 1
+    for name in ("box_free", "turn", "two/turn", "two/shoulder"):
+        kept, before = sim.data.joint(name), other.data.joint(name)
+        for field in ("qpos", "qvel", "qacc_warmstart"):
+            assert (getattr(kept, field) == getattr(before, field)).all(), (name, field)
+    assert sim.data.body("two/body").xfrc_applied[5] == 0.5
+    assert sim.data.actuator("two/turn").ctrl == 1.0
+    for each in (sim, other):
+        each.step_synchronous(10)
+    packet, same = sim.read("imu"), other.read("imu")
+    assert stamp_ns(packet) == stamp_ns(same) == 20_000_000
+    # The solver's tolerance depends on all masses, so the last digits differ.
+    assert packet.angular_velocity.z == pytest.approx(same.angular_velocity.z, rel=1e-3)
+    assert packet.angular_velocity.z > 0.1
+
+
+def sim_bodies(sim: MuJoCo) -> list[str]:
+    return [sim.model.body(index).name for index in range(sim.model.nbody)]
+
+
+def test_things_come_and_go_under_one_name(tmp_path: Path) -> None:
+    _, sim = simulation(tmp_path, spawned=())
+    bodies = sim_bodies(sim)
+    for _ in range(3):
+        sim.spawn_entity("cup.xml", (0, 0, 0), "cup")
+        sim.step_synchronous(5)
+        sim.remove_entity("cup")
+        assert sim_bodies(sim) == bodies
+        sim.step_synchronous(5)
+    assert sim.sim_time == pytest.approx(0.03)
+
+
+def test_declared_elements_of_what_is_removed_wait_for_another(tmp_path: Path) -> None:
+    node, sim = simulation(tmp_path, {"imu": imu("robot/imu")})
+    sim.step_to_next()
+    sim.remove_entity("robot")
+    with pytest.raises(ModelError, match="no site or body 'robot/imu'"):
+        sim.step_to_next()
+    sim.spawn_entity("robot.xml", (0, 0, 0), "robot")
+    assert sim.read("imu") is not None
+    sim.step_to_next()
+    assert stamp_ns(sim.read("imu")) == 40_000_000
+    sim.run_asynchronous(None)
+    with pytest.raises(ModelError, match=r"'robot' has sensors or actuators .*stop"):
+        sim.remove_entity("robot")
+    node.close()
+
+
+def test_what_was_never_spawned_cannot_be_removed(tmp_path: Path) -> None:
+    _, sim = simulation(tmp_path)
+    with pytest.raises(ModelError, match=r"no spawned entity 'robt' \(did you mean 'robot'"):
+        sim.remove_entity("robt")
+    with pytest.raises(ModelError, match="no spawned entity 'box'"):
+        sim.remove_entity("box")
+
+
+def test_a_constraint_that_was_switched_off_stays_so_and_a_mocap_body_in_its_place(
+    tmp_path: Path,
+) -> None:
+    hand = '<body name="hand" mocap="true"/></worldbody>'
+    held = '<equality><connect body1="hand" body2="cup" anchor="0 0 0"/></equality></mujoco>'
+    _, sim = simulation(tmp_path, spawned=())
+    (tmp_path / "held.xml").write_text(
+        CUP.replace("</worldbody>", hand).replace("</mujoco>", held), "utf-8"
+    )
+    for name in ("one", "two", "three"):
+        sim.spawn_entity("held.xml", (0, 0, 0), name)
+    sim.data.eq_active[1] = 0
+    sim.data.mocap_pos[:, 0] = [1, 2, 3]
+    sim.remove_entity("one")
+    assert sim.data.eq_active.tolist() == [0, 1]
+    assert sim.data.mocap_pos[:, 0].tolist() == [2, 3]

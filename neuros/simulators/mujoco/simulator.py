@@ -78,12 +78,12 @@ class MuJoCo:
 
     @property
     def model(self) -> Any:
-        """The ``mujoco.MjModel``; another one after :meth:`spawn_entity`."""
+        """The ``mujoco.MjModel``; another one when entities come or go."""
         return self._world.model
 
     @property
     def data(self) -> Any:
-        """The ``mujoco.MjData``; another one after :meth:`spawn_entity`."""
+        """The ``mujoco.MjData``; another one when entities come or go."""
         return self._world.data
 
     @property
@@ -207,6 +207,21 @@ class MuJoCo:
         """
         with self.paused():
             self._world.spawn(str(path), position, name)
+            if self._viewer is not None:
+                self._viewer.show(self.model, self.data)
+
+    def remove_entity(self, name: str) -> None:
+        """Remove what :meth:`spawn_entity` has attached; everything else keeps its state.
+
+        Sensors and actuators that the node file declares for it wait for another entity of that
+        name, which must be spawned before the next step.
+
+        Raises:
+            ModelError: if there is none of that name, or if such sensors and actuators would be
+                missing in a simulation that steps itself.
+        """
+        with self.paused():
+            self._world.remove(name, may_unbind=not self.is_running)
             if self._viewer is not None:
                 self._viewer.show(self.model, self.data)
 

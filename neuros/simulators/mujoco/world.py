@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext, Packet
@@ -17,22 +18,13 @@ from neuros.simulators.convert.sdf import convert_sdf
 from neuros.simulators.convert.urdf import read_urdf
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
-from neuros.simulators.mujoco.lookup import Problems, has_any, names_of
+from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
 from neuros.simulators.mujoco.sensor_base import Sensor, SensorDeclaration
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
-
-_KEPT_BY_HAND = (
-    "qacc_warmstart",
-    "qfrc_applied",
-    "xfrc_applied",
-    "mocap_pos",
-    "mocap_quat",
-    "eq_active",
-)
 _DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
     ".urdf": read_urdf,
     ".sdf": convert_sdf,
@@ -147,16 +139,54 @@ class World:
         self._bind(_compile_spec(trial, where), problems)
         problems.raise_any()
         self._attach(self._spec, child, position, name, problems)
-        before = self.data
-        self.model, self.data = self._spec.recompile(self.model, before)
+        # What is new comes last in the world.
+        self._recompile(range(self.model.nbody), range(self.model.neq))
+
+    def remove(self, name: str, *, may_unbind: bool) -> None:
+        """Remove a spawned entity; everything else keeps its state.
+
+        ``may_unbind``: also if sensors or actuators are declared for it, which then wait for
+        another entity of that name.
+        """
+        trial = self._spec.copy()
+        frame = trial.frame(_frame_of(name))
+        if frame is None:
+            known = [each.name[:-1] for each in trial.frames if each.name.endswith("/")]
+            raise ModelError(f"there is no spawned entity '{name}'{did_you_mean(name, known)}")
+        trial.delete(frame)
+        problems = Problems(self._node.description.file)
+        bound = self._bind(_compile_spec(trial, self.where), problems)
+        problems.raise_any()
+        if not (bound.is_complete or may_unbind):
+            raise ModelError(
+                f"entity '{name}' has sensors or actuators of {self._node.description.file}:"
+                " stop() the simulation before it is removed"
+            )
+        bodies, equalities = _without(self._spec, name)
+        self._spec.delete(self._spec.frame(_frame_of(name)))
+        self._recompile(bodies, equalities)
+
+    def _recompile(self, bodies: Sequence[int], equalities: Sequence[int]) -> None:
+        """Compile the changed spec; bodies and constraints that are still there keep their state.
+
+        ``recompile`` keeps positions, velocities, activations, controls and time; the rest is kept
+        here. Elements keep their order.
+        """
+        old, before = self.model, self.data
+        self.model, self.data = self._spec.recompile(old, before)
         self.cameras.use(self.model)
-        self._bound = self._bind(self.model, problems)
+        self._bound = self._bind(self.model, Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
-        # recompile keeps positions, velocities, activations, controls and time. What is new comes
-        # last in the world, so all that was there is still in its place.
-        for field in _KEPT_BY_HAND:
-            old = getattr(before, field)
-            getattr(self.data, field)[: len(old)] = old
+        dofs = np.flatnonzero(np.isin(old.dof_bodyid, bodies))
+        mocaps = old.body_mocapid[bodies]
+        for rows, fields in (
+            (dofs, ("qacc_warmstart", "qfrc_applied")),
+            (bodies, ("xfrc_applied",)),
+            (mocaps[mocaps >= 0], ("mocap_pos", "mocap_quat")),
+            (equalities, ("eq_active",)),
+        ):
+            for field in fields:
+                getattr(self.data, field)[: len(rows)] = getattr(before, field)[list(rows)]
 
     def _make_schedule(self, problems: Problems) -> Schedule:
         periods = {}
@@ -172,7 +202,9 @@ class World:
     ) -> None:
         """Attach an entity as ``name/...``, and add the actuators declared for its joints."""
         before = _joints_of(spec)
-        frame = spec.worldbody.add_frame(pos=[float(value) for value in position])
+        frame = spec.worldbody.add_frame(
+            name=_frame_of(name), pos=[float(value) for value in position]
+        )
         spec.attach(child, prefix=f"{name}/", frame=frame)
         add_drives(spec, _joints_of(spec) - before, self._commands, problems)
 
@@ -215,6 +247,25 @@ def _may_come(element: str, bodies: Sequence[str]) -> bool:
     parts = element.split("/")
     entities = ("/".join(parts[:count]) for count in range(1, len(parts)))
     return any(entity and not _is_taken(entity, bodies) for entity in entities)
+
+
+def _frame_of(entity: str) -> str:
+    """The name of the frame that holds a spawned entity."""
+    return f"{entity}/"
+
+
+def _without(spec: Any, entity: str) -> tuple[list[int], list[int]]:
+    """The ids of all bodies and constraints that stay when an entity is removed.
+
+    A spec numbers them anew at once, so in a copy their names are their old numbers.
+    """
+    marked = spec.copy()
+    for elements in (marked.bodies[1:], marked.equalities):
+        for number, element in enumerate(elements):
+            element.name = f"#{number}"
+    marked.delete(marked.frame(_frame_of(entity)))
+    bodies = [0, *(int(body.name[1:]) + 1 for body in marked.bodies[1:])]
+    return bodies, [int(each.name[1:]) for each in marked.equalities]
 
 
 def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
