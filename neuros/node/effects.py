@@ -54,6 +54,7 @@ class NodeEffects:
         self.has_taken_in = transport.has_taken_in
         self._note_execution = transport.note_execution
         self._instruments = instruments
+        self._sent: dict[str, Tap] = {}
         self._taps_to_itself: dict[Connection, Tap] = {}
         self._enter = enter
         self._on_first_hook = on_first_hook
@@ -107,7 +108,10 @@ class NodeEffects:
     def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None] | None:
         """Return what sends packets of an output, and shows them to the instruments."""
         transmit: Callable[[Any], bytes | None]
-        tap = self.tap(Way.SENT, port)
+        tap = self._sent.get(port.name)
+        if tap is None:  # else the node was reset
+            tap = self._sent[port.name] = self.tap(Way.SENT, port)
+        observed = tap
         if port.external_topic is not None:
             transmit = partial(self._transport.send_external, port)
         elif connections:
@@ -119,7 +123,7 @@ class NodeEffects:
 
         def send(packet: Any) -> None:
             data = transmit(packet)
-            for observe in tap.observers:
+            for observe in observed.observers:
                 observe(packet, data)
 
         return send
