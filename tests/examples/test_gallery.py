@@ -13,7 +13,7 @@ from shown_output import Entry
 
 from neuros.backends.domain import choose_domain
 
-QUICK = ("clock", "tennis", "voting", "elevator")
+QUICK = ("clock", "tennis", "voting", "elevator", "light")
 BESIDE = {"rover": ("driver.py", "battery.py")}
 LIMIT_S = 400.0  # the first start of some installs their libraries
 

@@ -2,6 +2,10 @@
 
 Run once, where both libraries are. Each network is stepped, and then exported, by its own library:
 snnTorch 1.0.0 and Norse 1.1.0, with nirtorch 2.6, nir 1.0.8 and PyTorch 1.12.1.
+
+For that old PyTorch, ``torch.fx`` was imported first, ``_register_pytree_node`` was given its later
+name without the first underscore, and ``superspike_fn`` of Norse was replaced by ``heaviside``,
+also Norse's, which is what it computes forwards. A newer PyTorch should need none of it.
 """
 
 import inspect
