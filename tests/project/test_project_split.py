@@ -154,7 +154,7 @@ def test_the_parts_make_up_the_project(project: Project, random: Any) -> None:
 @given(projects())
 def test_a_node_file_survives_json_and_has_the_documented_form(project: Project) -> None:
     form = {**schema("node"), "$ref": "#/$defs/node_file"}
-    for key in ("required", "additionalProperties", "properties"):
+    for key in ("required", "oneOf", "additionalProperties", "properties"):
         form.pop(key)
     form["$defs"]["node_file"]["properties"]["node"] = {"type": "object"}
     for part in split(project, folders_for):
