@@ -153,18 +153,21 @@ class World:
         if frame is None:
             known = [each.name[:-1] for each in trial.frames if each.name.endswith("/")]
             raise ModelError(f"there is no spawned entity '{name}'{did_you_mean(name, known)}")
+        for number, each in enumerate(trial.equalities):  # to know them again
+            each.name = f"#{number}"
         trial.delete(frame)
         problems = Problems(self._node.description.file)
-        bound = self._bind(_compile_spec(trial, self.where), problems)
+        model = _compile_spec(trial, self.where)
+        bound = self._bind(model, problems)
         problems.raise_any()
         if not (bound.is_complete or may_unbind):
             raise ModelError(
                 f"entity '{name}' has sensors or actuators of {self._node.description.file}:"
                 " stop() the simulation before it is removed"
             )
-        bodies, equalities = _without(self._spec, name)
+        bodies = _bodies_without(self._spec, name)
         self._spec.delete(self._spec.frame(_frame_of(name)))
-        self._recompile(bodies, equalities)
+        self._recompile(bodies, [int(model.equality(i).name[1:]) for i in range(model.neq)])
 
     def _recompile(self, bodies: Sequence[int], equalities: Sequence[int]) -> None:
         """Compile the changed spec; bodies and constraints that are still there keep their state.
@@ -254,18 +257,17 @@ def _frame_of(entity: str) -> str:
     return f"{entity}/"
 
 
-def _without(spec: Any, entity: str) -> tuple[list[int], list[int]]:
-    """The ids of all bodies and constraints that stay when an entity is removed.
+def _bodies_without(spec: Any, entity: str) -> list[int]:
+    """The ids of all bodies that stay when an entity is removed.
 
     A spec numbers them anew at once, so in a copy their names are their old numbers.
     """
     marked = spec.copy()
-    for elements in (marked.bodies[1:], marked.equalities):
-        for number, element in enumerate(elements):
-            element.name = f"#{number}"
+    for number, body in enumerate(marked.bodies):
+        if number:  # the world keeps its name
+            body.name = f"#{number}"
     marked.delete(marked.frame(_frame_of(entity)))
-    bodies = [0, *(int(body.name[1:]) + 1 for body in marked.bodies[1:])]
-    return bodies, [int(each.name[1:]) for each in marked.equalities]
+    return [0, *(int(body.name[1:]) for body in marked.bodies[1:])]
 
 
 def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
