@@ -66,6 +66,7 @@ class TestOnEveryBackEnd:
             s.reset()
             assert s.sim_time is None
             assert poses(s, 3) == [1.0, 0.5, 0.25]
+            assert s["robot.pose"].count == 3
             assert s.sim_time == pytest.approx(0.03)
 
 
