@@ -1,4 +1,4 @@
-"""Recorded packets of a run, as NumPy arrays and pandas frames.
+"""Recorded packets of a run, as NumPy arrays, pandas frames and xarray datasets.
 
 ::
 
@@ -8,6 +8,7 @@
         imu = bag["robot.imu"].array()            # structured array, one row per packet
         speed = imu["linear_acceleration.x"]
         frame = bag["/clock"].frame()             # pandas, if it is installed
+        images = bag["robot.camera"].xarray()     # xarray, if it is installed
 """
 
 import os

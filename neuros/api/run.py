@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import html
 import os
-import sys
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.analysis.run_record import open_run, run_table
-from neuros.errors import EnvironmentFault, RunError
+from neuros.errors import RunError
 
 if TYPE_CHECKING:
     from neuros.recording.bag_reader import Bag
@@ -178,11 +177,8 @@ def frame_of(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any
     Raises:
         EnvironmentFault: if pandas is not installed.
     """
-    try:
-        import pandas as pd
-    except ImportError as error:
-        raise EnvironmentFault(
-            f"pandas is not installed for {sys.executable}: pip install pandas"
-        ) from error
+    from neuros.recording.labelled import library
+
+    pd = library("pandas")
     frame = pd.DataFrame(list(rows))
     return frame if index is None or frame.empty else frame.set_index(index)

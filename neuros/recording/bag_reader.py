@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +22,19 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.recording.labelled import (
+    LOG_TIME,
+    PUBLISH_TIME,
+    dataset_of,
+    library,
+    simulated_time_ns,
+)
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 Column: TypeAlias = npt.NDArray[Any]
-_LOG_TIME, _PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 _MOST_COLUMNS = 100
 
 
@@ -83,8 +88,8 @@ class RecordedTopic:
         packets = self.raw()
         with damage_of(self._bag.folder):
             return {
-                _LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
-                _PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
+                LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
+                PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
                 **columns_of([p.data for p in packets], self.type, self._bag.store),
             }
 
@@ -96,26 +101,24 @@ class RecordedTopic:
         sequences of different length are objects.
         """
         columns = self.columns()
-        rows = len(columns[_LOG_TIME])
+        rows = len(columns[LOG_TIME])
         made = np.empty(rows, [(name, c.dtype, c.shape[1:]) for name, c in columns.items()])
         for name, column in columns.items():
             made[name] = column
         return made
 
-    def frame(self) -> Any:
+    def frame(self, clock: Literal["wall", "sim"] = "wall") -> Any:
         """A ``pandas.DataFrame``, one row per packet; arrays get a column for each element.
 
-        Its index ``time`` is the wall time (UTC) at which packets were sent.
+        Args:
+            clock: of the index ``time``: ``wall``, when packets were sent (UTC), or ``sim``, the
+                simulated time (a ``TimedeltaIndex``).
 
         Raises:
             EnvironmentFault: if pandas is not installed.
+            UsageError: for the simulated time of a bag that has none.
         """
-        try:
-            import pandas as pd
-        except ImportError as error:
-            raise EnvironmentFault(
-                f"pandas is not installed for {sys.executable}: pip install pandas, or use array()"
-            ) from error
+        pd = library("pandas", "array()")
         spread: dict[str, Any] = {}
         columns = self.columns()
         for name, column in columns.items():
@@ -127,8 +130,25 @@ class RecordedTopic:
                     spread[f"{name}[{place}]"] = single
             else:
                 spread[name] = list(column)
-        time = pd.to_datetime(columns[_LOG_TIME], unit="ns", utc=True)
+        if clock == "sim":
+            time = pd.to_timedelta(simulated_time_ns(self, columns), unit="ns")
+        else:
+            time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
         return pd.DataFrame(spread, index=time.rename("time"))
+
+    def xarray(self) -> Any:
+        """An ``xarray.Dataset``: a variable for each field, along the dimension ``time``.
+
+        Images of one size are ``(time, y, x, channel)``, those of one channel ``(time, y, x)``; the
+        axes of other arrays have names like ``position_0``. The coordinate ``time`` is simulated
+        time in seconds; where there is none, wall time since the first packet of the bag. The
+        coordinate ``wall_time`` is that of the wall clock (UTC). Variables whose unit the ROS
+        definition states have it as the attribute ``units``.
+
+        Raises:
+            EnvironmentFault: if xarray is not installed.
+        """
+        return dataset_of(self, self._bag.store.fielddefs, self._bag.start_ns)
 
 
 class Bag:
@@ -139,6 +159,7 @@ class Bag:
         topics: by name, in the order of the project.
         custom: what its metadata says of the run: ``run_id``, ``project``, ``project_sha256``,
             ``versions``, ``seeds``.
+        start_ns: wall time of the first packet, in nanoseconds since 1970.
         duration_s: from the first packet to the last.
         missing: by topic, how many packets were in the bag when the run ended, and are not now.
     """
@@ -152,7 +173,7 @@ class Bag:
         self.folder = folder
         with opened(folder) as reader, damage_of(folder):
             self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
-            self.duration_s = reader.duration / 1e9
+            self.start_ns, self.duration_s = reader.start_time, reader.duration / 1e9
             found = {c.topic: c for c in reader.connections}
             self.store = _store_of(found.values())
             self.topics = {

@@ -1,0 +1,159 @@
+"""Recorded packets for the libraries of scientists: xarray's datasets.
+
+Units are those that the definitions of ROS messages state (REP 103); a field whose unit depends on
+something else, as the position of a joint, has none.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuros.errors import EnvironmentFault, UsageError
+
+if TYPE_CHECKING:
+    from neuros.recording.bag_reader import Column, RecordedTopic
+
+LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
+_IMAGE = "sensor_msgs/msg/Image"
+_UNITS = {
+    "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
+    "builtin_interfaces/msg/Time": {"sec": "s", "nanosec": "ns"},
+    "geometry_msgs/msg/Accel": {"linear": "m/s^2", "angular": "rad/s^2"},
+    "geometry_msgs/msg/Pose": {"position": "m"},
+    "geometry_msgs/msg/Transform": {"translation": "m"},
+    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
+    "geometry_msgs/msg/Wrench": {"force": "N", "torque": "N m"},
+    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa", "variance": "Pa^2"},
+    "sensor_msgs/msg/Illuminance": {"illuminance": "lx", "variance": "lx^2"},
+    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2"},
+    "sensor_msgs/msg/LaserScan": {
+        **dict.fromkeys(("angle_min", "angle_max", "angle_increment"), "rad"),
+        **dict.fromkeys(("time_increment", "scan_time"), "s"),
+        **dict.fromkeys(("range_min", "range_max", "ranges"), "m"),
+    },
+    "sensor_msgs/msg/MagneticField": {"magnetic_field": "T"},
+    "sensor_msgs/msg/Range": {
+        "field_of_view": "rad",
+        **dict.fromkeys(("min_range", "max_range", "range"), "m"),
+    },
+    "sensor_msgs/msg/Temperature": {"temperature": "degC", "variance": "degC^2"},
+}
+# By encoding: the type of a pixel's values, and its channels.
+_PIXELS = {
+    **{name: ("u1", tuple(name[:-1])) for name in ("rgb8", "bgr8", "rgba8", "bgra8")},
+    "rgb16": ("u2", tuple("rgb")),
+    "bgr16": ("u2", tuple("bgr")),
+    "mono8": ("u1", ()),
+    "mono16": ("u2", ()),
+    "8UC1": ("u1", ()),
+    "8UC3": ("u1", (0, 1, 2)),
+    "16UC1": ("u2", ()),
+    "32FC1": ("f4", ()),
+}
+
+
+def library(name: str, otherwise: str = "") -> Any:
+    """An optional library.
+
+    Args:
+        otherwise: what works without it, for the error.
+
+    Raises:
+        EnvironmentFault: if it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        text = f"{name} is not installed for {sys.executable}: pip install {name}"
+        raise EnvironmentFault(f"{text}, or use {otherwise}" if otherwise else text) from error
+
+
+def simulated_time_ns(topic: RecordedTopic, columns: Mapping[str, Column]) -> Column:
+    """The simulated time of each packet. Raises ``UsageError`` if the bag has none."""
+    if has_simulated_time(columns):
+        return columns[PUBLISH_TIME]
+    raise UsageError(
+        f"{topic.name} has no simulated time: no node of the run owns time, or the bag is an"
+        ' SQLite file, which has no place for it. Use clock="wall"'
+    )
+
+
+def has_simulated_time(columns: Mapping[str, Column]) -> bool:
+    """Whether packets have another time than that of the wall clock."""
+    return bool(np.any(columns[PUBLISH_TIME] != columns[LOG_TIME]))
+
+
+def dataset_of(topic: RecordedTopic, types: Mapping[str, Any], start_ns: int) -> Any:
+    """What :meth:`RecordedTopic.xarray` gives; ``start_ns``: wall time of the bag's first packet.
+
+    Args:
+        types: the field definitions of the bag's types.
+    """
+    xr = library("xarray", "array()")
+    columns = topic.columns()
+    wall_ns, sim_ns = columns.pop(LOG_TIME), columns[PUBLISH_TIME]
+    if has_simulated_time({LOG_TIME: wall_ns, PUBLISH_TIME: sim_ns}):
+        time_s, clock = sim_ns / 1e9, "simulated time"
+    else:
+        time_s, clock = (wall_ns - start_ns) / 1e9, "wall time since the first packet of the bag"
+    del columns[PUBLISH_TIME]
+    found = dict(_fields(topic.type, types))
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {
+        "time": ("time", time_s, {"units": "s", "long_name": clock}),
+        "wall_time": ("time", wall_ns.astype("datetime64[ns]")),
+    }
+    images = [name for name, (of, _) in found.items() if of == _IMAGE and name.endswith("data")]
+    for name in images:
+        prefix = name.removesuffix("data")
+        if (pixels := _pixels(columns, prefix)) is not None:
+            dims = [f"{prefix}{dim}" for dim in ("y", "x", "channel")][: pixels.ndim - 1]
+            variables[name] = (("time", *dims), pixels)
+            if pixels.ndim == 4:
+                channels = list(_PIXELS[str(columns[f"{prefix}encoding"][0])][1])
+                coordinates[dims[2]] = (dims[2], channels)
+            del columns[name]
+    for name, column in columns.items():
+        unit = found.get(name, ("", None))[1]
+        dims = [f"{name}_{axis}" for axis in range(column.ndim - 1)]
+        free = f"{name}_" if name in coordinates else name
+        variables[free] = (("time", *dims), column, {"units": unit} if unit else {})
+    label = {"connection": topic.connection} if topic.connection else {}
+    return xr.Dataset(variables, coordinates, {"topic": topic.name, "type": topic.type, **label})
+
+
+def _fields(
+    type_name: str, types: Mapping[str, Any], prefix: str = "", unit: str | None = None
+) -> Iterator[tuple[str, tuple[str, str | None]]]:
+    """Of each field, with dots: the type that has it, and its unit where one is known."""
+    units = _UNITS.get(type_name, {})
+    for name, (_, details) in types[type_name][1]:
+        its = units.get(name, unit)
+        if isinstance(details, str) and details in types:
+            yield from _fields(details, types, f"{prefix}{name}.", its)
+        else:
+            yield f"{prefix}{name}", (type_name, its)
+
+
+def _pixels(columns: Mapping[str, Column], prefix: str) -> Column | None:
+    """Images ``(time, y, x[, channel])``; ``None`` unless all have one size and known pixels."""
+    data = columns[f"{prefix}data"]
+    about = [columns[f"{prefix}{name}"] for name in ("height", "width", "step", "is_bigendian")]
+    encodings = columns[f"{prefix}encoding"]
+    varies = any(len(np.unique(column)) != 1 for column in (encodings, *about))
+    if data.ndim != 2 or varies or str(encodings[0]) not in _PIXELS:
+        return None
+    height, width, step, is_bigendian = (int(column[0]) for column in about)
+    kind, channels = _PIXELS[str(encodings[0])]
+    value = np.dtype(kind).newbyteorder(">" if is_bigendian else "<")
+    used = width * max(1, len(channels)) * value.itemsize
+    if step < used or data.shape[1] != height * step:
+        return None
+    rows = np.ascontiguousarray(data.reshape(len(data), height, step)[:, :, :used])
+    pixels: Column = rows.view(value).astype(value.newbyteorder("="), copy=False)
+    return pixels.reshape((len(data), height, width, *([len(channels)] if channels else [])))
