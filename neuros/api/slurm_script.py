@@ -23,8 +23,9 @@ _SCRIPT = """\
 #SBATCH --nodes={count}
 #SBATCH --ntasks-per-node=1
 #SBATCH --output={name}-%j.log
-{resources}# Submit it with sbatch. The launcher runs on the first node of the allocation, and so do the
-# nodes of the project that the deployment does not name; agents run the others.
+{resources}\
+# Submit it with sbatch. The launcher runs on the first node of the allocation, and so do the nodes
+# of the project that the deployment does not name; agents run the others.
 if [ "${{SLURM_JOB_NUM_NODES:-0}}" -lt {count} ]; then
     echo "this needs a Slurm allocation of {count} node(s): submit it with sbatch" >&2
     exit 4
