@@ -123,16 +123,6 @@ class TestConnecting:
         with old_engine(tmp_path / "docker.sock") as address:
             assert f"at {address} is too old" in fault_of({"XDG_RUNTIME_DIR": str(tmp_path)})
 
-    def test_that_of_podman_is_found_where_docker_has_none(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(engine_module, "_USUAL_SOCKET", tmp_path / "none.sock")
-        (tmp_path / "podman").mkdir()
-        with old_engine(tmp_path / "podman/podman.sock") as address:
-            assert f"at {address} is too old" in fault_of({"XDG_RUNTIME_DIR": str(tmp_path)})
-            with old_engine(tmp_path / "docker.sock") as docker:
-                assert f"at {docker} is too old" in fault_of({"XDG_RUNTIME_DIR": str(tmp_path)})
-
 
 def fault(text: str) -> Any:
     return pytest.raises(EnvironmentFault, match=text)

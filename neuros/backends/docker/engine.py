@@ -33,8 +33,8 @@ def connect(
 ) -> DockerClient:
     """Connect to the engine that ``DOCKER_HOST``, the current context, or the usual socket names.
 
-    Where the usual socket does not exist, one of rootless Docker or of podman is taken. A single
-    request may last ``timeout_s`` seconds, ``None`` for any time; the caller closes the client.
+    Where the usual socket does not exist, one of rootless Docker is taken. A single request may
+    last ``timeout_s`` seconds, ``None`` for any time; the caller closes the client.
 
     Raises:
         EnvironmentFault: where there is none, it may not be used, or it is too old.
@@ -133,10 +133,10 @@ def explain(text: str) -> str:
 
 
 def _usual_address(environ: Mapping[str, str]) -> str:
-    folder = Path(environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}")
-    users = [folder / name for name in ("docker.sock", "podman/podman.sock")]
-    found = [] if _USUAL_SOCKET.exists() else [path for path in users if path.is_socket()]
-    return f"unix://{[*found, _USUAL_SOCKET][0]}"
+    folder = environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    rootless = Path(folder) / "docker.sock"
+    is_rootless = rootless.is_socket() and not _USUAL_SOCKET.exists()
+    return f"unix://{rootless if is_rootless else _USUAL_SOCKET}"
 
 
 def _address_of_context(environ: Mapping[str, str]) -> str:
