@@ -51,6 +51,7 @@ BY_NAME = {
     "process": (
         "recording/test_provenance.py",
         "backends/environments/test_container_pythons.py",
+        "backends/test_charliecloud_back_end.py",
         "backends/test_placement.py",
         "backends/test_reaper.py",
         "backends/test_shared_memory.py::test_the_reaper",

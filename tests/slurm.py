@@ -1,4 +1,4 @@
-"""A Slurm cluster of a test's own: controller, one node and authentication on this machine."""
+"""A Slurm cluster of a test's own: controller, its nodes and authentication on this machine."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -21,18 +21,17 @@ _CONFIGURATION = """\
 ClusterName=neuros
 SlurmctldHost={host}(127.0.0.1)
 SlurmctldPort={controller}
-SlurmdPort={node}
 SlurmUser={user}
 SlurmdUser={user}
 AuthType=auth/munge
 AuthInfo=socket={folder}/munge.socket
 CredType=cred/munge
 StateSaveLocation={folder}/state
-SlurmdSpoolDir={folder}/spool
+SlurmdSpoolDir={folder}/spool-%n
 SlurmctldPidFile={folder}/slurmctld.pid
-SlurmdPidFile={folder}/slurmd.pid
+SlurmdPidFile={folder}/%n.pid
 SlurmctldLogFile={folder}/slurmctld.log
-SlurmdLogFile={folder}/slurmd.log
+SlurmdLogFile={folder}/%n.log
 ProctrackType=proctrack/linuxproc
 TaskPlugin=task/none
 MpiDefault=none
@@ -44,34 +43,41 @@ SchedulerType=sched/backfill
 SlurmdParameters=config_overrides
 ReturnToService=2
 MessageTimeout=60
-NodeName=node NodeHostname={host} NodeAddr=127.0.0.1 CPUs={cpus} RealMemory=4096 State=UNKNOWN
-PartitionName=first Nodes=node Default=YES MaxTime=INFINITE State=UP
+{nodes}
+PartitionName=first Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
 
 @contextmanager
-def slurm_cluster(cpus: int = 2) -> Iterator[dict[str, str]]:
-    """Start a cluster of one node; yields the environment in which its commands find it."""
+def slurm_cluster(cpus: int = 2, names: Sequence[str] = ("node",)) -> Iterator[dict[str, str]]:
+    """Start a cluster; yields the environment in which its commands find it.
+
+    Its nodes are daemons of this machine, each with its own port.
+    """
     require(*PROGRAMS)
     # Sockets have short names, and the folders of pytest have not.
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        for name in ("state", "spool"):
+        for name in ("state", *(f"spool-{name}" for name in names)):
             (folder / name).mkdir()
         key = folder / "munge.key"
         key.write_bytes(os.urandom(128))
         key.chmod(0o600)
         configuration = folder / "slurm.conf"
-        controller, node = _free_ports()
+        host = socket.gethostname().partition(".")[0]
+        controller, *ports = _free_ports(1 + len(names))
         configuration.write_text(
             _CONFIGURATION.format(
-                host=socket.gethostname().partition(".")[0],
+                host=host,
                 user=pwd.getpwuid(os.geteuid()).pw_name,
                 folder=folder,
                 controller=controller,
-                node=node,
-                cpus=cpus,
+                nodes="\n".join(
+                    f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port}"
+                    f" CPUs={cpus} RealMemory=4096 State=UNKNOWN"
+                    for name, port in zip(names, ports, strict=True)
+                ),
             )
         )
         files = {"pid-file": "munge.pid", "log-file": "munge.log", "seed-file": "munge.seed"}
@@ -81,7 +87,8 @@ def slurm_cluster(cpus: int = 2) -> Iterator[dict[str, str]]:
         _wait_until(folder, (folder / "munge.socket").exists)
         options = ("-D", "-f", str(configuration))
         stack.enter_context(_daemon(folder, "slurmctld", *options, "-c"))
-        stack.enter_context(_daemon(folder, "slurmd", *options, "-N", "node"))
+        for name in names:
+            stack.enter_context(_daemon(folder, "slurmd", *options, "-N", name))
         environment = {"SLURM_CONF": str(configuration)}
         _wait_until(folder, lambda: _is_idle(environment))
         yield environment
@@ -90,7 +97,7 @@ def slurm_cluster(cpus: int = 2) -> Iterator[dict[str, str]]:
 @contextmanager
 def _daemon(folder: Path, program: str, *arguments: str) -> Iterator[None]:
     found = shutil.which(program, path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
-    with (folder / f"{program}.out").open("wb") as out:
+    with (folder / f"{program}.out").open("ab") as out:
         process = subprocess.Popen(
             ["setpriv", "--pdeathsig", "TERM", str(found), *arguments], stdout=out, stderr=out
         )
@@ -123,8 +130,9 @@ def _wait_until(folder: Path, condition: object) -> None:
         time.sleep(0.1)
 
 
-def _free_ports() -> tuple[int, int]:
-    with socket.socket() as one, socket.socket() as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
+def _free_ports(count: int) -> list[int]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]

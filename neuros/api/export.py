@@ -1,5 +1,7 @@
 """A project as files for Docker Compose, Docker Swarm or Kubernetes, which then start its nodes.
 
+That for Slurm is in :mod:`neuros.api.slurm_script`.
+
 The folder that is written holds all that a run needs, but for the images that nodes run in::
 
     compose.yaml, swarm.yaml or kubernetes.yaml
@@ -29,11 +31,13 @@ import yaml
 
 from neuros.api.part import parts_to_json
 from neuros.api.request import ExportOptions
+from neuros.api.slurm_script import script_of
 from neuros.backends.containers import bare_name
 from neuros.backends.docker.recipes import files_of, find_recipe
 from neuros.backends.placement import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
 from neuros.errors import UsageError
+from neuros.options import options_of
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.resources import memory_text
 from neuros.project.split import split, translated
@@ -46,6 +50,8 @@ NODES_FILE = "nodes.json"
 _LIBRARY, _MESSAGES = ROOT / "lib", ROOT / "messages"
 _RUN = "${RUN:-run}"
 _MOST_PIDS = 4096
+_OF_CONTAINERS = ("peers", "peer_timeout", "host_network", "registry", "volume_claim")
+_OF_SLURM = ("place", "spread")
 _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
@@ -182,9 +188,7 @@ class Export:
             documents = form.documents(self)
             file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
         except OSError as error:
-            raise UsageError(
-                f"{self.folder} cannot be written ({error.strerror}): name another folder with -o"
-            ) from error
+            raise _not_written(self.folder, error) from error
         return file
 
     def _check(self, form: Form) -> None:
@@ -200,13 +204,11 @@ class Export:
                     )
 
     def _make_folder(self) -> None:
-        folder = self.folder
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
+        _make_new(self.folder)
         for each in ("runs", "image/runs"):
-            (folder / each).mkdir(parents=True)
+            (self.folder / each).mkdir(parents=True)
         # Volumes begin as what the image has there, and whoever a container runs as writes to them.
-        (folder / "image/runs").chmod(0o1777)
+        (self.folder / "image/runs").chmod(0o1777)
 
     def _copy(self) -> None:
         image = self.folder / "image"
@@ -235,7 +237,30 @@ def slug(name: str) -> str:
 
 def export(project: Project, messages: Sequence[Path], options: ExportOptions) -> Path:
     """Write a project for another engine; returns the file for it. Raises ``UsageError``."""
-    return Export(project, messages, options).write()
+    without = {"slurm": _OF_CONTAINERS}.get(options.form, _OF_SLURM)
+    for each in options_of(ExportOptions):
+        if each.name in without and getattr(options, each.name) != each.default:
+            raise UsageError(f"{each.flags[-1]} is not for {options.form}")
+    if options.form != "slurm":
+        return Export(project, messages, options).write()
+    script = script_of(project, options)
+    folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
+    try:
+        _make_new(folder)
+        (folder / "job.sh").write_text(script, "utf-8")
+    except OSError as error:
+        raise _not_written(folder, error) from error
+    return folder / "job.sh"
+
+
+def _make_new(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _not_written(folder: Path, error: OSError) -> UsageError:
+    return UsageError(f"{folder} cannot be written ({error.strerror}): name another folder with -o")
 
 
 # ------------------------------------------------------------------------------- the formats

@@ -319,14 +319,23 @@ class LaunchOptions(Request):
     )
 
 
-FORMS = ("compose", "swarm", "kubernetes")
+FORMS = ("compose", "swarm", "kubernetes", "slurm")
+
+
+def _placed(text: str) -> tuple[str, int]:
+    node, is_given, number = text.rpartition("=")
+    if not (is_given and number.isdecimal()):
+        raise ArgumentTypeError(f"'{text}': give NODE=NUMBER, as in robot=1")
+    return node, int(number)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions(ProjectOptions):
     """How to export a project: for which engine, and how its nodes find each other there."""
 
-    form: str = option(help="for which engine: compose, swarm or kubernetes", default="compose")
+    form: str = option(
+        help="for which engine: compose, swarm, kubernetes or slurm", default="compose"
+    )
     output: str | os.PathLike[str] | None = like(
         Request,
         "output",
@@ -366,6 +375,19 @@ class ExportOptions(ProjectOptions):
         metavar="NAME",
         default_help="they go with the pods",
         help="for kubernetes: keep run folders in this PersistentVolumeClaim",
+    )
+    place: tuple[tuple[str, int], ...] = option(
+        "--place",
+        parse=_placed,
+        metavar="NODE=NUMBER",
+        default_help="beside the launcher, on the first, 0",
+        is_repeatable=True,
+        help="for slurm: run this node of the project on this node of the allocation",
+    )
+    spread: bool = option(
+        "--spread",
+        default=False,
+        help="for slurm: run each node of the project on a node of the allocation of its own",
     )
 
 

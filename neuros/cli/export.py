@@ -20,7 +20,8 @@ def add_export(export: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     export.description = (
         "Write a project as files with which Docker Compose, Docker Swarm or Kubernetes start its"
-        " nodes, a container for each, without NeuROS on the machine."
+        " nodes, a container for each, without NeuROS on the machine; or as a batch script that"
+        " launches it on Slurm."
     )
     export.add_argument("form", choices=FORMS, help="for which engine")
     add_project(export, ExportOptions)

@@ -22,7 +22,7 @@ from urllib3.exceptions import ProtocolError
 
 from neuros.backends.docker import engine as engine_module
 from neuros.backends.docker.back_end import without_limits
-from neuros.backends.docker.engine import Abilities, connect, engine_faults
+from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_name, explain
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 from neuros.project.resources import Resources
@@ -145,6 +145,10 @@ class TestFaultsWhileWorking:
         with fault("node 'a': .*NVIDIA Container Toolkit"), engine_faults("node 'a'"):
             raise said
 
+    def test_an_init_that_podman_lacks_comes_with_a_remedy(self) -> None:
+        said = "container create: container-init binary not found on the host: stat /usr/libexec"
+        assert explain(said).endswith(": sudo apt-get install catatonit")
+
     def test_an_engine_that_goes_away_is_noticed(self) -> None:
         reset = ProtocolError("Connection aborted.", ConnectionResetError(104, "reset"))
         with fault("node 'a': the Docker engine has gone away"), engine_faults("node 'a'"):
@@ -174,6 +178,19 @@ class TestAbilities:
             "CpuCfsQuota": False,
         }
         assert Abilities.of(facts) == Abilities(True, frozenset({"mem_bytes", "cpus"}))
+
+    def test_a_rootless_podman_says_in_its_own_way_that_it_is_one(self) -> None:
+        facts = {**self.FACTS, "Rootless": True, "CgroupVersion": "2"}
+        assert Abilities.of(facts) == Abilities(is_rootless=True)
+
+    def test_with_control_groups_of_version_1_a_rootless_podman_keeps_to_no_limit(self) -> None:
+        facts = {**self.FACTS, "Rootless": True, "CgroupVersion": "1"}
+        assert Abilities.of(facts).unkept == {"mem_bytes", "cpus", "pids"}
+
+    def test_an_engine_says_whether_it_is_podman(self) -> None:
+        podman = {"Version": "4.3.1", "Components": [{"Name": "Podman Engine"}]}
+        docker = {"Version": "20.10.24", "Components": [{"Name": "Engine"}]}
+        assert [*map(engine_name, (podman, docker))] == ["podman 4.3.1", "20.10.24"]
 
     def test_limits_that_do_not_hold_are_said(self) -> None:
         def node(name: str, **limits: float) -> Node:

@@ -148,7 +148,7 @@ def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iter
     if find_spec("docker") is None:
         yield Finding.absent("Docker", "its Python package is not installed", install_command())
         return
-    from neuros.backends.docker.engine import connect, engine_faults
+    from neuros.backends.docker.engine import connect, engine_faults, engine_name
     from neuros.backends.docker.images import image_for
 
     try:
@@ -163,7 +163,7 @@ def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iter
         except EnvironmentFault as fault:
             yield Finding.bad("Docker", str(fault))
             return
-        text = f"engine {version['Version']}, API {version['ApiVersion']}"
+        text = f"engine {engine_name(version)}, API {version['ApiVersion']}"
         yield Finding.good("Docker", text)
         for name in names:
             try:

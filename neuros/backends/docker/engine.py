@@ -75,10 +75,12 @@ class Abilities:
 
     @staticmethod
     def of(facts: Mapping[str, Any]) -> Abilities:
-        """Those in the answer of ``docker info``."""
+        """Those in the answer of ``docker info``, and of podman, which says it in its own way."""
+        of_podman = bool(facts.get("Rootless"))
+        ignores_all = of_podman and facts.get("CgroupVersion") == "1"
         return Abilities(
-            "name=rootless" in (facts.get("SecurityOptions") or ()),
-            frozenset(key for key, fact in _LIMITS.items() if facts.get(fact) is False),
+            of_podman or "name=rootless" in (facts.get("SecurityOptions") or ()),
+            frozenset(k for k, fact in _LIMITS.items() if ignores_all or facts.get(fact) is False),
         )
 
 
@@ -111,11 +113,20 @@ def engine_socket(engine: DockerClient) -> str:
     return str(path)
 
 
+def engine_name(version: Mapping[str, Any]) -> str:
+    """Docker's version, or podman's with its name, from the answer of ``docker version``."""
+    names = [str(each.get("Name")) for each in version.get("Components") or ()]
+    prefix = "podman " if any(name.startswith("Podman") for name in names) else ""
+    return f"{prefix}{version['Version']}"
+
+
 def explain(text: str) -> str:
     """The engine's message on one line, with a remedy where one is known."""
     said = " ".join(text.split())
     if "no space left on device" in said.lower():
         return f"{said}: the disk is full: make room (docker system df; docker image prune)"
+    if "container-init binary not found" in said:  # podman's, which Debian only recommends
+        return f"{said}: sudo apt-get install catatonit"
     if "could not select device driver" in said and "gpu" in said:
         return "the engine cannot give it a GPU: install the NVIDIA Container Toolkit"
     return said

@@ -19,7 +19,13 @@ from docker import DockerClient
 from docker.errors import DockerException
 
 from neuros.backends.docker import leftovers
-from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_socket
+from neuros.backends.docker.engine import (
+    Abilities,
+    connect,
+    engine_faults,
+    engine_name,
+    engine_socket,
+)
 from neuros.backends.docker.images import Image, images_for
 from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import (
@@ -65,7 +71,7 @@ class Containers:
     def record(self) -> dict[str, Any]:
         """The engine's version and the images, ready for JSON. Raises ``EnvironmentFault``."""
         with engine_faults("Docker"):
-            version = self.engine.version()["Version"]
+            version = engine_name(self.engine.version())
         images = {
             container: {"name": image.name, "id": image.id}
             for container, image in self.images.items()
@@ -419,5 +425,5 @@ class ContainerEvents(threading.Thread):
         elif event["Action"] == "die":
             fate.died_s = time.monotonic()
             fate.exit_code = int(actor["Attributes"]["exitCode"])
-        elif event["Action"] == "destroy":
+        elif event["Action"] in ("destroy", "remove"):  # podman says remove
             fate.is_gone = True

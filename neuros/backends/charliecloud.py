@@ -1,0 +1,207 @@
+"""The back end ``charliecloud``: each node in an unpacked image, without a daemon and without root.
+
+A node is a process of this machine that sees another root folder: ``ch-run`` makes that with a user
+namespace and becomes the node. The image is a folder that ``ch-convert`` has made of the one that
+Docker or podman has built.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from neuros.backends.containers import bare_name
+from neuros.backends.node_command import NodeProcess, node_process
+from neuros.backends.process_launchers import ProcessLauncher
+from neuros.distribution import PACKAGE
+from neuros.errors import EnvironmentFault
+from neuros.options import Option
+from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram
+from neuros.project.model import Node, NodeFile, Project
+
+_RUNNER = "ch-run"
+_INSTALL = "apt-get install charliecloud, or ask those who run the cluster"
+_PYTHON = Path("/opt/neuros/bin/python")
+"""Of every image that is built from a recipe."""
+_LIBRARY = Path("/neuros/lib")
+_FOLDER = "~/.local/share/neuros/images"
+_PROBE_S = 30.0
+_USER = {"USER": "neuros"}  # ch-run asks for a name
+# What the Python of the launcher, or a module file, has put there leads to the wrong libraries.
+_UNSET = ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD", "VIRTUAL_ENV")
+
+
+class Charliecloud(BackEnd):
+    """Runs where somebody asks for it."""
+
+    name = "charliecloud"
+    place = "an unpacked image"
+    has_own_pythons = True
+    options = (
+        Option(
+            ("--image-folder",),
+            "the folder with unpacked images, each named as its container",
+            default=_FOLDER,
+            variable="NEUROS_IMAGE_FOLDER",
+            metavar="FOLDER",
+            page="charliecloud.md",
+        ),
+    )
+
+    def prepare(
+        self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
+    ) -> Deployment:
+        _require_runner(os.environ)
+        folder = Path(options["image_folder"]).expanduser().absolute()
+        images = {node.container: _image(folder, node.container) for node in nodes}
+        missing = [_missing(name, path) for name, path in images.items() if not _is_image(path)]
+        if missing:
+            raise EnvironmentFault("\n".join(missing))
+        _try_image(next(iter(images.values())))
+        return _Images(images, nodes)
+
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        (option,) = self.options
+        folder = Path(option.value(None, environ)).expanduser()
+        try:
+            _require_runner(environ)
+        except EnvironmentFault as fault:
+            yield Finding.absent("Charliecloud", str(fault))
+            return
+        images = [each for each in sorted(folder.glob("*")) if _is_image(each)]
+        if not images:
+            yield Finding.absent("Charliecloud", f"no unpacked images in {folder}")
+            return
+        try:
+            _try_image(images[0])
+        except EnvironmentFault as fault:
+            yield Finding.bad("Charliecloud", str(fault))
+            return
+        names = ", ".join(each.name for each in images)
+        yield Finding.good("Charliecloud", f"images in {folder}: {names}")
+
+
+BACK_END = Charliecloud()
+
+
+class _Images(Deployment):
+    """Images for nodes. They keep to no limits."""
+
+    def __init__(self, images: Mapping[str, Path], nodes: Sequence[Node]) -> None:
+        self._images = images
+        limited = [node.name for node in nodes if any(vars(node.resources).values())]
+        if limited:
+            text = f"resources of {', '.join(limited)}: only --backend docker keeps to them"
+            self.notices = [("INFO", text)]
+
+    def launcher(self, program: NodeProgram) -> Launcher:
+        return _ImageLauncher(program, self._images)
+
+    def record(self) -> Mapping[str, Any]:
+        return {"charliecloud": {name: str(path) for name, path in self._images.items()}}
+
+
+class _ImageLauncher(ProcessLauncher):
+    """Starts a process per node, with ``ch-run`` before its command."""
+
+    def __init__(self, program: NodeProgram, images: Mapping[str, Path]) -> None:
+        super().__init__(program)
+        self._images = images
+
+    def _processes(
+        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
+    ) -> Sequence[NodeProcess]:
+        pythons = {node.node.name: _PYTHON for node in nodes}
+        program = replace(self._program, pythons=pythons)
+        return [
+            _inside(node_process(program, node, environment), node, self._image_of(node))
+            for node in nodes
+        ]
+
+    def _image_of(self, node: NodeFile) -> Path:
+        return self._images[node.node.container]
+
+
+def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:
+    """The process in an image, where it sees the folders of the run under their own paths."""
+    folders = node.folders
+    seen = {PACKAGE: _LIBRARY / PACKAGE.name}
+    seen |= {path: path for path in (folders.project, folders.workspace, folders.run)}
+    seen |= {python: python for python in node.messages}
+    binds: list[str] = []
+    for here, there in sorted(seen.items(), key=lambda pair: len(pair[1].parts)):
+        if here.is_dir():  # an installed NeuROS comes without a workspace
+            _make_mount_point(image, there)
+            binds.append(f"--bind={here}:{there}")
+    start = [_RUNNER, "--set-env", *binds, f"--cd={process.folder}", str(image), "--"]
+    given = {key: value for key, value in process.environment.items() if key not in _UNSET}
+    path = os.pathsep.join([*map(str, node.messages), str(_LIBRARY)])
+    environment = {**_USER, **given, "HOME": "/tmp", "PYTHONPATH": path}
+    environment["XDG_CACHE_HOME"] = "/tmp/.cache"  # libraries' own; the launcher's is not seen
+    return replace(
+        process,
+        command=[*start, *process.command],
+        node_program=[*start, *process.node_program],
+        environment=environment,
+    )
+
+
+def _make_mount_point(image: Path, there: Path) -> None:
+    """A folder of the image, which is mounted so that nodes cannot write to it."""
+    inside = image / there.relative_to("/")
+    try:
+        inside.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EnvironmentFault(
+            f"{inside}: {error.strerror}: the image needs this folder, to see {there} there; its"
+            " owner can make it"
+        ) from error
+
+
+def _image(folder: Path, container: str) -> Path:
+    return folder / bare_name(container).replace("/", "%").replace(":", "+")
+
+
+def _is_image(path: Path) -> bool:
+    return os.path.lexists(path / _PYTHON.relative_to("/"))
+
+
+def _missing(container: str, path: Path) -> str:
+    if path.is_dir():
+        return f"{path} is no image that can run nodes: it has no {_PYTHON}; build it with NeuROS"
+    return (
+        f"container '{container}': there is no unpacked image {path}: ch-convert -i docker"
+        f" {container} {path}, on a machine that has built it"
+    )
+
+
+def _require_runner(environ: Mapping[str, str]) -> None:
+    if shutil.which(_RUNNER, path=environ.get("PATH")) is None:
+        raise EnvironmentFault(f"Charliecloud is not installed ({_RUNNER} on PATH): {_INSTALL}")
+
+
+def _try_image(image: Path) -> None:
+    """Start something in an image, since a machine may allow no user namespaces."""
+    try:
+        done = subprocess.run(
+            [_RUNNER, str(image), "--", "/bin/true"],
+            env={**_USER, **os.environ},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_PROBE_S,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        raise EnvironmentFault(f"nothing can be started in {image}: {error}") from error
+    if done.returncode:
+        raise EnvironmentFault(
+            f"nothing can be started in {image}: {done.stderr.strip()}: does this machine allow"
+            " user namespaces? (unshare --user true)"
+        )
