@@ -95,9 +95,7 @@ class Engine:
         self._to_itself = 0  # packets of the node for itself that are on their way
         self._schedule = Schedule()
         self.all_hooks = [
-            Hook(spec, ports.inputs_of(spec), self.outputs)
-            for spec in specs
-            if spec.is_scheduled
+            Hook(spec, ports.inputs_of(spec), self.outputs) for spec in specs if spec.is_scheduled
         ]
         for hook in self.all_hooks:
             self._schedule.add(hook)
