@@ -7,6 +7,11 @@ Held still between two pictures, it would drag the bump back by some 10 degrees 
 How hard it pulls depends on how exact the heading is: by the inverse of its variance, as a Kalman
 filter weighs what it measures. Else the ring would follow the worst views as closely as the best,
 and one whose gyroscope is right would lose by what it sees.
+
+The bias of the gyroscope is learnt from what vision and the turned gyroscope differ by in the long
+run, as in Mahony, Hamel & Pflimlin, *IEEE Transactions on Automatic Control* 53(5) (2008). From the
+ring's own heading it would be learnt worse: the ring lags, and slips by some percent of its rate,
+and the harder vision pulls it, the more of that would be taken for bias (up to 0.05 rad/s of 0.1).
 """
 
 from __future__ import annotations
@@ -22,6 +27,7 @@ LEAD_S = 0.06  # how late the ring follows: so far ahead a current holds the bum
 WIDTH_RAD = math.radians(30.0)
 EXACT_RAD = math.radians(1.0)  # a heading as exact as this is pulled to with all of the gain
 GATE = 0.12  # see README.md
+FOLLOWS_PER_S = 2.0  # how fast the heading by gyroscope, from which the bias is learnt, is pulled
 
 
 class SeenHeading:
@@ -72,8 +78,8 @@ class CorrectedIntegrator:
         bias_rad_s: is added to the gyroscope.
         peak_pa: the gain: highest current of the correction, in pA; 0 corrects nothing.
         gate: see :class:`SeenHeading`.
-        learning_per_s2: how fast the gyroscope's bias is learnt from what vision and the corrected
-            ring differ by, in rad/s per rad and second; 0: it is not.
+        learning_per_s2: how fast the gyroscope's bias is learnt from what vision and the turned
+            gyroscope differ by, in rad/s per rad and second; 0: it is not.
 
     Attributes:
         learnt_rad_s: the bias that has been learnt; the corrected ring is driven without it.
@@ -96,6 +102,7 @@ class CorrectedIntegrator:
         self._learning_per_s2 = learning_per_s2
         self.learnt_rad_s = 0.0
         self._bridged_rad, self._done_ns = 0.0, 0
+        self._by_gyroscope_rad = 0.0
 
     def integrate(self, stamp_ns: int, rate_rad_s: float) -> tuple[float, float]:
         """Headings in rad at this stamp: of the ring that is corrected, and of the ring alone."""
@@ -113,10 +120,16 @@ class CorrectedIntegrator:
         alone_rad = self._integrator.integrate(stamp_ns, rate_rad_s)
         self._bridged_rad += self._integrator.bridged_rad - bridged_rad
         self._bridged_rad -= self.learnt_rad_s * (self._integrator.bridged_s - bridged_s)
-        heading_rad = math.remainder(self.corrected.heading_rad + self._bridged_rad, math.tau)
-        if seen is not None:
-            ahead_rad = math.remainder(heading_rad - seen[0], math.tau)
-            passed_s = (stamp_ns - self._done_ns) * 1e-9
-            self.learnt_rad_s += self._learning_per_s2 * passed_s * seen[1] * ahead_rad
+        self._learn(corrected_rad_s, (stamp_ns - self._done_ns) * 1e-9, seen)
         self._done_ns = stamp_ns
-        return heading_rad, alone_rad
+        heading_rad = self.corrected.heading_rad + self._bridged_rad
+        return math.remainder(heading_rad, math.tau), alone_rad
+
+    def _learn(self, rate_rad_s: float, passed_s: float, seen: tuple[float, float] | None) -> None:
+        """Learn the bias from how far the gyroscope has turned ahead of what is seen."""
+        self._by_gyroscope_rad += rate_rad_s * passed_s
+        if seen is not None:
+            ahead_rad = math.remainder(self._by_gyroscope_rad - seen[0], math.tau)
+            weighed_s_rad = passed_s * seen[1] * ahead_rad
+            self._by_gyroscope_rad -= FOLLOWS_PER_S * weighed_s_rad
+            self.learnt_rad_s += self._learning_per_s2 * weighed_s_rad

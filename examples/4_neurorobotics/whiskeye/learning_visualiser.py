@@ -10,9 +10,9 @@ from correction_visualiser import (
     show_uncorrected,
     show_vision,
 )
-from views import stamp_ns
 
 from neuros.hooks import neuros_function, neuros_initialise
+from neuros.time import to_seconds
 from neuros.visualise import VisualiseLines
 
 LEARNT = "learnt bias"
@@ -41,4 +41,4 @@ def start(node):
 
 @neuros_function(inputs="bias")
 def show_bias(node, bias):
-    node.get_user_data().bias.plot(LEARNT, bias.vector.z, stamp_ns(bias) * 1e-9)
+    node.get_user_data().bias.plot(LEARNT, bias.vector.z, to_seconds(bias))
