@@ -127,12 +127,14 @@ def test_ps_shows_the_nodes_and_stop_ends_them_as_ctrl_c_does(folder: Path, back
     with start(folder / "demo", "--backend", back_end, cwd=folder) as running:
         running.wait_for("[b]: running", 30.0)
         run = run_of(running).run
-        shown = [line.split() for line in neuros("ps").stdout.splitlines()]
+        listed = neuros("ps")
+        assert listed.returncode == 0, listed.stderr
+        shown = [line.split() for line in listed.stdout.splitlines()]
         rows = [row for row in shown if row[0] == run[:8]]
         assert [(row[1], row[2], row[3], row[-1]) for row in rows] == [
             ("demo", "a", back_end, "running"),
             ("demo", "b", back_end, "running"),
-        ]
+        ], listed.stdout
         stopped = neuros("stop", run[:8])
         assert stopped.returncode == 0
         assert stopped.stdout.startswith(f"stopped {run[:8]} (demo); run folder {folder}")
