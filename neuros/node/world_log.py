@@ -1,4 +1,4 @@
-"""How the simulated world of a recorded run has moved, for the page that ``neuros report`` makes.
+"""The log of a simulated world: how it has moved in a recorded run, for ``neuros report`` to show.
 
 ``<node>/world.jsonl`` has a JSON object per line: ``version`` of the geometry; ``geometry``, as
 JSON text, where that is another one than in the line before; ``frames``: lists of wall and

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.labelled import (
     LOG_TIME,
     PUBLISH_TIME,
+    Column,
     dataset_of,
     library,
     simulated_time_ns,
@@ -34,7 +35,6 @@ from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
-Column: TypeAlias = npt.NDArray[Any]
 _MOST_COLUMNS = 100
 
 

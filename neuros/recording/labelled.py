@@ -9,14 +9,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from neuros.errors import EnvironmentFault, UsageError
 
-if TYPE_CHECKING:
-    from neuros.recording.bag_reader import Column, RecordedTopic
+Column: TypeAlias = npt.NDArray[Any]
+"""Values of one field, a row per packet."""
 
 LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 _IMAGE = "sensor_msgs/msg/Image"
@@ -57,6 +58,17 @@ _PIXELS = {
 }
 
 
+class Topic(Protocol):
+    """A recorded topic."""
+
+    name: str
+    type: str
+    connection: str | None
+
+    def columns(self) -> dict[str, Column]:
+        """Its fields, by name, and the two times."""
+
+
 def library(name: str, otherwise: str = "") -> Any:
     """An optional library.
 
@@ -73,7 +85,7 @@ def library(name: str, otherwise: str = "") -> Any:
         raise EnvironmentFault(f"{text}, or use {otherwise}" if otherwise else text) from error
 
 
-def simulated_time_ns(topic: RecordedTopic, columns: Mapping[str, Column]) -> Column:
+def simulated_time_ns(topic: Topic, columns: Mapping[str, Column]) -> Column:
     """The simulated time of each packet. Raises ``UsageError`` if the bag has none."""
     if has_simulated_time(columns):
         return columns[PUBLISH_TIME]
@@ -88,7 +100,7 @@ def has_simulated_time(columns: Mapping[str, Column]) -> bool:
     return bool(np.any(columns[PUBLISH_TIME] != columns[LOG_TIME]))
 
 
-def dataset_of(topic: RecordedTopic, types: Mapping[str, Any], start_ns: int) -> Any:
+def dataset_of(topic: Topic, types: Mapping[str, Any], start_ns: int) -> Any:
     """What :meth:`RecordedTopic.xarray` gives; ``start_ns``: wall time of the bag's first packet.
 
     Args:

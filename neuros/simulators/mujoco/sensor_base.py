@@ -1,4 +1,4 @@
-"""What sensors of MuJoCo have in common: declaration, base class, frames, parts of messages."""
+"""The common part of MuJoCo sensors: declaration, base class, frames, parts of messages."""
 
 from __future__ import annotations
 
