@@ -82,7 +82,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     One name makes a ``Box``, a list a ``Dict`` of boxes, by the names without brackets.
 
     Args:
-        project: its file, its folder, or a :class:`neuros.Project`.
+        project: its file, its folder, or a :class:`~neuros.api.project.Project`.
         action: an output, whose packets the environment sends in its place, or an input.
         observation: outputs.
         reward: called after each step with the environment.
@@ -93,7 +93,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
             action drives; ``ranges`` come first.
         rounds, sim_s: length of a step, as for :meth:`Session.step`.
         initial_action: sent at each reset, for a project that waits for its first command.
-        options: those of :meth:`neuros.Project.session`.
+        options: those of :meth:`~neuros.api.project.Project.session`.
 
     Attributes:
         session: the run.
@@ -101,7 +101,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
 
     Raises:
         UsageError: if a name is that of no port or field, or its numbers are not known.
-        ProjectError, EnvironmentFault, RunError: as :meth:`neuros.Project.session` does.
+        ProjectError, EnvironmentFault, RunError: as :meth:`~neuros.api.project.Project.session` does.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in the class above
