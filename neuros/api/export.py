@@ -54,6 +54,7 @@ _OF_CONTAINERS = ("peers", "peer_timeout", "host_network", "registry", "volume_c
 _OF_SLURM = ("place", "spread")
 _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
+_LONGEST_LABEL = 63  # of DNS
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
 # What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
@@ -194,6 +195,8 @@ class Export:
     def _check(self, form: Form) -> None:
         if self.options.host_network and form.file == "kubernetes.yaml":
             raise UsageError("--host-network: Kubernetes gives each pod an address of its own")
+        if form.file == "kubernetes.yaml":
+            self._check_names()
         for node in self.project.nodes:
             for what in form.lacks:
                 if getattr(node.access, what):
@@ -202,6 +205,22 @@ class Export:
                         " its containers: export for compose, or run that node with"
                         " `neuros launch -n`"
                     )
+
+    def _check_names(self) -> None:
+        """A Service has an RFC 1035 label, the host of an indexed Job one of RFC 1123."""
+        hosts = {f"node '{node}'": f"{self.name}-{name}-0" for node, name in self.names.items()}
+        wrong = {what: host for what, host in hosts.items() if len(host) > _LONGEST_LABEL}
+        if not self.name[0].isalpha() or len(self.name) > _LONGEST_LABEL:
+            wrong = {f"project '{self.project.name}'": self.name, **wrong}
+        if wrong:
+            raise UsageError(
+                "\n".join(
+                    f"{what} would be '{name}' for Kubernetes, whose names begin with a letter and"
+                    f" have at most {_LONGEST_LABEL} characters: rename the folder of the project,"
+                    " or the node"
+                    for what, name in wrong.items()
+                )
+            )
 
     def _make_folder(self) -> None:
         _make_new(self.folder)
@@ -218,7 +237,16 @@ class Export:
             itself = [name for name in names if (Path(folder) / name).resolve() == here]
             return {*_NOT_COPIED(folder, names), *itself}
 
-        shutil.copytree(self.project.folder, image / "project", ignore=left_out)
+        try:
+            shutil.copytree(
+                self.project.folder,
+                image / "project",
+                ignore=left_out,
+                ignore_dangling_symlinks=True,
+            )
+        except shutil.Error as error:
+            why = "\n".join(f"{path} cannot be copied: {text}" for path, _, text in error.args[0])
+            raise UsageError(why) from error
         shutil.copytree(PACKAGE, image / "lib/neuros", ignore=_NOT_COPIED)
         if WORKSPACE.is_dir():
             shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=_NOT_COPIED)

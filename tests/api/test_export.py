@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -240,6 +241,27 @@ def test_a_folder_with_anything_in_it_is_not_written_to(project: Project) -> Non
     services(project, "compose")
     with pytest.raises(UsageError, match="is not an empty folder; name a new one"):
         exported(project, "compose")
+
+
+def test_a_link_to_nothing_is_left_out_and_what_cannot_be_copied_is_named(project: Project) -> None:
+    (project.folder / "old_data").symlink_to("gone")
+    assert services(project, "compose")
+    (project.folder / "itself").symlink_to(".")
+    with pytest.raises(UsageError, match=r"itself.* cannot be copied: .*symbolic links"):
+        exported(project, "swarm")
+
+
+def test_names_that_kubernetes_refuses_are_told_at_once(project: Project) -> None:
+    long = replace(project.nodes[1], name="counter" * 9)
+    project = replace(project, name="2_dice", nodes=(project.nodes[0], long))
+    with pytest.raises(UsageError) as raised:
+        exported(project, "kubernetes")
+    told = str(raised.value).splitlines()
+    assert [line.partition(" would be ")[0] for line in told] == [
+        "project '2_dice'",
+        f"node '{long.name}'",
+    ]
+    assert services(project, "compose")
 
 
 def test_an_invalid_project_is_not_exported(

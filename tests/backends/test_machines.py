@@ -73,6 +73,27 @@ class TestTrees:
         assert (before / "plugin.py").read_text() == "plugin.py"  # another run may use it
         assert (after / "plugin.py").read_text() == "changed"
 
+    def test_content_that_changed_while_it_was_sent_is_not_used(
+        self, project: Path, tmp_path: Path
+    ) -> None:
+        tree, store = scan("toy", project), TreeStore(tmp_path / "cache")
+        for digest in store.lacking([tree]):
+            store.receive(digest, b"half of another version")
+        with pytest.raises(OSError, match="was changed while it was sent"):
+            store.place(tree)
+
+    def test_two_agents_with_one_process_id_share_a_cache(
+        self, project: Path, tmp_path: Path
+    ) -> None:
+        """As on two nodes of a cluster, whose home folder is one."""
+        tree, stores = scan("toy", project), [TreeStore(tmp_path / "cache") for _ in range(2)]
+        paths = {file.digest: project / file.path for file in tree.files}
+        for digest, path in paths.items():
+            for store in stores:
+                store.receive(digest, path.read_bytes())
+        stores[1].clean_up()
+        assert (stores[0].place(tree) / "plugin.py").read_text() == "plugin.py"
+
     def test_what_was_changed_there_is_put_right(self, project: Path, tmp_path: Path) -> None:
         _, folder = self.give(project, tmp_path / "cache")
         (folder / "plugin.py").write_text("changed there")
@@ -211,14 +232,14 @@ class TestPump:
         node.close()
         end = NodeEnded("eye", "exit code 0")
         ends.agent.send_last(end)
-        ends.wait_for(lambda: end in ends.to_launcher)
+        wait_for(lambda: end in ends.to_launcher)
         supervisor.setblocking(False)  # what it has said before is there when its end is known
         assert b"".join(iter(lambda: supervisor.recv(1 << 16), b"")) == words
         supervisor.close()
 
     def test_who_hangs_up_is_missed_at_once(self, ends: Ends) -> None:
         ends.agent.end()
-        ends.wait_for(lambda: ends.lost)
+        wait_for(lambda: ends.lost)
         assert ends.lost == ["the connection was closed"]
 
     def test_who_is_silent_is_missed_after_its_time(self) -> None:
@@ -258,15 +279,9 @@ class Ends:
     def accepted(self) -> ControlStream:
         """The control connection that has come through."""
         found: list[ControlStream] = []
-        self.wait_for(lambda: found.extend(filter(None, [self.supervisor.accept()])) or found)
+        wait_for(lambda: found.extend(filter(None, [self.supervisor.accept()])) or found)
         found[0].setblocking(True)
         return found[0]
-
-    def wait_for(self, condition: Callable[[], object]) -> None:
-        deadline_s = time.monotonic() + _SOON_S
-        while not condition():
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
 
     def close(self) -> None:
         for pump in (self.launcher, self.agent):
@@ -274,6 +289,13 @@ class Ends:
             pump.join(_SOON_S)
         self.supervisor.close()
         self.listener.close()
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + _SOON_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
 
 
 class TestCommand:

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from launching import Finished, Running, launch, start
+
+from neuros.backends.machines.machine import Machine
+from neuros.backends.machines.trees import scan
+from neuros.control.link import encode
+from neuros.control.machines import Lacking
+from neuros.errors import EnvironmentFault
+from neuros.project.deployment import Host
 
 STREAM = Path(__file__).parent / "network" / "stream"
 NEUROS = Path(sys.executable).with_name("neuros")
@@ -81,3 +93,30 @@ def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(
     assert "process source: " in finished.output
     assert "process sink on other\n" in finished.output
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_ctrl_c_ends_the_sending_of_a_project(tmp_path: Path) -> None:
+    """Where a machine takes nothing any more; the launcher waits for the thread that sends."""
+    project, takes_no_more = tmp_path / "project", tmp_path / "takes_no_more"
+    project.mkdir()
+    (project / "weights").write_bytes(bytes(1 << 22))
+    (file,) = scan("project", project).files
+    agent = 'echo "$0"; head -c 100000 >/dev/null; touch "$1"; exec sleep 600'
+    answer = encode(Lacking((file.digest,))).decode().strip()
+    host = Host("robot", through=("sh", "-c", agent, answer, str(takes_no_more)))
+    machine = Machine(host, ENDED_S, lambda severity, text: None)
+    closer = threading.Thread(target=machine.close)  # what Ctrl+C does
+    with ThreadPoolExecutor(1) as threads:
+        sending = threads.submit(machine.place, project)
+        deadline_s = time.monotonic() + ENDED_S
+        while not takes_no_more.exists() and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        closer.start()
+        try:
+            with pytest.raises(EnvironmentFault, match="robot: it is not needed any more"):
+                sending.result(ENDED_S)
+        finally:
+            machine.lost = "ended"  # ends the thread, come what may
+            if closer.is_alive():
+                os.kill(machine.pid, signal.SIGKILL)  # else it is given some seconds
+            closer.join()

@@ -310,8 +310,7 @@ class Machine:
         end_s = None if limit_s is None else time.monotonic() + limit_s
         with self._arrived:
             while not self._answers:
-                if self.lost or self._is_closed:
-                    raise self._failed(self.lost or "it is not needed any more")
+                self._require_open()
                 if is_enough() or (end_s is not None and time.monotonic() > end_s):
                     raise self._failed("it did not answer in time")
                 self._arrived.wait(_LOOK_S)
@@ -320,6 +319,10 @@ class Machine:
             raise self._failed(answer.text)
         assert isinstance(answer, kind), f"{kind.__name__} was expected, not {answer}"
         return answer
+
+    def _require_open(self) -> None:
+        if self.lost or self._is_closed:
+            raise self._failed(self.lost or "it is not needed any more")
 
     def _failed(self, text: str) -> EnvironmentFault:
         return EnvironmentFault("\n".join(f"{self.host}: {line}" for line in text.splitlines()))
@@ -330,8 +333,10 @@ class Machine:
                 data = file.read(_CONTENT_BYTES)
                 while True:
                     following = file.read(_CONTENT_BYTES)
-                    while self._pump.unsent_bytes > _MOST_UNSENT_BYTES and not self.lost:
+                    while self._pump.unsent_bytes > _MOST_UNSENT_BYTES:
+                        self._require_open()  # else, after Ctrl+C, nobody writes it any more
                         time.sleep(_LOOK_S)
+                    self._require_open()
                     text = b64encode(data).decode()
                     self._pump.send(Content(digest, text, not following))
                     if not following:

@@ -67,7 +67,8 @@ class TreeStore:
 
     def __init__(self, cache: Path) -> None:
         self._cache = cache
-        self._received = cache / f"received-{os.getpid()}"
+        # Machines that share a home folder may have agents of one process id.
+        self._received = cache / f"received-{os.urandom(6).hex()}"
 
     def lacking(self, trees: Sequence[Tree]) -> tuple[str, ...]:
         """The digests of content that is nowhere here."""
@@ -92,7 +93,7 @@ class TreeStore:
                 path = target / file.path
                 if not _has(path, file.digest):
                     received = self._received / file.digest
-                    source = received if received.exists() else _find(known, file.digest)
+                    source = received if _has(received, file.digest) else _find(known, file.digest)
                     _copy(source, path, file)
             if target != kept.folder:
                 target.rename(kept.folder)
@@ -166,7 +167,7 @@ def _find(known: Mapping[str, Sequence[Path]], digest: str) -> Path | None:
 
 def _copy(source: Path | None, path: Path, file: TreeFile) -> None:
     if source is None:
-        raise OSError(f"the content of {file.path} has not arrived")
+        raise OSError(f"{file.path} was changed while it was sent: launch again")
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.name}.draft")
     shutil.copyfile(source, draft)
