@@ -101,7 +101,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
 
     Raises:
         UsageError: if a name is that of no port or field, or its numbers are not known.
-        ProjectError, EnvironmentFault, RunError: as :meth:`~neuros.api.project.Project.session` does.
+        ProjectError, EnvironmentFault, RunError: as a session does.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in the class above
