@@ -89,7 +89,7 @@ def look(node, left, right, heading):
         before, after = learner.learn()
         report(node, learner, before, after)
     packets = learner.predictor.packets(node, left, right)
-    if left.height and packets[0].vector.x > float(os.environ.get("GATE", "0.12")):
+    if left.height and packets[0].vector.x > float(os.environ.get("GATE", "0.07")):
         learner.keep(to_nanoseconds(left), view_of(left, right))
     return packets
 
