@@ -327,8 +327,8 @@ def _split(written: str) -> tuple[str, str, tuple[int, ...] | None]:
     match = _NAME.fullmatch(written)
     if match is None:
         raise UsageError(f"'{written}': say node.port, node.port.field or node.port.field[3]")
-    shape = match["shape"]
-    return match["port"], match["field"], shape and tuple(map(int, shape.split(",")))  # type: ignore[return-value]
+    shape = tuple(map(int, match["shape"].split(","))) if match["shape"] else None
+    return match["port"], match["field"], shape
 
 
 def _port(project: Described, name: str, *, is_output: bool = False) -> Port:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ KEPT = Path(__file__).parent / "kept"
 
 _Part = TypeVar("_Part")
 _DEADLOCK_S = 9.0  # the launcher asks after one second, and the answers are some seconds apart
-_MORE_RUNS, _CONFIRMING_RUNS = 3, 2  # of a rule that a busy machine may seem to break
+_MORE_RUNS = 2
 _SHRINKING_RUNS = 60
 
 
@@ -94,13 +93,11 @@ def verdict_of(case: Case, meter: LoadMeter, gate: Gate | None = None) -> Verdic
     doubtful = {each.rule for each in violations if each.is_timed}
     if not doubtful or len(doubtful) < len({each.rule for each in violations}):
         return Verdict(case, violations)
-    confirmed = Counter[str]()
     for _ in range(_MORE_RUNS):
         with gate.alone():
             again, _ = _judged(case, meter)
-        confirmed.update(doubtful & {each.rule for each in again})
-        is_certain = any(not each.is_timed for each in again)
-        if is_certain or max(confirmed.values(), default=0) >= _CONFIRMING_RUNS:
+        confirmed = doubtful & {each.rule for each in again}
+        if confirmed or any(not each.is_timed for each in again):
             return Verdict(case, again)
     return Verdict(case, (), violations)
 

@@ -28,7 +28,10 @@ def check(cell: Cell, folder: Path) -> None:
     if cell.backend == "docker":
         require_containers()
     outcome = run(cell, folder, flood_bytes=_FLOOD_BYTES)
-    assert not outcome.problems, f"{outcome.problems}\n{outcome.output[-5000:]}"
+    if outcome.is_late:  # because of the run, or of what else the machine did: once more tells
+        (folder / "again").mkdir()
+        outcome = run(cell, folder / "again", flood_bytes=_FLOOD_BYTES)
+    assert outcome.is_well, f"{outcome}\n{outcome.output[-5000:]}"
 
 
 @pytest.mark.parametrize("cell", _ROUND, ids=str)

@@ -5,6 +5,8 @@ Here is what no other test has; ``python -m tests.faults`` runs all cells.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -51,8 +53,13 @@ _INTERRUPTS = (
 )
 
 
-def check(outcome: Outcome) -> None:
-    assert not outcome.problems, f"{outcome.problems}\n{outcome.output[-5000:]}"
+def check(trial: Callable[[Path], Outcome], folder: Path) -> None:
+    """A late end is the run's, or comes of what else the machine did: once more tells."""
+    outcome = trial(folder)
+    if outcome.is_late:
+        (folder / "again").mkdir()
+        outcome = trial(folder / "again")
+    assert outcome.is_well, f"{outcome}\n{outcome.output[-5000:]}"
 
 
 def check_process(fault: ProcessFault, folder: Path) -> None:
@@ -60,7 +67,7 @@ def check_process(fault: ProcessFault, folder: Path) -> None:
         require_engines()
     elif fault.backend == "docker":
         require_containers()
-    check(processes.run(fault, folder))
+    check(partial(processes.run, fault), folder)
 
 
 def check_surrounding(cell: SurroundingCell, folder: Path) -> None:
@@ -68,7 +75,7 @@ def check_surrounding(cell: SurroundingCell, folder: Path) -> None:
     require("gcc", "ip")
     if cell.backend == "docker":
         require_containers()
-    check(surroundings.run(cell, folder))
+    check(partial(surroundings.run, cell), folder)
 
 
 @pytest.mark.parametrize("fault", _FAULTS, ids=str)
@@ -85,7 +92,7 @@ def test_surroundings_end_a_run_only_where_they_must(cell: SurroundingCell, tmp_
 
 @pytest.mark.parametrize("interrupt", _INTERRUPTS, ids=str)
 def test_ctrl_c_ends_a_run_at_any_moment(interrupt: Interrupt, tmp_path: Path) -> None:
-    check(interrupts.run(interrupt, tmp_path))
+    check(partial(interrupts.run, interrupt), tmp_path)
 
 
 def test_many_launches_are_all_alike_and_leave_nothing(tmp_path: Path) -> None:

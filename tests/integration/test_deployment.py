@@ -113,6 +113,7 @@ def test_ctrl_c_ends_the_sending_of_a_project(tmp_path: Path) -> None:
             time.sleep(0.01)
         closer.start()
         try:
+            assert takes_no_more.exists()
             with pytest.raises(EnvironmentFault, match="robot: it is not needed any more"):
                 sending.result(ENDED_S)
         finally:
