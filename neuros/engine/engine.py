@@ -147,10 +147,14 @@ class Engine:
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself; all that waited then has been taken in."""
+        """The event that the engine posted to itself.
+
+        All that waited then has been taken in, but a hook may have run since: it is an event like
+        any other.
+        """
         self._wake()
         self._has_posted_loop_back = False
-        self._pass(may_start=True)
+        self._pass()
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
         """Send packets as if a hook with those outputs had returned them, once it might run.
@@ -318,7 +322,7 @@ class Engine:
             self.since_ns = now_ns
         return now_ns
 
-    def _pass(self, *, may_start: bool = False) -> None:
+    def _pass(self) -> None:
         if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
             return
         lifecycle, pause = self._lifecycle, self._pause
@@ -333,9 +337,8 @@ class Engine:
                     if pause.is_on and not pause.allows(hook):
                         continue
                     if not hook.blocked or hook.can_send():
-                        if not may_start and (self._to_itself or not self._has_taken_in()):
+                        if self._to_itself or not self._has_taken_in():
                             break
-                        may_start = False
                         self._run(hook)
             finally:
                 self._is_passing = False

@@ -142,10 +142,10 @@ class LoggedEngine(Engine):
         super().stop_hooks()
         self._note(_entry(EventKind.STOP))
 
-    def _pass(self, *, may_start: bool = False) -> None:
+    def _pass(self) -> None:
         if not self._is_passing:
             self._starts = 0
-        super()._pass(may_start=may_start)
+        super()._pass()
 
     def _run(self, hook: Hook) -> None:
         self._starts += 1

@@ -96,17 +96,15 @@ class NaiveNode:
         if kind == "own packet":
             self.on_packet(*rest)
         else:
-            self.one_pass(has_taken_in=True)
+            self.one_pass()
 
     # ---- rules
 
-    def one_pass(self, *, has_taken_in: bool = False) -> None:
+    def one_pass(self) -> None:
         for hook in sorted(self.hooks, key=lambda each: (each.last_turn, each.place)):
             if self.is_ready(hook):
-                is_own_coming = any(event[0] == "own packet" for event in self.events)
-                if is_own_coming and not has_taken_in:
+                if any(event[0] == "own packet" for event in self.events):
                     break
-                has_taken_in = False
                 self.run(hook)
         is_loop_back_waiting = any(event[0] == "loop-back" for event in self.events)
         if not is_loop_back_waiting and any(self.is_ready(hook) for hook in self.hooks):

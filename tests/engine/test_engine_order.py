@@ -234,6 +234,19 @@ def test_what_arrives_meanwhile_starts_no_hook_but_is_there_for_the_next():
     assert bench.calls[-1] == ("look", (3,))
 
 
+def test_a_loop_back_from_before_the_last_execution_starts_nothing_ahead_of_arrivals():
+    bench = Bench(function("slow", "x"), function("quick", "x"), connections=[wire(A)])
+    after_a_hook_something_may_have_arrived(bench)
+    assert bench.packet(A, 1) == ["slow"]
+    bench.is_taken_in = True
+    assert bench.packet(A, 2) == ["quick"]  # the loop-back of the first one still waits
+    assert bench.posted_event() == []
+    assert bench.packet(A, 3) == []
+    bench.is_taken_in = True
+    assert bench.posted_event() == ["slow"]
+    assert bench.calls[-1] == ("slow", (3,))
+
+
 def test_acknowledgements_that_have_piled_up_start_a_main_loop_once():
     """Else it would run once more for each, and what its input gets would grow older and older."""
     receivers = [wire(f"node.o -> {name}.x", 0, queue_size=8) for name in ("b", "c", "d")]
