@@ -20,6 +20,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from neuros.api.project import Project
+from neuros.api.session import check_length
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Port
@@ -100,7 +101,8 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         action, observation: those of the last step.
 
     Raises:
-        UsageError: if a name is that of no port or field, or its numbers are not known.
+        UsageError: if a name is that of no port or field, or its numbers are not known; for a
+            negative length of a step.
         ProjectError, EnvironmentFault, RunError: as a session does.
     """
 
@@ -122,6 +124,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         backend: str = "in-process",
         **options: Any,
     ) -> None:
+        check_length(rounds, sim_s)
         loaded = project if isinstance(project, Project) else Project.from_file(project)
         described = loaded.check_with({})
         self._reward, self._done = reward, done

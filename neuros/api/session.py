@@ -11,6 +11,7 @@ import asyncio
 import base64
 import contextlib
 import html
+import math
 import select
 import sys
 import threading
@@ -142,8 +143,10 @@ class Session:
         Raises:
             RunError: if it has failed, or had ended before.
             TimeoutError: if it takes longer; what goes on is waited for by the next step.
-            UsageError: for ``sim_s`` where no node owns simulated time.
+            UsageError: for ``sim_s`` where no node owns simulated time, and for a length that is
+                negative or not finite.
         """
+        check_length(rounds, sim_s)
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         with self._lock:
             self._check_running()
@@ -167,6 +170,8 @@ class Session:
         Returns:
             As :meth:`step`, and raises what that raises.
         """
+        _check_seconds("duration_s", duration_s)
+        _check_seconds("duration_sim_s", duration_sim_s)
         if (duration_s is None) == (duration_sim_s is None):
             raise UsageError("run: give either duration_s or duration_sim_s")
         with self._lock:
@@ -540,6 +545,18 @@ def with_session_inputs(project: Project, taken: Sequence[str]) -> tuple[Project
         nodes.append(replace(node, inputs=tuple(inputs)))
     bound = replace(project, nodes=tuple(nodes), connections=tuple(connections))
     return bound, tuple(names)
+
+
+def check_length(rounds: int, sim_s: float | None) -> None:
+    """Refuse a length of a step that is no length; raises ``UsageError``."""
+    if rounds < 0:
+        raise UsageError(f"rounds={rounds}: give 0 or more")
+    _check_seconds("sim_s", sim_s)
+
+
+def _check_seconds(name: str, seconds: float | None) -> None:
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise UsageError(f"{name}={seconds:g}: give 0 or more seconds")
 
 
 def _input(project: Project, name: str) -> tuple[Node, Port]:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -313,6 +313,25 @@ def test_wrong_values_are_refused_as_those_of_a_hook(held: Session) -> None:
     wrong._data = "13"
     with pytest.raises(ValueError, match="packet for input 'push': field 'data' must be"):
         held.send("robot.push", wrong)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda s: s.step(-1), "rounds=-1: give 0 or more"),
+        (lambda s: s.step(sim_s=-0.1), "sim_s=-0.1: give 0 or more seconds"),
+        (lambda s: s.step(sim_s=float("nan")), "sim_s=nan: give 0 or more seconds"),
+        (lambda s: s.run(duration_s=-1), "duration_s=-1: give 0 or more seconds"),
+        (lambda s: s.run(duration_sim_s=float("inf")), "duration_sim_s=inf: give 0 or more"),
+    ],
+)
+def test_a_length_that_is_none_is_refused(
+    held: Session, call: Callable[[Session], object], said: str
+) -> None:
+    before = held["robot.pose"].count
+    with pytest.raises(UsageError, match=re.escape(said)):
+        call(held)
+    assert held["robot.pose"].count == before
 
 
 def test_what_a_session_cannot_be_is_said_before_anything_starts(tmp_path: Path) -> None:
