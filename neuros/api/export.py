@@ -15,12 +15,14 @@ What a container starts is in :mod:`neuros.api.part`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
+import shlex
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
@@ -178,18 +180,16 @@ class Export:
         """
         form = FORMS[self.options.form]
         self._check(form)
-        try:
-            self._make_folder()
+        file = self.folder / form.file
+        with _new_folder(self.folder):
+            self._make_folders()
             self._copy()
             (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
             (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
             content = json.dumps(parts_to_json(self.project, self.files), indent=2) + "\n"
             (self.folder / NODES_FILE).write_text(content, "utf-8")
-            file = self.folder / form.file
             documents = form.documents(self)
             file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
-        except OSError as error:
-            raise _not_written(self.folder, error) from error
         return file
 
     def _check(self, form: Form) -> None:
@@ -222,8 +222,7 @@ class Export:
                 )
             )
 
-    def _make_folder(self) -> None:
-        _make_new(self.folder)
+    def _make_folders(self) -> None:
         for each in ("runs", "image/runs"):
             (self.folder / each).mkdir(parents=True)
         # Volumes begin as what the image has there, and whoever a container runs as writes to them.
@@ -273,22 +272,42 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
         return Export(project, messages, options).write()
     script = script_of(project, options)
     folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
-    try:
-        _make_new(folder)
+    with _new_folder(folder):
         (folder / "job.sh").write_text(script, "utf-8")
-    except OSError as error:
-        raise _not_written(folder, error) from error
     return folder / "job.sh"
 
 
-def _make_new(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder for what the block writes; nothing of that stays if it fails.
+
+    Raises:
+        UsageError: if the folder is taken or cannot be written.
+    """
+    was_there = folder.exists()
+    if was_there and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException as error:
+        if was_there:
+            _empty(folder)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise UsageError(
+                f"{folder} cannot be written ({error.strerror}): name another folder with -o"
+            ) from error
+        raise
 
 
-def _not_written(folder: Path, error: OSError) -> UsageError:
-    return UsageError(f"{folder} cannot be written ({error.strerror}): name another folder with -o")
+def _empty(folder: Path) -> None:
+    for each in folder.iterdir():
+        if each.is_dir():
+            shutil.rmtree(each, ignore_errors=True)
+        else:
+            each.unlink(missing_ok=True)
 
 
 # ------------------------------------------------------------------------------- the formats
@@ -381,7 +400,8 @@ def _is_up(part: Part) -> list[str]:
 
     Swarm tells others the address of a healthy container only, and each waits for the others.
     """
-    return ["sh", "-c", f"test ! -e {part.run} || test -S {part.run}/control.sock"]
+    run, listener = shlex.quote(part.run), shlex.quote(f"{part.run}/control.sock")
+    return ["sh", "-c", f"test ! -e {run} || test -S {listener}"]
 
 
 def _kubernetes(export: Export) -> list[dict[str, Any]]:

@@ -27,7 +27,7 @@ from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.environments.pythons import Pythons
 from neuros.backends.machines.mirror import Follower
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import TreeStore, tree_cache
+from neuros.backends.machines.trees import RECEIVED, TreeStore, tree_cache
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
@@ -70,7 +70,7 @@ _BUSY_S, _QUIET_S = 0.05, 0.2
 _MOST_IN_FLIGHT_BYTES = 1 << 19
 _STOP_S = 5.0
 _KEPT_S = 7 * 24 * 3600.0
-_RUN = "run-"
+_RUNS = "runs"
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
@@ -196,7 +196,9 @@ class Agent:
     def _place(self) -> None:
         project, workspace = map(self._store.place, self._trees)
         self._store.clean_up()
-        self._run = Path(tempfile.mkdtemp(prefix=_RUN, dir=self._cache))
+        runs = self._cache / _RUNS
+        runs.mkdir(exist_ok=True)
+        self._run = Path(tempfile.mkdtemp(prefix="", dir=runs))
         self._pump.send(Placed(str(project), str(workspace), str(self._run)))
 
     def _prepare(self, nodes: Iterable[Mapping[str, Any]]) -> None:
@@ -298,15 +300,24 @@ class Agent:
         for name, process in tuple(self._processes.items()):
             how = process.poll()
             assert self._follower is not None
+            if how is None and self._is_full:
+                continue
             for chunk in self._follower.grown(name):
                 self._send(chunk)
                 has_sent = True
-                if how is None and self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES:
-                    return True
+                if how is None and self._is_full:
+                    # The others come first the next time.
+                    self._processes[name] = self._processes.pop(name)
+                    break
             if how is not None:
                 del self._processes[name]
                 self._pump.send_last(NodeEnded(name, how))
         return has_sent
+
+    @property
+    def _is_full(self) -> bool:
+        """Whether the launcher has to take what is on its way before more is sent."""
+        return self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES
 
     def _send(self, chunk: Chunk) -> None:
         self._in_flight_bytes += len(chunk.data) * 3 // 4
@@ -317,8 +328,10 @@ class Agent:
         load = None if self._monitor is None else self._monitor.stop()
         problem = None if self._monitor is None else self._monitor.failure
         for chunk in self._follower.rest() if self._follower is not None else ():
+            if self._is_lost:
+                break
             self._send(chunk)
-            while self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES and not self._is_lost:
+            while self._is_full and not self._is_lost:
                 message = self._next(_QUIET_S)
                 if isinstance(message, Took):
                     self._in_flight_bytes -= message.size
@@ -366,7 +379,7 @@ def _json_of(file: NodeFile) -> str:
 
 def _remove_old_runs(cache: Path) -> None:
     """What was left of runs whose launcher has gone is kept for a week."""
-    for run in (*cache.glob(f"{_RUN}*"), *cache.glob("received-*")):
+    for run in (*cache.glob(f"{_RUNS}/*"), *cache.glob(f"{RECEIVED}/*")):
         try:
             is_old = run.stat().st_mtime < time.time() - _KEPT_S
         except OSError:

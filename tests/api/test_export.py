@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -98,7 +99,8 @@ def test_each_node_is_a_service_that_is_not_started_again_and_looks_for_the_othe
         assert command.endswith(" --peer-timeout 600 --peers counter --duration 3")
         assert "--peers the-thrower" in " ".join(found["counter"]["command"])
         for service in found.values():
-            assert service["healthcheck"]["test"][-1].endswith("/control.sock")
+            listener = service["healthcheck"]["test"][-1].split()[-1]
+            assert re.fullmatch(r"'/neuros/runs/\$\{RUN:-run\}/\w+/control.sock'", listener)
     assert found["counter"]["deploy"]["restart_policy"] == {"condition": "none"}
 
 
@@ -249,6 +251,18 @@ def test_a_link_to_nothing_is_left_out_and_what_cannot_be_copied_is_named(projec
     (project.folder / "itself").symlink_to(".")
     with pytest.raises(UsageError, match=r"itself.* cannot be copied: .*symbolic links"):
         exported(project, "swarm")
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_what_fails_leaves_nothing_behind(project: Project, is_there: bool) -> None:
+    (project.folder / "itself").symlink_to(".")
+    folder = project.folder.parent / "compose"
+    if is_there:
+        folder.mkdir()
+    with pytest.raises(UsageError, match="cannot be copied"):
+        exported(project, "compose")
+    assert [*folder.glob("*")] == []
+    assert folder.exists() == is_there
 
 
 def test_names_that_kubernetes_refuses_are_told_at_once(project: Project) -> None:

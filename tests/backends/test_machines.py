@@ -100,6 +100,13 @@ class TestTrees:
         assert self.give(project, tmp_path / "cache") == (["plugin.py"], folder)
         assert (folder / "plugin.py").read_text() == "plugin.py"
 
+    def test_what_has_come_to_it_there_is_removed(self, project: Path, tmp_path: Path) -> None:
+        _, folder = self.give(project, tmp_path / "cache")
+        (folder / "models/brain.py").write_text("would be imported")
+        self.give(project, tmp_path / "cache")
+        files = sorted(path.name for path in folder.rglob("*") if path.is_file())
+        assert files == ["plugin.py", "robot.xml", "script.sh"]
+
 
 class TestMirror:
     """Files that nodes write elsewhere."""
@@ -174,6 +181,21 @@ class TestClock:
         assert clock.round_trip_s == pytest.approx(0.01)
         assert clock.monotonic_s == pytest.approx(1000.0)
         assert clock.unix_s == pytest.approx(-3.0)
+
+    def test_a_clock_that_drifts_is_followed(self, tmp_path: Path) -> None:
+        """By 100 us per second; the very first answer is the fastest."""
+        clock, drift = ClockOffset(), 1e-4
+        for now_s in range(0, 601, 10):
+            late_s = 0.002 if now_s else 0.001
+            ahead_s = 1000.0 + drift * (now_s - late_s / 2)
+            clock.take(Pong(now_s - late_s, now_s - late_s / 2 + ahead_s, 0.0), now_s, 0.0)
+        assert clock.monotonic_s == pytest.approx(1000.06, abs=0.007)
+        here_s = [5.0, 300.0, 595.0]
+        there_ns = [round(1e9 * (t + 1000.0 + drift * t)) for t in here_s]
+        (tmp_path / "0.sent_ns").write_bytes(array("q", there_ns).tobytes())
+        clock.log_here(tmp_path)
+        moved = array("q", (tmp_path / "0.sent_ns").read_bytes())
+        assert [1e-9 * t for t in moved] == pytest.approx(here_s, abs=0.003)
 
     def test_processes_of_one_machine_have_one_clock(self) -> None:
         clock = ClockOffset()

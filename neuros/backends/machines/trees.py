@@ -6,9 +6,11 @@
         <name>-<key>/                 a tree, whole from its first moment; the key is its content's
         <name>-<key>.json             its files and their digests
         <name>-<key>.draft/           only while it is being made
+        received/                     by agent, content that has come for trees
+        runs/                         by agent, its run folder
 
 Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
-has been changed in a tree there is put right before it is used.
+has been changed in a tree there is put right before it is used, and what has come to it is removed.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -30,6 +32,7 @@ from neuros.errors import EnvironmentFault
 _LEFT_OUT = frozenset({"__pycache__", "runs", "node_modules"})
 _RUN_FILE = "run.json"
 _READ_BYTES = 1 << 20
+RECEIVED = "received"
 
 
 def tree_cache(environ: Mapping[str, str]) -> Path:
@@ -68,7 +71,7 @@ class TreeStore:
     def __init__(self, cache: Path) -> None:
         self._cache = cache
         # Machines that share a home folder may have agents of one process id.
-        self._received = cache / f"received-{os.urandom(6).hex()}"
+        self._received = cache / RECEIVED / os.urandom(6).hex()
 
     def lacking(self, trees: Sequence[Tree]) -> tuple[str, ...]:
         """The digests of content that is nowhere here."""
@@ -95,6 +98,7 @@ class TreeStore:
                     received = self._received / file.digest
                     source = received if _has(received, file.digest) else _find(known, file.digest)
                     _copy(source, path, file)
+            _remove_others(target, {file.path for file in tree.files})
             if target != kept.folder:
                 target.rename(kept.folder)
             kept.beside(".json").write_text(json.dumps([asdict(file) for file in tree.files]))
@@ -163,6 +167,16 @@ def _has(path: Path, digest: str) -> bool:
 
 def _find(known: Mapping[str, Sequence[Path]], digest: str) -> Path | None:
     return next((path for path in known.get(digest, ()) if _has(path, digest)), None)
+
+
+def _remove_others(folder: Path, paths: Collection[str]) -> None:
+    """Remove what is not in a tree, but for what Python keeps beside its modules."""
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [each for each in folders if each != "__pycache__"]
+        for name in names:
+            path = Path(parent, name)
+            if path.relative_to(folder).as_posix() not in paths:
+                path.unlink()
 
 
 def _copy(source: Path | None, path: Path, file: TreeFile) -> None:
