@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from email.parser import HeaderParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,6 +54,10 @@ def run(*command: object, cwd: Path, environ: Mapping[str, str]) -> str:
     return done.stdout + done.stderr
 
 
+EXTRACTION: Any = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
+"""Python 3.11.2, of Debian 12, has no filters yet."""
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an sdist, made of a copy of the checkout, and a wheel, made of the sdist."""
@@ -67,7 +72,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run(sys.executable, "-c", code, cwd=folder / place, environ=os.environ)
         for archive in folder.glob("*.tar.gz"):
             with tarfile.open(archive) as opened:
-                opened.extractall(folder, filter="data")
+                opened.extractall(folder, **EXTRACTION)
             archive.with_name(archive.name.removesuffix(".tar.gz")).rename(folder / "sdist")
             archive.unlink()
     return folder

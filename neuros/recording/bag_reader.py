@@ -33,6 +33,7 @@ from neuros.recording.labelled import (
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
+from neuros.recording.spike_trains import segment_of, write_nwb
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 _MOST_COLUMNS = 100
@@ -149,6 +150,28 @@ class RecordedTopic:
             EnvironmentFault: if xarray is not installed.
         """
         return dataset_of(self, self._bag.store.fielddefs, self._bag.start_ns)
+
+    def neo(self) -> Any:
+        """A ``neo.Segment`` of recorded spikes (``neuros_msgs/msg/Spikes``).
+
+        It has a ``SpikeTrain`` for each neuron of the population, in the order of their numbers,
+        annotated with ``neuron``, in seconds of simulated time.
+
+        Raises:
+            EnvironmentFault: if Neo is not installed.
+            UsageError: for packets of another type, and for spikes of neurons that are not there.
+        """
+        return segment_of(self)
+
+    def nwb(self, file: str | os.PathLike[str]) -> None:
+        """Write recorded spikes into a new file of Neurodata Without Borders, a unit per neuron.
+
+        Raises:
+            EnvironmentFault: if PyNWB is not installed.
+            UsageError: as :meth:`neo`.
+            OSError: if the file cannot be written.
+        """
+        write_nwb(self, file, self._bag.start_ns, self._bag.custom.get("run_id", "unknown"))
 
 
 class Bag:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,28 @@ class Spikes:
         """The same spikes, by time; of one time, by neuron."""
         order = np.lexsort((self.neuron, self.time_s))
         return Spikes(self.neuron[order], self.time_s[order])
+
+    def into(self, packet: Any, neurons: int) -> Any:
+        """Put the spikes into a ``neuros_msgs/msg/Spikes``, by time; returns that message.
+
+        Its header is the caller's: the stamp says until when these are all spikes.
+
+        Args:
+            neurons: size of the population.
+
+        Raises:
+            ValueError: if a spike is of none of these neurons.
+        """
+        spikes = self.in_order()
+        packet.size = neurons
+        packet.senders = checked_indices(spikes, neurons).astype(np.uint32)
+        packet.times = spikes.time_s
+        return packet
+
+    @classmethod
+    def of(cls, packet: Any) -> Spikes:
+        """The spikes in a ``neuros_msgs/msg/Spikes``."""
+        return cls(np.array(packet.senders, np.int64), np.array(packet.times, np.float64))
 
     def counts(self, neurons: int) -> Indices:
         """How many of them each of so many neurons fired, ``(neurons,)``."""

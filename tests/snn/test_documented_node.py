@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Float64MultiArray
 
+from neuros.snn import Spikes
 from neuros.testing import PluginHarness
 
 pytest.importorskip("nest")
@@ -18,9 +19,13 @@ PAGE = Path(__file__).resolve().parents[2] / "docs/neural_simulators.md"
 FLOAT = "std_msgs/msg/Float64"
 
 
+def blocks() -> list[str]:
+    """The node, and its hook that sends spikes."""
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+
+
 def estimates(folder: Path, seed: str) -> list[float]:
-    (plugin,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
-    (folder / "snn.py").write_text(plugin)
+    (folder / "snn.py").write_text(blocks()[0])
     with PluginHarness(
         str(folder / "snn.py"),
         inputs={"direction": FLOAT},
@@ -41,3 +46,23 @@ def test_it_decodes_the_direction_that_its_spikes_stand_for_and_repeats_it(tmp_p
     error = np.array(found) - 0.02 * np.arange(50)
     assert np.all(np.abs(error) < math.radians(5 * 8))
     assert np.sqrt(np.mean(error[1:] ** 2)) < math.radians(10)
+
+
+def test_its_spikes_are_messages(tmp_path):
+    (tmp_path / "snn.py").write_text("\n".join(["from neuros.time import to_stamp", *blocks()]))
+    with PluginHarness(
+        str(tmp_path / "snn.py"),
+        inputs={"direction": FLOAT, "rates": "std_msgs/msg/Float64MultiArray"},
+        outputs={"estimate": FLOAT, "spikes": "neuros_msgs/msg/Spikes"},
+        environment={"SEED": "1"},
+        name="snn",
+    ) as harness:
+        harness.send("rates", Float64MultiArray(data=[1000.0, *[0.0] * 99]))
+        harness.run()
+        (packet,) = harness.received("spikes")
+    spikes = Spikes.of(packet)
+    assert packet.size == 100
+    assert {*spikes.neuron} == {0}
+    assert 5 <= len(spikes) <= 50  # 20 are expected
+    stamp_s = packet.header.stamp.nanosec * 1e-9
+    assert 0 < spikes.time_s.min() <= spikes.time_s.max() <= stamp_s <= 0.02
