@@ -12,12 +12,17 @@ if TYPE_CHECKING:
     from neuros.api.run import Run
     from neuros.api.sweep import sweep
     from neuros.distribution import __version__
+    from neuros.node.handle import NodeHandle as Node
 
-__all__ = ["Project", "Run", "__version__", "sweep"]
+__all__ = ["Node", "Project", "Run", "__version__", "sweep"]
 
 
 def __getattr__(name: str) -> Any:
     """Import these only when they are asked for: every node imports this package."""
+    if name == "Node":
+        from neuros.node.handle import NodeHandle
+
+        return NodeHandle
     if name == "Project":
         from neuros.api.project import Project
 

@@ -65,10 +65,10 @@ PACKAGES = (
     Package(8, ("pytest_plugin", "gym")),
     Package(8, ("cli", "doctor", "replay")),
 )
-# neuros itself holds public names; every package may ask it for the version. Those of the package
-# ``api`` it imports when they are asked for.
+# neuros itself holds public names; every package may ask it for the version. Those of other packages
+# it imports when they are asked for.
 PUBLIC_NAMES = Package(2, ("",))
-PUBLIC_NAMES_OF_API = ("Project", "Run", "sweep")
+OWNERS = {"Node": "node", "Project": "api", "Run": "api", "sweep": "api"}
 PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
@@ -134,8 +134,7 @@ def package_of(module: str) -> Package | None:
     """The package of ``neuros.<module>``; the package itself is ``""``."""
     if not module:
         return PUBLIC_NAMES
-    if module in PUBLIC_NAMES_OF_API:
-        module = "api"
+    module = OWNERS.get(module, module)
     return next((package for package in PACKAGES if package.holds(module)), None)
 
 
@@ -175,7 +174,7 @@ def complaint(importer: str, imported: str) -> str | None:
     other = package_of(inner)
     if other is None or other in (package, PUBLIC_NAMES):
         return None
-    if package is PUBLIC_NAMES and other.holds("api"):
+    if package is PUBLIC_NAMES and {*other.modules} & {*OWNERS.values()}:
         return None
     if package.holds("installation"):
         return None if other.holds("errors") else "the installation knows nothing but errors"

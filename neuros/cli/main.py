@@ -51,6 +51,7 @@ COMMANDS = {
     "launch": Command("launch", "run a project"),
     "validate": Command("projects", "check a project without running it"),
     "graph": Command("projects", "show the nodes and connections of a project"),
+    "types": Command("projects", "let editors know the fields of a project's messages"),
     "build": Command("setup", "build message packages"),
     "ps": Command("runs", "show the runs of this user"),
     "stop": Command("runs", "stop a run, as Ctrl+C does"),

@@ -1,4 +1,4 @@
-"""``neuros validate`` and ``neuros graph``, and the project that a command names.
+"""``neuros validate``, ``graph`` and ``types``, and the project that a command names.
 
 What reads projects is imported late: ``--help`` and completion read this module, too.
 """
@@ -160,6 +160,41 @@ def add_graph(graph: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="FILE", help="write to this file, not to the terminal"
     )
     graph.set_defaults(command=_graph)
+
+
+def add_types(types: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    types.description = (
+        "Write stubs of the message classes that a project uses, so that editors complete the"
+        " fields of packets, and mypy and Pyright check them."
+    )
+    add_project(types)
+    types.add_argument(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        help="the folder for the stubs (default: typings, where Pyright and VS Code look)",
+    )
+    types.set_defaults(command=_types)
+
+
+def _types(options: argparse.Namespace) -> int:
+    """Write the stubs. Raises ``UsageError`` if they cannot be written."""
+    from neuros.cli.environments import build_messages
+    from neuros.messages.stubs import write_stubs
+
+    project, messages = load_with_messages(options, reads_plugins=False)
+    if code := build_messages(messages):
+        return code
+    sys.path[:0] = map(str, messages.paths)
+    ports = [port for node in project.nodes for port in (*node.inputs, *node.outputs)]
+    folder = Path(options.output or "typings")
+    try:
+        files = write_stubs({port.type for port in ports}, folder)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
+    print(f"{folder}: {_count(len(files), 'package')} of messages")
+    return 0
 
 
 def _graph(options: argparse.Namespace) -> int:

@@ -1,0 +1,135 @@
+"""Stubs of message classes, so that editors and type checkers know the fields of a packet.
+
+rclpy's classes are made without annotations. A stub file (PEP 561) states what
+``get_fields_and_field_types`` says of each class, and what NeuROS takes for a field: a plain number
+for a number, a list or an array for a sequence of them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+_HEAD = """\
+# Made by `neuros types`: the fields of {package}'s messages. Make it again when those change.
+from array import array
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+{imports}
+"""
+# PEP 484: so the modules that have no stubs, such as srv, are not taken for missing.
+_OTHER_MODULES = """\
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
+"""
+_SCALARS = {
+    **dict.fromkeys(("float", "double"), "float"),
+    **dict.fromkeys(("string", "wstring"), "str"),
+    **dict.fromkeys(("octet",), "bytes"),
+    "boolean": "bool",
+}
+_FIELD = re.compile(
+    r"(?P<sequence>sequence<)?(?P<element>w?string(?:<\d+>)?|[\w/]+)(?:, \d+)?>?"
+    r"(?:\[(?P<length>\d+)\])?"
+)
+_IN_ARRAYS = {"int", "float"}
+
+
+def write_stubs(types: Iterable[str], folder: Path) -> list[Path]:
+    """Write the stubs of all packages of these types, and of those that they need.
+
+    Args:
+        types: in ROS notation, ``sensor_msgs/msg/Imu``; their packages can be imported.
+        folder: gets a folder for each package.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: if they cannot be written.
+    """
+    wanted = {name.partition("/")[0] for name in types}
+    done: dict[str, str] = {}
+    while todo := wanted - done.keys():
+        package = min(todo)
+        done[package], needed = _stub(package)
+        wanted |= needed
+    files = []
+    for package, text in sorted(done.items()):
+        file = folder / package / "msg" / "__init__.pyi"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        (folder / package / "__init__.pyi").write_text(_OTHER_MODULES, "utf-8")
+        file.write_text(text, "utf-8")
+        files.append(file)
+    return files
+
+
+def _stub(package: str) -> tuple[str, set[str]]:
+    """The text for a package, and the packages whose messages it names."""
+    module = import_module(f"{package}.msg")
+    found = (getattr(module, name) for name in sorted(vars(module)))
+    classes = [each for each in found if hasattr(each, "get_fields_and_field_types")]
+    fields = {each: each.get_fields_and_field_types() for each in classes}
+    elements = (_parts(kind)[1] for types in fields.values() for kind in types.values())
+    needed = {element.partition("/")[0] for element in elements if "/" in element} - {package}
+    imports = "".join(f"\nimport {each}.msg" for each in sorted(needed))
+    text = _HEAD.format(package=package, imports=imports)
+    for each in classes:
+        lines = [*_constants(each), *_fields(fields[each], package)]
+        text += f"\nclass {each.__name__}:\n" + "".join(f"    {line}\n" for line in lines)
+    return text, needed
+
+
+def _constants(message: Any) -> Iterator[str]:
+    """The constants of a message, which its metaclass has."""
+    made = getattr(type(message), f"_{type(message).__name__}__constants", {})
+    for name, value in made.items():
+        yield f"{name}: ClassVar[{type(value).__name__}]"
+
+
+def _fields(types: dict[str, str], package: str) -> Iterator[str]:
+    """The fields, and the constructor that takes them by name."""
+    taken = []
+    for name, kind in types.items():
+        read, written = _annotations(kind, package)
+        taken.append(f"{name}: {written} = ...")
+        if read == written:
+            yield f"{name}: {read}"
+        else:
+            yield "@property"
+            yield f"def {name}(self) -> {read}: ..."
+            yield f"@{name}.setter"
+            yield f"def {name}(self, value: {written}) -> None: ..."
+    yield f"def __init__({', '.join(['self', *(['*', *taken] if taken else [])])}) -> None: ..."
+    yield "@classmethod"
+    yield "def get_fields_and_field_types(cls) -> dict[str, str]: ..."
+
+
+def _annotations(kind: str, package: str) -> tuple[str, str]:
+    """What a field is when it is read, and what may be written to it."""
+    is_sequence, element, length = _parts(kind)
+    if "/" in element:
+        of, name = element.split("/")
+        plain = name if of == package else f"{of}.msg.{name}"
+    else:
+        plain = _SCALARS.get(element, "int")
+    if length and plain in _IN_ARRAYS:
+        return "np.ndarray[Any, Any]", f"Sequence[{plain}] | np.ndarray[Any, Any]"
+    if is_sequence and plain in _IN_ARRAYS:
+        return f"array[{plain}]", f"Sequence[{plain}] | np.ndarray[Any, Any] | bytes"
+    if is_sequence or length:
+        return f"list[{plain}]", f"Sequence[{plain}]"
+    return plain, plain
+
+
+def _parts(kind: str) -> tuple[bool, str, str]:
+    """Whether it is a sequence, of what, and the length of an array: of ``sequence<double, 3>``."""
+    found = _FIELD.fullmatch(kind)
+    assert found is not None, kind
+    return bool(found["sequence"]), found["element"].partition("<")[0], found["length"] or ""
