@@ -65,7 +65,7 @@ PACKAGES = (
     Package(8, ("pytest_plugin", "gym")),
     Package(8, ("cli", "doctor", "replay")),
 )
-# neuros itself holds public names; every package may ask it for the version. Those of other packages
+# neuros itself holds public names; every package may ask it for the version. Those of others
 # it imports when they are asked for.
 PUBLIC_NAMES = Package(2, ("",))
 OWNERS = {"Node": "node", "Project": "api", "Run": "api", "sweep": "api"}
