@@ -15,12 +15,13 @@ What a container starts is in :mod:`neuros.api.part`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
@@ -178,8 +179,8 @@ class Export:
         """
         form = FORMS[self.options.form]
         self._check(form)
-        try:
-            self._make_folder()
+        with _new(self.folder):
+            self._make_folders()
             self._copy()
             (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
             (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
@@ -188,8 +189,6 @@ class Export:
             file = self.folder / form.file
             documents = form.documents(self)
             file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
-        except OSError as error:
-            raise _not_written(self.folder, error) from error
         return file
 
     def _check(self, form: Form) -> None:
@@ -222,8 +221,7 @@ class Export:
                 )
             )
 
-    def _make_folder(self) -> None:
-        _make_new(self.folder)
+    def _make_folders(self) -> None:
         for each in ("runs", "image/runs"):
             (self.folder / each).mkdir(parents=True)
         # Volumes begin as what the image has there, and whoever a container runs as writes to them.
@@ -273,22 +271,29 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
         return Export(project, messages, options).write()
     script = script_of(project, options)
     folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
-    try:
-        _make_new(folder)
+    with _new(folder):
         (folder / "job.sh").write_text(script, "utf-8")
-    except OSError as error:
-        raise _not_written(folder, error) from error
     return folder / "job.sh"
 
 
-def _make_new(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
-    folder.mkdir(parents=True, exist_ok=True)
-
-
-def _not_written(folder: Path, error: OSError) -> UsageError:
-    return UsageError(f"{folder} cannot be written ({error.strerror}): name another folder with -o")
+@contextlib.contextmanager
+def _new(folder: Path) -> Iterator[None]:
+    """Make a folder, to be filled; it is as before if that fails. Raises ``UsageError``."""
+    try:
+        was_there = folder.exists()
+        if was_there and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            yield
+        except BaseException:
+            for path in (*folder.iterdir(),) if was_there else (folder,):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            raise
+    except OSError as error:
+        raise UsageError(
+            f"{folder} cannot be written ({error.strerror}): name another folder with -o"
+        ) from error
 
 
 # ------------------------------------------------------------------------------- the formats
@@ -372,16 +377,19 @@ def _service(part: Part) -> dict[str, Any]:
         "read_only": True,
         "cap_drop": ["ALL"],
         "stop_grace_period": f"{_STOP_S}s",
-        "healthcheck": {"test": ["CMD", *_is_up(part)], "interval": f"{_PROBE_S}s"},
+        "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
     }
 
 
-def _is_up(part: Part) -> list[str]:
+def _is_up(part: Part, dollar: str = "$") -> list[str]:
     """The command that succeeds while the launcher of a node listens to it, and before it does.
 
-    Swarm tells others the address of a healthy container only, and each waits for the others.
+    Swarm tells others the address of a healthy container only, and each waits for the others. The
+    run folder is an argument of the shell: RUN, which is part of it, may be any text. ``dollar``:
+    how the engine is told one that is not for itself.
     """
-    return ["sh", "-c", f"test ! -e {part.run} || test -S {part.run}/control.sock"]
+    run = f'"{dollar}1"'
+    return ["sh", "-c", f"test ! -e {run} || test -S {run}/control.sock", "sh", part.run]
 
 
 def _kubernetes(export: Export) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ A deployment stands apart from the project: an experiment does not know where it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -77,8 +77,7 @@ def load_deployment(path: Path, project: Project | None = None) -> DeploymentFil
     except SourceError as error:
         raise ProjectError([error.problem]) from None
     problems += violations_in(root, "deployment")
-    if not problems:
-        problems += _mistakes(root, project)
+    problems += _mistakes(root, project, [problem.pointer for problem in problems])
     if problems:
         raise ProjectError(problems)
     hosts = {name: _host(name, each) for name, each in (root.plain.get("hosts") or {}).items()}
@@ -93,13 +92,20 @@ def _host(name: str, keys: Mapping[str, object]) -> Host:
     return Host(name, **{**keys, **lists})  # type: ignore[arg-type]
 
 
-def _mistakes(root: Element, project: Project | None) -> list[Problem]:
-    """What the schema cannot say."""
+def _members(element: Element | None) -> Mapping[str, Element]:
+    """Those of an object; of anything else, which the schema refuses, none."""
+    return element.value if element is not None and isinstance(element.value, dict) else {}
+
+
+def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> list[Problem]:
+    """What the schema cannot say; ``wrong``: pointers to what it has refused."""
     found: list[Problem] = []
-    hosts = root.member("hosts")
+    members = _members(root)
     known = {HERE}
-    for name, host in (hosts.value if hosts is not None else {}).items():
+    for name, host in _members(members.get("hosts")).items():
         known.add(name)
+        if any(f"{each}/".startswith(f"{host.pointer}/") for each in wrong):
+            continue
         ways = [key for key in ("ssh", "through") if key in host.value]
         if name == HERE and ways:
             text = f"'{HERE}' is the machine that launches, and is not reached by '{ways[0]}'"
@@ -110,10 +116,9 @@ def _mistakes(root: Element, project: Project | None) -> list[Problem]:
             found.append(host.problem(text, f"this machine is '{HERE}'"))
         elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
             found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))
-    nodes = root.member("nodes")
     names = None if project is None else [node.name for node in project.nodes]
-    for node, host in (nodes.value if nodes is not None else {}).items():
-        if host.value not in known:
+    for node, host in _members(members.get("nodes")).items():
+        if isinstance(host.value, str) and host.value not in known:
             hint = did_you_mean(host.value, known) or f"there are {', '.join(sorted(known))}"
             found.append(host.problem(f"there is no host '{host.value}'", hint))
         if names is not None and node not in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -249,6 +250,34 @@ def test_a_link_to_nothing_is_left_out_and_what_cannot_be_copied_is_named(projec
     (project.folder / "itself").symlink_to(".")
     with pytest.raises(UsageError, match=r"itself.* cannot be copied: .*symbolic links"):
         exported(project, "swarm")
+
+
+def test_a_failed_export_leaves_nothing_behind(project: Project, tmp_path: Path) -> None:
+    (project.folder / "itself").symlink_to(".")
+    output = tmp_path / "new"
+    for was_there in (False, True):
+        if was_there:
+            output.mkdir()
+        with pytest.raises(UsageError, match="cannot be copied"):
+            export(project, [], ExportOptions(form="compose", output=str(output)))
+        assert output.exists() == was_there
+        assert not was_there or not any(output.iterdir())
+
+
+def test_the_run_folder_may_have_any_name(project: Project) -> None:
+    """As ``RUN`` is the user's, it is no part of what the shell reads."""
+    for form in ("compose", "swarm"):
+        _, shell, option, script, *arguments = services(project, form)["counter"]["healthcheck"][
+            "test"
+        ]
+        assert "RUN" not in script
+        assert "$$1" in script  # Compose and Swarm make $ of it
+        assert "${RUN:-run}" in arguments[-1]
+        made = project.folder / "a run; exit 7" / "counter"
+        made.mkdir(parents=True, exist_ok=True)
+        command = [shell, option, script.replace("$$", "$"), "sh", str(made)]
+        assert subprocess.run(command, check=False).returncode == 1  # nothing listens in there
+        assert subprocess.run([*command[:-1], f"{made} gone"], check=False).returncode == 0
 
 
 def test_names_that_kubernetes_refuses_are_told_at_once(project: Project) -> None:

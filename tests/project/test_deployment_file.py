@@ -83,6 +83,20 @@ def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
     ]
 
 
+def test_mistakes_are_told_with_problems_of_form(tmp_path: Path) -> None:
+    hosts = {"neither": {}, "robot": {"ssh": 5}, "none": 3}
+    nodes = {"eye": "robbot", "brian": "robot", "brain": 7}
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes, "node": {}}) == [
+        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how it is reached",
+        "/hosts/none: must be an object, but is a whole number",
+        "/hosts/robot/ssh: must be a text, but is a whole number",
+        "/node: unknown key 'node'",
+        "/nodes/brain: must be a text, but is a whole number",
+        "/nodes/brian: the project has no node 'brian'",
+        "/nodes/eye: there is no host 'robbot'",
+    ]
+
+
 def test_what_is_no_json_is_told_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(ProjectError, match=r"deployment\.json:2:1"):
         load(tmp_path, '{"nodes":\n}')

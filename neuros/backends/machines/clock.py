@@ -8,8 +8,9 @@ a message takes there and back.
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,10 @@ from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
 from neuros.control.machines import Pong
 from neuros.errors import ControlError
+
+_MOST_DRIFT = 1e-4
+"""Seconds per second by which clocks drift apart: crystals are within 1e-4 of what they show."""
+_COURSE_NS = 10 * 10**9
 
 _ACCEPTED = {kind_of(each): each for each in FROM_NODES}
 _WITH_TIMES = tuple(f'{{"kind": "{kind_of(each)}"' for each in (Report, Probed, NodeStatus))
@@ -33,25 +38,33 @@ _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
 class ClockOffset:
     """How far the clocks of another machine are ahead of this one's, in seconds.
 
+    Clocks of two machines drift apart. So an answer counts for less the older it is, as in NTP
+    (RFC 5905, dispersion): its error is at most half of its round trip, and what the clocks may
+    have drifted since. The one of the smallest error counts.
+
     Attributes:
         round_trip_s: of the answer that it is known from.
         monotonic_s, unix_s: the difference of the monotonic clocks, and of those that show the time
-            of day.
+            of day, at that answer.
     """
 
     round_trip_s: float = float("inf")
     monotonic_s: float = 0.0
     unix_s: float = 0.0
+    _known_at_s: float = 0.0
+    _course: list[tuple[int, int]] = field(default_factory=list)
 
     def take(self, pong: Pong, now_s: float, now_unix_s: float) -> None:
-        """An answer that arrives now, by the clocks of this machine; the fastest says most."""
+        """An answer that arrives now, by the clocks of this machine."""
         round_trip_s = now_s - pong.sent_s
-        if round_trip_s < self.round_trip_s:
-            self.round_trip_s = round_trip_s
+        drift_s = _MOST_DRIFT * (now_s - self._known_at_s)
+        if round_trip_s / 2 < self.round_trip_s / 2 + drift_s:
+            self.round_trip_s, self._known_at_s = round_trip_s, now_s
             ahead_s = pong.monotonic_s - (now_s - round_trip_s / 2)
             # Containers of one machine have one clock.
             self.monotonic_s = ahead_s if abs(ahead_s) > round_trip_s else 0.0
             self.unix_s = pong.unix_s - (now_unix_s - round_trip_s / 2)
+            self._course.append((round(1e9 * pong.monotonic_s), round(1e9 * self.monotonic_s)))
 
     @property
     def is_known(self) -> bool:
@@ -101,7 +114,7 @@ class ClockOffset:
 
     def log_here(self, folder: Path) -> None:
         """Move the times in the packet log of a node there. Raises ``OSError``."""
-        shift_ns = round(1e9 * self.monotonic_s)
+        course = self._smooth_course()
         for file in sorted(folder.glob("*")):
             width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
             if columns:
@@ -109,8 +122,20 @@ class ClockOffset:
                 data = file.read_bytes()
                 entries.frombytes(data[: len(data) // 8 * 8])
                 for column in columns:
-                    _shift(entries, column, width, shift_ns)
+                    _shift(entries, column, width, course)
                 file.write_bytes(entries.tobytes())
+
+    def _smooth_course(self) -> list[tuple[int, int]]:
+        """When it was known, on the clock there, and what it was then; in ns.
+
+        Of answers that came shortly after each other, the last, which was the best at its time.
+        """
+        found: list[tuple[int, int]] = []
+        for at_ns, ahead_ns in self._course:
+            if found and at_ns - found[-1][0] < _COURSE_NS:
+                found.pop()
+            found.append((at_ns, ahead_ns))
+        return found
 
 
 def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:
@@ -119,6 +144,18 @@ def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:
     return {**sample, "values": rows} if rows else dict(sample)
 
 
-def _shift(entries: array[int], column: int, width: int, shift_ns: int) -> None:
-    moved: Sequence[int] = [at_ns - shift_ns for at_ns in entries[column::width]]
+def _shift(entries: array[int], column: int, width: int, course: Sequence[tuple[int, int]]) -> None:
+    times = [at_ns for at_ns, _ in course]
+    moved = [at_ns - _ahead_ns(at_ns, times, course) for at_ns in entries[column::width]]
     entries[column::width] = array("q", moved)
+
+
+def _ahead_ns(at_ns: int, times: Sequence[int], course: Sequence[tuple[int, int]]) -> int:
+    """How far the clock there was ahead, on a straight line between two answers."""
+    after = bisect_right(times, at_ns)
+    if not course:
+        return 0
+    if after in (0, len(course)):
+        return course[max(0, after - 1)][1]
+    (from_ns, ahead_ns), (to_ns, then_ns) = course[after - 1], course[after]
+    return ahead_ns + (then_ns - ahead_ns) * (at_ns - from_ns) // (to_ns - from_ns)

@@ -6,9 +6,11 @@
         <name>-<key>/                 a tree, whole from its first moment; the key is its content's
         <name>-<key>.json             its files and their digests
         <name>-<key>.draft/           only while it is being made
+        received/                     what has come for trees; a folder for each agent
+        runs/                         run folders of agents
 
 Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
-has been changed in a tree there is put right before it is used.
+has been changed in a tree there is put right before it is used, and what has come to it is removed.
 """
 
 from __future__ import annotations
@@ -19,13 +21,16 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import asdict
 from pathlib import Path
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.control.machines import Tree, TreeFile
 from neuros.errors import EnvironmentFault
+
+RECEIVED, RUNS = "received", "runs"
+"""Folders of agents beside the trees, whose names end with a key."""
 
 _LEFT_OUT = frozenset({"__pycache__", "runs", "node_modules"})
 _RUN_FILE = "run.json"
@@ -68,7 +73,7 @@ class TreeStore:
     def __init__(self, cache: Path) -> None:
         self._cache = cache
         # Machines that share a home folder may have agents of one process id.
-        self._received = cache / f"received-{os.urandom(6).hex()}"
+        self._received = cache / RECEIVED / os.urandom(6).hex()
 
     def lacking(self, trees: Sequence[Tree]) -> tuple[str, ...]:
         """The digests of content that is nowhere here."""
@@ -89,6 +94,7 @@ class TreeStore:
         with kept.locked():
             target = kept.folder if kept.folder.is_dir() else kept.beside(".draft")
             target.mkdir(parents=True, exist_ok=True)
+            _remove_others(target, {file.path for file in tree.files})
             for file in tree.files:
                 path = target / file.path
                 if not _has(path, file.digest):
@@ -143,6 +149,17 @@ def _files(folder: Path) -> Iterator[Path]:
         here = Path(parent)
         folders[:] = [each for each in folders if not _is_left_out(here / each)]
         yield from (here / name for name in names if (here / name).is_file())
+
+
+def _remove_others(folder: Path, wanted: Set[str]) -> None:
+    """Remove files that a tree does not have, and folders that are empty then. Raises ``OSError``."""
+    for path in [*_files(folder)]:
+        if path.relative_to(folder).as_posix() not in wanted:
+            path.unlink()
+            for parent in path.parents:
+                if parent == folder or any(parent.iterdir()):
+                    break
+                parent.rmdir()
 
 
 def _raise(error: OSError) -> None:
