@@ -262,7 +262,7 @@ class TestClock:
     def test_a_clock_that_drifts_is_followed_and_so_are_times_in_packet_logs(
         self, tmp_path: Path
     ) -> None:
-        """The clock there gains 50 us each second, an hour long; the first answer is the fastest."""
+        """The clock there gains 50 us a second for an hour; the first answer is the fastest."""
         clock, drift = ClockOffset(), 5e-5
 
         def there_s(here_s: float) -> float:

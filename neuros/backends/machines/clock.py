@@ -21,7 +21,6 @@ from neuros.errors import ControlError
 
 _MOST_DRIFT = 1e-4
 """Seconds per second by which clocks drift apart: crystals are within 1e-4 of what they show."""
-_COURSE_NS = 10 * 10**9
 
 _ACCEPTED = {kind_of(each): each for each in FROM_NODES}
 _WITH_TIMES = tuple(f'{{"kind": "{kind_of(each)}"' for each in (Report, Probed, NodeStatus))
@@ -52,7 +51,7 @@ class ClockOffset:
     monotonic_s: float = 0.0
     unix_s: float = 0.0
     _known_at_s: float = 0.0
-    _course: list[tuple[int, int]] = field(default_factory=list)
+    _course: list[tuple[float, float, float]] = field(default_factory=list)
 
     def take(self, pong: Pong, now_s: float, now_unix_s: float) -> None:
         """An answer that arrives now, by the clocks of this machine."""
@@ -64,7 +63,16 @@ class ClockOffset:
             # Containers of one machine have one clock.
             self.monotonic_s = ahead_s if abs(ahead_s) > round_trip_s else 0.0
             self.unix_s = pong.unix_s - (now_unix_s - round_trip_s / 2)
-            self._course.append((round(1e9 * pong.monotonic_s), round(1e9 * self.monotonic_s)))
+            self._note(pong.monotonic_s, round_trip_s / 2)
+
+    def _note(self, at_s: float, error_s: float) -> None:
+        """Keep what is known of this moment, on the clock there, for packet logs."""
+        while self._course:
+            earlier_s, _, earlier_error_s = self._course[-1]
+            if earlier_error_s <= error_s + _MOST_DRIFT * (at_s - earlier_s):
+                break
+            self._course.pop()  # now it is better known, for that moment too
+        self._course.append((at_s, self.monotonic_s, error_s))
 
     @property
     def is_known(self) -> bool:
@@ -114,7 +122,7 @@ class ClockOffset:
 
     def log_here(self, folder: Path) -> None:
         """Move the times in the packet log of a node there. Raises ``OSError``."""
-        course = self._smooth_course()
+        course = [(round(1e9 * at_s), round(1e9 * ahead_s)) for at_s, ahead_s, _ in self._course]
         for file in sorted(folder.glob("*")):
             width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
             if columns:
@@ -124,18 +132,6 @@ class ClockOffset:
                 for column in columns:
                     _shift(entries, column, width, course)
                 file.write_bytes(entries.tobytes())
-
-    def _smooth_course(self) -> list[tuple[int, int]]:
-        """When it was known, on the clock there, and what it was then; in ns.
-
-        Of answers that came shortly after each other, the last, which was the best at its time.
-        """
-        found: list[tuple[int, int]] = []
-        for at_ns, ahead_ns in self._course:
-            if found and at_ns - found[-1][0] < _COURSE_NS:
-                found.pop()
-            found.append((at_ns, ahead_ns))
-        return found
 
 
 def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:

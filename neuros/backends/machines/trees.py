@@ -152,7 +152,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _remove_others(folder: Path, wanted: Set[str]) -> None:
-    """Remove files that a tree does not have, and folders that are empty then. Raises ``OSError``."""
+    """Remove files that a tree does not have, and folders empty then. Raises ``OSError``."""
     for path in [*_files(folder)]:
         if path.relative_to(folder).as_posix() not in wanted:
             path.unlink()
