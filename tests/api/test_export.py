@@ -99,7 +99,7 @@ def test_each_node_is_a_service_that_is_not_started_again_and_looks_for_the_othe
         assert command.endswith(" --peer-timeout 600 --peers counter --duration 3")
         assert "--peers the-thrower" in " ".join(found["counter"]["command"])
         for service in found.values():
-            assert service["healthcheck"]["test"][-2].endswith("/control.sock")
+            assert service["healthcheck"]["test"][-3].endswith("/control.sock")
     assert found["counter"]["deploy"]["restart_policy"] == {"condition": "none"}
 
 
