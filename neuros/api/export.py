@@ -20,7 +20,6 @@ import hashlib
 import json
 import os
 import re
-import shlex
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -180,14 +179,14 @@ class Export:
         """
         form = FORMS[self.options.form]
         self._check(form)
-        file = self.folder / form.file
-        with _new_folder(self.folder):
+        with _new(self.folder):
             self._make_folders()
             self._copy()
             (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
             (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
             content = json.dumps(parts_to_json(self.project, self.files), indent=2) + "\n"
             (self.folder / NODES_FILE).write_text(content, "utf-8")
+            file = self.folder / form.file
             documents = form.documents(self)
             file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
         return file
@@ -272,42 +271,29 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
         return Export(project, messages, options).write()
     script = script_of(project, options)
     folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
-    with _new_folder(folder):
+    with _new(folder):
         (folder / "job.sh").write_text(script, "utf-8")
     return folder / "job.sh"
 
 
 @contextlib.contextmanager
-def _new_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for what the block writes; nothing of that stays if it fails.
-
-    Raises:
-        UsageError: if the folder is taken or cannot be written.
-    """
-    was_there = folder.exists()
-    if was_there and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
+def _new(folder: Path) -> Iterator[None]:
+    """Make a folder, to be filled; it is as before if that fails. Raises ``UsageError``."""
     try:
+        was_there = folder.exists()
+        if was_there and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"-o {folder}: is not an empty folder; name a new one")
         folder.mkdir(parents=True, exist_ok=True)
-        yield
-    except BaseException as error:
-        if was_there:
-            _empty(folder)
-        else:
-            shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise UsageError(
-                f"{folder} cannot be written ({error.strerror}): name another folder with -o"
-            ) from error
-        raise
-
-
-def _empty(folder: Path) -> None:
-    for each in folder.iterdir():
-        if each.is_dir():
-            shutil.rmtree(each, ignore_errors=True)
-        else:
-            each.unlink(missing_ok=True)
+        try:
+            yield
+        except BaseException:
+            for path in (*folder.iterdir(),) if was_there else (folder,):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            raise
+    except OSError as error:
+        raise UsageError(
+            f"{folder} cannot be written ({error.strerror}): name another folder with -o"
+        ) from error
 
 
 # ------------------------------------------------------------------------------- the formats
@@ -391,17 +377,19 @@ def _service(part: Part) -> dict[str, Any]:
         "read_only": True,
         "cap_drop": ["ALL"],
         "stop_grace_period": f"{_STOP_S}s",
-        "healthcheck": {"test": ["CMD", *_is_up(part)], "interval": f"{_PROBE_S}s"},
+        "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
     }
 
 
-def _is_up(part: Part) -> list[str]:
+def _is_up(part: Part, dollar: str = "$") -> list[str]:
     """The command that succeeds while the launcher of a node listens to it, and before it does.
 
-    Swarm tells others the address of a healthy container only, and each waits for the others.
+    Swarm tells others the address of a healthy container only, and each waits for the others. The
+    run folder is an argument of the shell: RUN, which is part of it, may be any text. ``dollar``:
+    how the engine is told one that is not for itself.
     """
-    run, listener = shlex.quote(part.run), shlex.quote(f"{part.run}/control.sock")
-    return ["sh", "-c", f"test ! -e {run} || test -S {listener}"]
+    run = f'"{dollar}1"'
+    return ["sh", "-c", f"test ! -e {run} || test -S {run}/control.sock", "sh", part.run]
 
 
 def _kubernetes(export: Export) -> list[dict[str, Any]]:

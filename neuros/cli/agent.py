@@ -27,7 +27,7 @@ from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.environments.pythons import Pythons
 from neuros.backends.machines.mirror import Follower
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import RECEIVED, TreeStore, tree_cache
+from neuros.backends.machines.trees import RECEIVED, RUNS, TreeStore, tree_cache
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
@@ -70,7 +70,6 @@ _BUSY_S, _QUIET_S = 0.05, 0.2
 _MOST_IN_FLIGHT_BYTES = 1 << 19
 _STOP_S = 5.0
 _KEPT_S = 7 * 24 * 3600.0
-_RUNS = "runs"
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
@@ -178,7 +177,7 @@ class Agent:
     def _begin_to_place(self, message: Place) -> None:
         self._cache.mkdir(parents=True, exist_ok=True)
         self._store.clean_up()
-        _remove_old_runs(self._cache)
+        remove_old_runs(self._cache)
         self._trees = (message.project, message.workspace)
         lacking = self._store.lacking(self._trees)
         self._awaited = set(lacking)
@@ -196,9 +195,9 @@ class Agent:
     def _place(self) -> None:
         project, workspace = map(self._store.place, self._trees)
         self._store.clean_up()
-        runs = self._cache / _RUNS
+        runs = self._cache / RUNS
         runs.mkdir(exist_ok=True)
-        self._run = Path(tempfile.mkdtemp(prefix="", dir=runs))
+        self._run = Path(tempfile.mkdtemp(dir=runs))
         self._pump.send(Placed(str(project), str(workspace), str(self._run)))
 
     def _prepare(self, nodes: Iterable[Mapping[str, Any]]) -> None:
@@ -300,23 +299,22 @@ class Agent:
         for name, process in tuple(self._processes.items()):
             how = process.poll()
             assert self._follower is not None
-            if how is None and self._is_full:
-                continue
-            for chunk in self._follower.grown(name):
-                self._send(chunk)
-                has_sent = True
-                if how is None and self._is_full:
-                    # The others come first the next time.
-                    self._processes[name] = self._processes.pop(name)
-                    break
+            if how is not None or not self._is_full:
+                for chunk in self._follower.grown(name):
+                    self._send(chunk)
+                    has_sent = True
+                    if how is None and self._is_full:
+                        # The others have their turn first when the launcher has taken this.
+                        self._processes[name] = self._processes.pop(name)
+                        break
             if how is not None:
                 del self._processes[name]
                 self._pump.send_last(NodeEnded(name, how))
-        return has_sent
+        return has_sent or self._is_full
 
     @property
     def _is_full(self) -> bool:
-        """Whether the launcher has to take what is on its way before more is sent."""
+        """Whether as much is under way as the launcher gets at once."""
         return self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES
 
     def _send(self, chunk: Chunk) -> None:
@@ -328,13 +326,13 @@ class Agent:
         load = None if self._monitor is None else self._monitor.stop()
         problem = None if self._monitor is None else self._monitor.failure
         for chunk in self._follower.rest() if self._follower is not None else ():
-            if self._is_lost:
-                break
             self._send(chunk)
             while self._is_full and not self._is_lost:
                 message = self._next(_QUIET_S)
                 if isinstance(message, Took):
                     self._in_flight_bytes -= message.size
+            if self._is_lost:  # nobody takes the rest, which stays here
+                return
         self._pump.send(Finished(load, (problem,) if problem else ()))
         self._pump.end()
         self._pump.join()
@@ -377,9 +375,9 @@ def _json_of(file: NodeFile) -> str:
     return json.dumps(node_file_to_json(file), indent=2) + "\n"
 
 
-def _remove_old_runs(cache: Path) -> None:
+def remove_old_runs(cache: Path) -> None:
     """What was left of runs whose launcher has gone is kept for a week."""
-    for run in (*cache.glob(f"{_RUNS}/*"), *cache.glob(f"{RECEIVED}/*")):
+    for run in (*(cache / RUNS).glob("*"), *(cache / RECEIVED).glob("*")):
         try:
             is_old = run.stat().st_mtime < time.time() - _KEPT_S
         except OSError:

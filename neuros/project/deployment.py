@@ -5,7 +5,7 @@ A deployment stands apart from the project: an experiment does not know where it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -77,7 +77,7 @@ def load_deployment(path: Path, project: Project | None = None) -> DeploymentFil
     except SourceError as error:
         raise ProjectError([error.problem]) from None
     problems += violations_in(root, "deployment")
-    problems += _mistakes(root, project, {problem.pointer for problem in problems})
+    problems += _mistakes(root, project, [problem.pointer for problem in problems])
     if problems:
         raise ProjectError(problems)
     hosts = {name: _host(name, each) for name, each in (root.plain.get("hosts") or {}).items()}
@@ -92,13 +92,19 @@ def _host(name: str, keys: Mapping[str, object]) -> Host:
     return Host(name, **{**keys, **lists})  # type: ignore[arg-type]
 
 
-def _mistakes(root: Element, project: Project | None, refused: Collection[str]) -> list[Problem]:
-    """What the schema cannot say; hosts with something that it has ``refused`` are left to it."""
+def _members(element: Element | None) -> Mapping[str, Element]:
+    """Those of an object; of anything else, which the schema refuses, none."""
+    return element.value if element is not None and isinstance(element.value, dict) else {}
+
+
+def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> list[Problem]:
+    """What the schema cannot say; ``wrong``: pointers to what it has refused."""
     found: list[Problem] = []
+    members = _members(root)
     known = {HERE}
-    for name, host in _members(root, "hosts").items():
+    for name, host in _members(members.get("hosts")).items():
         known.add(name)
-        if any(f"{each}/".startswith(f"/hosts/{name}/") for each in refused):
+        if any(f"{each}/".startswith(f"{host.pointer}/") for each in wrong):
             continue
         ways = [key for key in ("ssh", "through") if key in host.value]
         if name == HERE and ways:
@@ -111,7 +117,7 @@ def _mistakes(root: Element, project: Project | None, refused: Collection[str]) 
         elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
             found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))
     names = None if project is None else [node.name for node in project.nodes]
-    for node, host in _members(root, "nodes").items():
+    for node, host in _members(members.get("nodes")).items():
         if isinstance(host.value, str) and host.value not in known:
             hint = did_you_mean(host.value, known) or f"there are {', '.join(sorted(known))}"
             found.append(host.problem(f"there is no host '{host.value}'", hint))
@@ -119,9 +125,3 @@ def _mistakes(root: Element, project: Project | None, refused: Collection[str]) 
             text, hint = f"the project has no node '{node}'", did_you_mean(node, names)
             found.append(host.key_problem(text, hint))
     return found
-
-
-def _members(root: Element, name: str) -> Mapping[str, Element]:
-    """The members of an object of the file; none where there is no such object."""
-    found = root.member(name)
-    return found.value if found is not None and isinstance(found.value, dict) else {}

@@ -16,10 +16,11 @@ from neuros.backends.machines.clock import ClockOffset
 from neuros.backends.machines.machine import agent_command
 from neuros.backends.machines.mirror import Follower, write_chunk
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import TreeStore, scan
+from neuros.backends.machines.trees import RECEIVED, RUNS, TreeStore, scan
+from neuros.cli.agent import Agent, remove_old_runs
 from neuros.control import LiveCounters, Message, NodeStatus, Report
 from neuros.control.link import encode
-from neuros.control.machines import FROM_AGENT, TO_AGENT, Chunk, NodeEnded, Pong
+from neuros.control.machines import FROM_AGENT, TO_AGENT, Chunk, NodeEnded, Pong, Tree
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 from neuros.stacks import FILE_NAME as STACK
@@ -102,10 +103,86 @@ class TestTrees:
 
     def test_what_has_come_to_it_there_is_removed(self, project: Path, tmp_path: Path) -> None:
         _, folder = self.give(project, tmp_path / "cache")
-        (folder / "models/brain.py").write_text("would be imported")
-        self.give(project, tmp_path / "cache")
-        files = sorted(path.name for path in folder.rglob("*") if path.is_file())
-        assert files == ["plugin.py", "robot.xml", "script.sh"]
+        (folder / "random.py").write_text("a module that hides one of Python's")
+        (folder / "old/models").mkdir(parents=True)
+        (folder / "old/models/robot.xml").write_text("stale")
+        (folder / "__pycache__").mkdir()
+        (folder / "__pycache__/plugin.pyc").write_text("of a run that uses it now")
+        assert self.give(project, tmp_path / "cache") == ([], folder)
+        assert not (folder / "random.py").exists()
+        assert not (folder / "old").exists()
+        assert (folder / "__pycache__/plugin.pyc").exists()
+
+    def test_old_runs_are_removed_and_projects_of_such_a_name_are_not(
+        self, project: Path, tmp_path: Path
+    ) -> None:
+        cache = tmp_path / "cache"
+        trees = [TreeStore(cache).place(Tree(name, ())) for name in ("run-a", "received", "runs")]
+        old = [cache / RUNS / "abcdefgh", cache / RECEIVED / "0123456789ab"]
+        for folder in (*old, *trees):
+            folder.mkdir(parents=True, exist_ok=True)
+            os.utime(folder, (0, time.time() - 8 * 24 * 3600))
+        remove_old_runs(cache)
+        assert [folder.exists() for folder in (*old, *trees)] == [False, False, True, True, True]
+
+
+class TestAgent:
+    """What an agent sends of its nodes; the launcher takes nothing."""
+
+    @pytest.fixture
+    def agent(self, tmp_path: Path) -> Agent:
+        agent = Agent.__new__(Agent)  # a new one takes standard input and output of this process
+        for node in ("eye", "brain"):
+            (tmp_path / node).mkdir()
+            (tmp_path / node / "node.log").write_bytes(bytes(3 << 20))
+        agent._follower = Follower(tmp_path, ["eye", "brain"], "robot", ())
+        agent._processes = {"eye": Ended(None), "brain": Ended(None)}  # type: ignore[dict-item]
+        agent._pump = Sent()  # type: ignore[assignment]
+        agent._in_flight_bytes, agent._is_lost, agent._is_over = 0, False, False
+        agent._monitor = None
+        return agent
+
+    def test_the_end_of_a_node_is_told_while_another_writes_more_than_is_taken(
+        self, agent: Agent
+    ) -> None:
+        agent._processes["brain"] = Ended("exit code 0")  # type: ignore[assignment]
+        assert agent._look()
+        assert NodeEnded("brain", "exit code 0") in agent._pump.messages  # type: ignore[attr-defined]
+
+    def test_nodes_take_turns(self, agent: Agent) -> None:
+        agent._look()
+        agent._in_flight_bytes = 0
+        agent._look()
+        chunks = [each for each in agent._pump.messages if each.data]  # type: ignore[attr-defined]
+        assert list(dict.fromkeys(each.path for each in chunks)) == [
+            "eye/node.log",
+            "brain/node.log",
+        ]
+
+    def test_nothing_more_is_sent_to_a_launcher_that_has_gone(self, agent: Agent) -> None:
+        agent._is_lost = True
+        agent._finish()
+        sent = agent._pump.messages  # type: ignore[attr-defined]
+        assert sum(len(each.data) for each in sent) < 2 << 20
+        assert not agent._is_over
+
+
+class Ended:
+    """A process that has ended so, or runs."""
+
+    def __init__(self, how: str | None) -> None:
+        self.how = how
+
+    def poll(self) -> str | None:
+        return self.how
+
+
+class Sent:
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+        self.send = self.send_last = self.messages.append
 
 
 class TestMirror:
@@ -182,20 +259,26 @@ class TestClock:
         assert clock.monotonic_s == pytest.approx(1000.0)
         assert clock.unix_s == pytest.approx(-3.0)
 
-    def test_a_clock_that_drifts_is_followed(self, tmp_path: Path) -> None:
-        """By 100 us per second; the very first answer is the fastest."""
-        clock, drift = ClockOffset(), 1e-4
-        for now_s in range(0, 601, 10):
-            late_s = 0.002 if now_s else 0.001
-            ahead_s = 1000.0 + drift * (now_s - late_s / 2)
-            clock.take(Pong(now_s - late_s, now_s - late_s / 2 + ahead_s, 0.0), now_s, 0.0)
-        assert clock.monotonic_s == pytest.approx(1000.06, abs=0.007)
-        here_s = [5.0, 300.0, 595.0]
-        there_ns = [round(1e9 * (t + 1000.0 + drift * t)) for t in here_s]
-        (tmp_path / "0.sent_ns").write_bytes(array("q", there_ns).tobytes())
+    def test_a_clock_that_drifts_is_followed_and_so_are_times_in_packet_logs(
+        self, tmp_path: Path
+    ) -> None:
+        """The clock there gains 50 us a second for an hour; the first answer is the fastest."""
+        clock, drift = ClockOffset(), 5e-5
+
+        def there_s(here_s: float) -> float:
+            return 1000.0 + here_s * (1 + drift)
+
+        for second in range(3600):
+            half_s = 0.0001 if second == 0 else 0.001
+            sent_s, now_s = second - half_s, second + half_s
+            clock.take(Pong(sent_s, there_s(second), 2e9), now_s, 2e9)
+        assert clock.monotonic_s == pytest.approx(1000.0 + 3600 * drift, abs=0.005)
+        here = [0, 1000, 2000, 3000, 3599]
+        log = array("q", [round(1e9 * there_s(each)) for each in here])
+        (tmp_path / "0.sent_ns").write_bytes(log.tobytes())
         clock.log_here(tmp_path)
         moved = array("q", (tmp_path / "0.sent_ns").read_bytes())
-        assert [1e-9 * t for t in moved] == pytest.approx(here_s, abs=0.003)
+        assert [1e-9 * each for each in moved] == pytest.approx(here, abs=0.005)
 
     def test_processes_of_one_machine_have_one_clock(self) -> None:
         clock = ClockOffset()

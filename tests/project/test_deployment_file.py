@@ -64,18 +64,6 @@ def test_all_problems_of_its_form_are_told_at_once(tmp_path: Path) -> None:
     ]
 
 
-def test_so_are_what_its_form_forbids_and_what_it_gets_wrong(tmp_path: Path) -> None:
-    hosts = {"robot": {"shs": "pi@robot"}, "neither": {}, "list": []}
-    nodes = {"eye": "robbot", "brain": 5}
-    assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes}) == [
-        "/hosts/list: must be an object, but is a list",
-        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how it is reached",
-        "/hosts/robot/shs: unknown key 'shs'",
-        "/nodes/brain: must be a text, but is a whole number",
-        "/nodes/eye: there is no host 'robbot'",
-    ]
-
-
 def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
     hosts = {
         "both": {"ssh": "a", "through": ["srun"]},
@@ -90,6 +78,20 @@ def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
         "/hosts/here/ssh: 'here' is the machine that launches, and is not reached by 'ssh'",
         f"/hosts/neither: {ways}",
         "/hosts/option/ssh: is an option, not a destination: user@host",
+        "/nodes/brian: the project has no node 'brian'",
+        "/nodes/eye: there is no host 'robbot'",
+    ]
+
+
+def test_mistakes_are_told_with_problems_of_form(tmp_path: Path) -> None:
+    hosts = {"neither": {}, "robot": {"ssh": 5}, "none": 3}
+    nodes = {"eye": "robbot", "brian": "robot", "brain": 7}
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes, "node": {}}) == [
+        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how it is reached",
+        "/hosts/none: must be an object, but is a whole number",
+        "/hosts/robot/ssh: must be a text, but is a whole number",
+        "/node: unknown key 'node'",
+        "/nodes/brain: must be a text, but is a whole number",
         "/nodes/brian: the project has no node 'brian'",
         "/nodes/eye: there is no host 'robbot'",
     ]

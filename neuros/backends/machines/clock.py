@@ -2,17 +2,15 @@
 
 Each machine counts its monotonic time from a moment of its own. So what nodes there report, and
 the times in their packet logs, are moved by the difference, which is known to half of the time that
-a message takes there and back. Quartz clocks drift apart, by some 10 us per second: what was known
-of the difference gets old.
+a message takes there and back.
 """
 
 from __future__ import annotations
 
-import bisect
-import math
 from array import array
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,9 @@ from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
 from neuros.control.machines import Pong
 from neuros.errors import ControlError
+
+_MOST_DRIFT = 1e-4
+"""Seconds per second by which clocks drift apart: crystals are within 1e-4 of what they show."""
 
 _ACCEPTED = {kind_of(each): each for each in FROM_NODES}
 _WITH_TIMES = tuple(f'{{"kind": "{kind_of(each)}"' for each in (Report, Probed, NodeStatus))
@@ -32,68 +33,51 @@ _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
 }
 
 
-_SPAN_S = 30.0
-
-
 @dataclass
-class _Answer:
-    """What the fastest answer within a span of time says; times in seconds, by both clocks."""
-
-    from_s: float
-    round_trip_s: float
-    there_s: float
-    monotonic_s: float
-    unix_s: float
-
-
 class ClockOffset:
     """How far the clocks of another machine are ahead of this one's, in seconds.
 
-    The fastest answer says most; of each half minute that one is kept. Now the last two half
-    minutes count, for the times in packet logs those around each time.
+    Clocks of two machines drift apart. So an answer counts for less the older it is, as in NTP
+    (RFC 5905, dispersion): its error is at most half of its round trip, and what the clocks may
+    have drifted since. The one of the smallest error counts.
+
+    Attributes:
+        round_trip_s: of the answer that it is known from.
+        monotonic_s, unix_s: the difference of the monotonic clocks, and of those that show the time
+            of day, at that answer.
     """
 
-    def __init__(self) -> None:
-        self._answers: list[_Answer] = []
+    round_trip_s: float = float("inf")
+    monotonic_s: float = 0.0
+    unix_s: float = 0.0
+    _known_at_s: float = 0.0
+    _course: list[tuple[float, float, float]] = field(default_factory=list)
 
     def take(self, pong: Pong, now_s: float, now_unix_s: float) -> None:
         """An answer that arrives now, by the clocks of this machine."""
         round_trip_s = now_s - pong.sent_s
-        ahead_s = pong.monotonic_s - (now_s - round_trip_s / 2)
-        # Containers of one machine have one clock.
-        ahead_s = ahead_s if abs(ahead_s) > round_trip_s else 0.0
-        unix_s = pong.unix_s - (now_unix_s - round_trip_s / 2)
-        is_new = not self._answers or now_s >= self._answers[-1].from_s + _SPAN_S
-        from_s = now_s if is_new else self._answers[-1].from_s
-        answer = _Answer(from_s, round_trip_s, pong.monotonic_s, ahead_s, unix_s)
-        if is_new:
-            self._answers.append(answer)
-        elif round_trip_s < self._answers[-1].round_trip_s:
-            self._answers[-1] = answer
+        drift_s = _MOST_DRIFT * (now_s - self._known_at_s)
+        if round_trip_s / 2 < self.round_trip_s / 2 + drift_s:
+            self.round_trip_s, self._known_at_s = round_trip_s, now_s
+            ahead_s = pong.monotonic_s - (now_s - round_trip_s / 2)
+            # Containers of one machine have one clock.
+            self.monotonic_s = ahead_s if abs(ahead_s) > round_trip_s else 0.0
+            self.unix_s = pong.unix_s - (now_unix_s - round_trip_s / 2)
+            self._note(pong.monotonic_s, round_trip_s / 2)
+
+    def _note(self, at_s: float, error_s: float) -> None:
+        """Keep what is known of this moment, on the clock there, for packet logs."""
+        while self._course:
+            earlier_s, _, earlier_error_s = self._course[-1]
+            if earlier_error_s <= error_s + _MOST_DRIFT * (at_s - earlier_s):
+                break
+            self._course.pop()  # now it is better known, for that moment too
+        self._course.append((at_s, self.monotonic_s, error_s))
 
     @property
     def is_known(self) -> bool:
         """Whether there was an answer."""
-        return bool(self._answers)
-
-    @property
-    def round_trip_s(self) -> float:
-        """Of the answer that the difference is known from."""
-        return self._now.round_trip_s if self._answers else math.inf
-
-    @property
-    def monotonic_s(self) -> float:
-        """The difference of the monotonic clocks, 0 before the first answer."""
-        return self._now.monotonic_s if self._answers else 0.0
-
-    @property
-    def unix_s(self) -> float:
-        """The difference of the clocks that show the time of day."""
-        return self._now.unix_s if self._answers else 0.0
-
-    @property
-    def _now(self) -> _Answer:
-        return min(self._answers[-2:], key=lambda answer: answer.round_trip_s)
+        return self.round_trip_s < float("inf")
 
     def text_here(self, text: str) -> str:
         """Lines of nodes there, with their times on the clock of this machine."""
@@ -138,6 +122,7 @@ class ClockOffset:
 
     def log_here(self, folder: Path) -> None:
         """Move the times in the packet log of a node there. Raises ``OSError``."""
+        course = [(round(1e9 * at_s), round(1e9 * ahead_s)) for at_s, ahead_s, _ in self._course]
         for file in sorted(folder.glob("*")):
             width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
             if columns:
@@ -145,24 +130,28 @@ class ClockOffset:
                 data = file.read_bytes()
                 entries.frombytes(data[: len(data) // 8 * 8])
                 for column in columns:
-                    moved = [at_ns - self._ahead_ns(at_ns) for at_ns in entries[column::width]]
-                    entries[column::width] = array("q", moved)
+                    _shift(entries, column, width, course)
                 file.write_bytes(entries.tobytes())
-
-    def _ahead_ns(self, there_ns: int) -> int:
-        """The difference of the monotonic clocks at a time there: between two answers, linear."""
-        answers, there_s = self._answers, there_ns / 1e9
-        place = bisect.bisect(answers, there_s, key=lambda answer: answer.there_s)
-        if 0 < place < len(answers):
-            before, after = answers[place - 1 : place + 1]
-            share = (there_s - before.there_s) / (after.there_s - before.there_s)
-            ahead_s = before.monotonic_s + share * (after.monotonic_s - before.monotonic_s)
-        else:
-            ahead_s = answers[max(0, place - 1)].monotonic_s if answers else 0.0
-        return round(1e9 * ahead_s)
 
 
 def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:
     """Sampled fields: each row begins with its time."""
     rows = [[row[0] - shift_s, *row[1:]] for row in sample.get("values", ())]
     return {**sample, "values": rows} if rows else dict(sample)
+
+
+def _shift(entries: array[int], column: int, width: int, course: Sequence[tuple[int, int]]) -> None:
+    times = [at_ns for at_ns, _ in course]
+    moved = [at_ns - _ahead_ns(at_ns, times, course) for at_ns in entries[column::width]]
+    entries[column::width] = array("q", moved)
+
+
+def _ahead_ns(at_ns: int, times: Sequence[int], course: Sequence[tuple[int, int]]) -> int:
+    """How far the clock there was ahead, on a straight line between two answers."""
+    after = bisect_right(times, at_ns)
+    if not course:
+        return 0
+    if after in (0, len(course)):
+        return course[max(0, after - 1)][1]
+    (from_ns, ahead_ns), (to_ns, then_ns) = course[after - 1], course[after]
+    return ahead_ns + (then_ns - ahead_ns) * (at_ns - from_ns) // (to_ns - from_ns)

@@ -6,8 +6,8 @@
         <name>-<key>/                 a tree, whole from its first moment; the key is its content's
         <name>-<key>.json             its files and their digests
         <name>-<key>.draft/           only while it is being made
-        received/                     by agent, content that has come for trees
-        runs/                         by agent, its run folder
+        received/                     what has come for trees; a folder for each agent
+        runs/                         run folders of agents
 
 Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
 has been changed in a tree there is put right before it is used, and what has come to it is removed.
@@ -21,7 +21,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,10 +29,12 @@ from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.control.machines import Tree, TreeFile
 from neuros.errors import EnvironmentFault
 
+RECEIVED, RUNS = "received", "runs"
+"""Folders of agents beside the trees, whose names end with a key."""
+
 _LEFT_OUT = frozenset({"__pycache__", "runs", "node_modules"})
 _RUN_FILE = "run.json"
 _READ_BYTES = 1 << 20
-RECEIVED = "received"
 
 
 def tree_cache(environ: Mapping[str, str]) -> Path:
@@ -92,13 +94,13 @@ class TreeStore:
         with kept.locked():
             target = kept.folder if kept.folder.is_dir() else kept.beside(".draft")
             target.mkdir(parents=True, exist_ok=True)
+            _remove_others(target, {file.path for file in tree.files})
             for file in tree.files:
                 path = target / file.path
                 if not _has(path, file.digest):
                     received = self._received / file.digest
                     source = received if _has(received, file.digest) else _find(known, file.digest)
                     _copy(source, path, file)
-            _remove_others(target, {file.path for file in tree.files})
             if target != kept.folder:
                 target.rename(kept.folder)
             kept.beside(".json").write_text(json.dumps([asdict(file) for file in tree.files]))
@@ -149,6 +151,17 @@ def _files(folder: Path) -> Iterator[Path]:
         yield from (here / name for name in names if (here / name).is_file())
 
 
+def _remove_others(folder: Path, wanted: Set[str]) -> None:
+    """Remove files that a tree does not have, and folders empty then. Raises ``OSError``."""
+    for path in [*_files(folder)]:
+        if path.relative_to(folder).as_posix() not in wanted:
+            path.unlink()
+            for parent in path.parents:
+                if parent == folder or any(parent.iterdir()):
+                    break
+                parent.rmdir()
+
+
 def _raise(error: OSError) -> None:
     raise error
 
@@ -167,16 +180,6 @@ def _has(path: Path, digest: str) -> bool:
 
 def _find(known: Mapping[str, Sequence[Path]], digest: str) -> Path | None:
     return next((path for path in known.get(digest, ()) if _has(path, digest)), None)
-
-
-def _remove_others(folder: Path, paths: Collection[str]) -> None:
-    """Remove what is not in a tree, but for what Python keeps beside its modules."""
-    for parent, folders, names in os.walk(folder):
-        folders[:] = [each for each in folders if each != "__pycache__"]
-        for name in names:
-            path = Path(parent, name)
-            if path.relative_to(folder).as_posix() not in paths:
-                path.unlink()
 
 
 def _copy(source: Path | None, path: Path, file: TreeFile) -> None:
