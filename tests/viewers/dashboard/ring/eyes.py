@@ -1,0 +1,13 @@
+"""Takes what the ring sends."""
+
+from neuros.hooks import neuros_function
+
+
+@neuros_function(inputs="spikes")
+def see(node, spikes):
+    pass
+
+
+@neuros_function(inputs="rates")
+def look(node, rates):
+    pass
