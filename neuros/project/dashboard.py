@@ -49,7 +49,7 @@ def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
     seen: set[str] = set()
     for panel in () if dashboard is None else dashboard.items("panels"):
         kind = panel.string("panel")
-        if kind not in _KEYS or not isinstance(panel.value, dict):
+        if kind is None or kind not in _KEYS:
             continue
         needed, allowed = _KEYS[kind]
         if not needed and kind in seen:
@@ -100,8 +100,6 @@ def _misfit(
         yield output.problem(f"a raster shows {SPIKES}, but '{name}' is {type_name}")
     elif kind == "images" and type_name not in IMAGES:
         yield output.problem(f"'{name}' is {type_name}, which is not an image")
-    elif kind == "activity" and type_name != SPIKES:
-        if type_name not in ARRAYS and panel.member("field") is None:
-            yield panel.problem(
-                f"which array of {type_name} is to be drawn?", "name it with 'field', as \"data\""
-            )
+    elif kind == "activity" and type_name not in (SPIKES, *ARRAYS) and "field" not in panel.value:
+        text = f"which array of {type_name} is to be drawn?"
+        yield panel.problem(text, "name it with 'field', as \"data\"")

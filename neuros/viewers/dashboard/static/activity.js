@@ -36,6 +36,11 @@ export class Activity {
     return `peak at ${this.peak} of ${this.size}, ${number(this.low)} to ${number(this.high)}${cut}`;
   }
 
+  forget() {
+    this.train.forget();
+    this.rows = [];
+  }
+
   take(rows) {
     for (const [timeS, values, length] of rows) {
       this.put(timeS, new Float32Array(buffer(values)));
@@ -60,9 +65,9 @@ export class Activity {
     if (train.endS === null) return {columns: [], endS: null, size: 0};
     const binS = seconds / COLUMNS;
     const rows = Math.min(MOST_ROWS, Math.max(1, train.size));
-    const first = Math.ceil((train.endS - seconds) / binS);
+    const first = Math.ceil(Math.max(train.endS - seconds, train.beginS) / binS);
     const last = Math.floor(train.endS / binS); // whole bins
-    const columns = Array.from({length: last - first},
+    const columns = Array.from({length: Math.max(0, last - first)},
       (_, place) => ({timeS: (first + place + 0.5) * binS, values: new Float32Array(rows)}));
     const each = rows / (Math.max(1, train.size) * binS);
     train.each(first * binS, last * binS, (sender, timeS) => {
@@ -114,7 +119,8 @@ export class Activity {
       this.peak = Math.floor((peak + 0.5) * size / length);
       this.canvas.dataset.peak = this.peak;
     }
-    plane.levels(0, plane.height, String(size - 1), "0", "element");
+    plane.levels(0, plane.height, String(size - 1), "0",
+      this.rows.length ? "element" : "neuron");
     plane.times(beginS, endS);
     this.canvas.dataset.columns = columns.length;
   }

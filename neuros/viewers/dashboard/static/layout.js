@@ -199,6 +199,11 @@ export class Layout {
     setTimeout(() => URL.revokeObjectURL(url));
   }
 
+  // The page was not seen for a while.
+  forget() {
+    for (const {content} of this.panels) content?.forget();
+  }
+
   show(name, sample) {
     for (const {content} of this.panels) content?.show(name, sample);
   }
@@ -229,6 +234,7 @@ class OutputPanel {
   }
 
   open() {
+    const isSeen = this.isSeen ?? false;
     this.look(false);
     this.drawn?.remove();
     this.box.replaceChildren();
@@ -242,10 +248,14 @@ class OutputPanel {
       return;
     }
     this.drawn = new this.kind(this.box, this.panel, this.source);
-    this.look(this.isSeen ?? false);
+    this.look(isSeen);
   }
 
+  forget() { this.drawn?.forget(); }
+
   look(isSeen) {
+    // What passed meanwhile is not known.
+    if (isSeen && !this.isSeen) this.drawn?.forget();
     this.isSeen = isSeen;
     if (!this.source) return;
     want(this.source.name, (entry) => {

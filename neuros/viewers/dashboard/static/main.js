@@ -22,7 +22,7 @@ const handlers = {
   begin(plan) {
     log.clear();
     wants.begin(plan.page, plan.sources, plan.nodes.filter((node) => node.is_here));
-    if (view) return; // the same run, seen again: charts and selection stay
+    if (view) return view.layout.forget(); // the same run, seen again: charts and selection stay
     document.title = `${plan.project} – NeuROS`;
     document.querySelector("#project").textContent = plan.project;
     const series = new Series();

@@ -29,7 +29,9 @@ export class Plane {
     this.context.textAlign = "center";
     for (let tick = Math.ceil(beginS / step) * step; tick <= endS; tick += step) {
       const x = LEFT + this.width * (tick - beginS) / (endS - beginS);
-      this.context.fillText(`${tick.toFixed(digits)} s`, x, this.canvas.height - 4);
+      const label = `${tick.toFixed(digits)} s`;
+      const half = this.context.measureText(label).width / 2;
+      this.context.fillText(label, Math.min(x, this.canvas.width - half), this.canvas.height - 4);
     }
   }
 

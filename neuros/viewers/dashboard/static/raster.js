@@ -26,9 +26,12 @@ export class Raster {
     if (!sample.spikes) return null;
     this.train.add(sample.spikes);
     this.draw();
-    const missing = this.train.missing > 0 ? `, ${this.train.missing} spikes not shown` : "";
-    return `${this.train.size} neurons, ${number(this.rate, 3)} spikes/s each${missing}`;
+    const {size, missing} = this.train;
+    if (missing > 0) return `${size} neurons; too many spikes: not all of them are shown`;
+    return `${size} neurons, ${number(this.rate, 3)} spikes/s each`;
   }
+
+  forget() { this.train.forget(); }
 
   draw() {
     const {plane, train, seconds} = this;
@@ -42,7 +45,7 @@ export class Raster {
     const ink = new Uint32Array(Uint8Array.of(...INK, 255).buffer)[0];
     const tall = Math.max(1, Math.min(4, Math.floor(high / size)));
     const binS = seconds / BINS;
-    const firstBin = Math.ceil(beginS / binS);
+    const firstBin = Math.ceil(Math.max(beginS, train.beginS) / binS);
     const counts = new Uint32Array(Math.max(1, Math.floor(endS / binS) - firstBin)); // whole bins
     let drawn = 0;
     train.each(beginS, endS, (sender, timeS) => {

@@ -9,7 +9,7 @@ export class SpikeTrain {
   forget() {
     this.batches = [];
     this.size = 0;
-    this.endS = null;
+    this.beginS = this.endS = null; // what is outside is not known
     this.missing = 0; // that passed, but were not sent here
   }
 
@@ -29,6 +29,7 @@ export class SpikeTrain {
     if (this.endS !== null && lastS < this.endS - this.keptS) this.forget();
     this.size = Math.max(this.size, size, senders.reduce((most, each) => Math.max(most, each + 1), 0));
     this.endS = Math.max(this.endS ?? lastS, lastS);
+    this.beginS ??= Math.min(firstS, lastS);
     this.batches.push({senders, times, lastS});
     this.batches = this.batches.filter((each) => each.lastS >= this.endS - this.keptS);
   }

@@ -1,11 +1,6 @@
-"""Takes what the ring sends."""
+"""Takes the rates of the ring."""
 
 from neuros.hooks import neuros_function
-
-
-@neuros_function(inputs="spikes")
-def see(node, spikes):
-    pass
 
 
 @neuros_function(inputs="rates")
