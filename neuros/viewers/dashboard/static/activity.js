@@ -2,7 +2,7 @@
 
 import {element, number} from "./format.js";
 import {Plane} from "./plane.js";
-import {buffer, SpikeTrain} from "./spikes.js";
+import {binOf, buffer, SpikeTrain} from "./spikes.js";
 
 const COLUMNS = 100;
 const MOST_ROWS = 256;
@@ -66,12 +66,12 @@ export class Activity {
     const binS = seconds / COLUMNS;
     const rows = Math.min(MOST_ROWS, Math.max(1, train.size));
     const first = Math.ceil(Math.max(train.endS - seconds, train.beginS) / binS);
-    const last = Math.floor(train.endS / binS); // whole bins
+    const last = binOf(train.endS, binS); // whole bins
     const columns = Array.from({length: Math.max(0, last - first)},
       (_, place) => ({timeS: (first + place + 0.5) * binS, values: new Float32Array(rows)}));
     const each = rows / (Math.max(1, train.size) * binS);
     train.each(first * binS, last * binS, (sender, timeS) => {
-      const column = columns[Math.floor(timeS / binS) - first];
+      const column = columns[binOf(timeS, binS) - first];
       if (column) column.values[Math.floor(sender * rows / train.size)] += each;
     });
     return {columns, endS: train.endS, size: train.size};
@@ -87,6 +87,7 @@ export class Activity {
     [this.low, this.high] = [Infinity, -Infinity];
     for (const {values} of columns) {
       for (const value of values) {
+        if (!Number.isFinite(value)) continue;
         if (value < this.low) this.low = value;
         if (value > this.high) this.high = value;
       }
@@ -104,7 +105,7 @@ export class Activity {
       for (let row = 0; row < plane.height; row++) {
         const cell = Math.floor(values.length * (1 - (row + 1) / plane.height));
         const value = values[Math.max(0, cell)];
-        if (!(value - value === 0)) continue; // not finite: stays white
+        if (!Number.isFinite(value)) continue; // stays white
         pixels.fill(colours[Math.round((value - this.low) * scale)],
           row * plane.width + from, row * plane.width + to);
       }
@@ -128,19 +129,25 @@ export class Activity {
   remove() { this.plane.remove(); }
 }
 
-// Where a ring of values is largest, smoothed over a sixteenth of it; null where all are equal.
+// Where a ring of values is largest, smoothed over a sixteenth of it: the middle of the places that
+// are; null where all are equal.
 export function peakOf(values) {
   const reach = Math.floor(values.length * SMOOTH_SHARE / 2);
-  const at = (place) => values[(place + values.length) % values.length];
+  const at = (place) => {
+    const value = values[(place + values.length) % values.length];
+    return Number.isFinite(value) ? value : 0;
+  };
   let sum = 0;
   for (let place = -reach; place <= reach; place++) sum += at(place);
-  let [best, place, least] = [-Infinity, null, Infinity];
+  let [best, first, count, least] = [-Infinity, 0, 0, Infinity];
   for (let next = 0; next < values.length; next++) {
-    if (sum > best) [best, place] = [sum, next];
+    const margin = 1e-6 * Math.abs(best);
+    if (!(sum <= best + margin)) [best, first, count] = [sum, next, 1];
+    else if (sum >= best - margin && next === first + count) count += 1;
     least = Math.min(least, sum);
     sum += at(next + reach + 1) - at(next - reach);
   }
-  return best > least ? place : null;
+  return best - least > 1e-6 * Math.abs(best) ? first + (count - 1) / 2 : null;
 }
 
 let made = null;

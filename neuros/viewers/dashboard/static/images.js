@@ -25,7 +25,7 @@ export class Images {
         element("h3", {}, element("label", {}, switched, ` ${source.title}`), size), image));
       this.pictures.set(source.name, {image, size, switched});
     });
-    this.atFirst = this.chosen().outputs;
+    this.atFirst = images.slice(0, SHOWN_AT_FIRST).map((source) => source.name);
   }
 
   switch(name) {
@@ -47,7 +47,8 @@ export class Images {
 
   chosen() {
     const outputs = [...this.pictures].filter(([, {switched}]) => switched.checked);
-    return {outputs: outputs.map(([name]) => name)};
+    const names = outputs.map(([name]) => name);
+    return String(names) === String(this.atFirst) ? {} : {outputs: names};
   }
 
   show(name, sample) {

@@ -62,10 +62,8 @@ export class Layout {
 
   // The layout, as the project file has it.
   get written() {
-    return this.panels.map(({section, content, ...keys}) => {
-      const of = this.contents[keys.panel]?.chosen?.();
-      return {...keys, ...of};
-    });
+    return this.panels.map(({section, content, fields, outputs, ...keys}) => (
+      {...keys, ...this.contents[keys.panel]?.chosen()}));
   }
 
   note() {
@@ -93,7 +91,7 @@ export class Layout {
   use(panels) {
     for (const panel of this.panels) panel.content?.remove();
     this.panels = panels.map((keys) => ({...keys}));
-    for (const panel of this.panels) this.contents[panel.panel]?.choose?.(panel);
+    for (const panel of this.panels) this.contents[panel.panel]?.choose(panel);
     this.arrange();
     this.note();
   }
@@ -102,7 +100,7 @@ export class Layout {
     const here = new Set(this.panels.map((each) => each.panel));
     for (const [name, section] of this.sections) {
       section.classList.toggle("off", !here.has(name));
-      this.contents[name]?.enable?.(here.has(name));
+      this.contents[name]?.enable(here.has(name));
     }
     for (const panel of this.panels) {
       panel.section = this.sections.get(panel.panel);

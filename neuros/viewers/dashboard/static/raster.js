@@ -2,7 +2,7 @@
 
 import {element, number} from "./format.js";
 import {Plane} from "./plane.js";
-import {SpikeTrain} from "./spikes.js";
+import {binOf, SpikeTrain} from "./spikes.js";
 
 const BINS = 100;
 const RASTER_SHARE = 0.7;
@@ -46,11 +46,11 @@ export class Raster {
     const tall = Math.max(1, Math.min(4, Math.floor(high / size)));
     const binS = seconds / BINS;
     const firstBin = Math.ceil(Math.max(beginS, train.beginS) / binS);
-    const counts = new Uint32Array(Math.max(1, Math.floor(endS / binS) - firstBin)); // whole bins
+    const counts = new Uint32Array(Math.max(1, binOf(endS, binS) - firstBin)); // whole bins
     let drawn = 0;
     train.each(beginS, endS, (sender, timeS) => {
       drawn += 1;
-      const bin = Math.floor(timeS / binS) - firstBin;
+      const bin = binOf(timeS, binS) - firstBin;
       if (bin >= 0 && bin < counts.length) counts[bin] += 1;
       const x = Math.min(plane.width - 1, Math.floor(plane.width * (timeS - beginS) / seconds));
       const y = Math.floor(high * (1 - (sender + 1) / size));

@@ -24,8 +24,9 @@ export class Series {
   }
 
   chosen() {
-    return {fields: [...this.charts.values()].map(
-      ({source, path}) => ({output: source, field: path}))};
+    const fields = [...this.charts.values()].map(
+      ({source, path}) => ({output: source, field: path}));
+    return fields.length ? {fields} : {};
   }
 
   // Whether the page shows this panel.

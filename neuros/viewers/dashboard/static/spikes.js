@@ -44,6 +44,10 @@ export class SpikeTrain {
   }
 }
 
+// The bin that a time is in. Simulators place spikes on a grid: one on the edge of a bin is in the
+// later one, also where the division is a little too small.
+export function binOf(timeS, binS) { return Math.floor(timeS / binS + 1e-6); }
+
 export function buffer(text) {
   return Uint8Array.from(atob(text), (character) => character.charCodeAt(0)).buffer;
 }
