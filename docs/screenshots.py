@@ -80,27 +80,14 @@ def shoot_panels(page: Any) -> None:
     """The spikes of a ring as a raster and as a heat map."""
     with page_of(RING, "dashboard", "--dashboard") as url:
         page.goto(url)
-        page.click("#layout")
-        page.select_option("#layout-panel", "activity ring.spikes")
-        page.click("#layout-add")
-        for panel in (
-            "world",
-            "details",
-            "connections",
-            "nodes",
-            "series",
-            "images",
-            "log",
-            "load",
-        ):
-            page.evaluate(
-                "(panel) => document.querySelector(`[data-panel=${panel}] .tools"
-                " button[title='hide this panel']`).click()",
-                panel,
-            )
-        page.click("#layout")
+        page.wait_for_function("() => window.neuros?.layout")
+        panels = [
+            {"panel": kind, "output": "ring.spikes", "width": "full"}
+            for kind in ("raster", "activity")
+        ]
+        page.evaluate("(panels) => window.neuros.layout.use(panels)", panels)
         page.wait_for_function(
-            "() => document.querySelector('[data-panel=activity] canvas').dataset.columns >= 99",
+            "() => document.querySelector('[data-panel=activity] canvas')?.dataset.columns >= 99",
             timeout=DEADLINE_MS,
         )
         page.locator("main").screenshot(path=FIGURES / "dashboard_panels.png")
