@@ -12,6 +12,7 @@ from launching import start
 from viewers.dashboard.browser import browser_page
 from viewers.dashboard.visitor import Visitor, address
 
+from neuros.cli.main import main
 from neuros.project.load import load_project
 
 RING = Path(__file__).parents[1] / "viewers" / "dashboard" / "ring"
@@ -19,6 +20,10 @@ NEURONS, IN_BUMP, STEP_S = 60, 11, 0.01  # of spiking_ring.py
 SHOWN = """() => [...document.querySelectorAll('main > section')]
     .filter((section) => section.checkVisibility()).map((section) => section.dataset.panel)"""
 PEAK = "() => document.querySelector('[data-panel=activity] canvas')?.dataset.peak"
+BACK = """(slider) => {
+    slider.value = Number(slider.value) - 1.0;
+    slider.dispatchEvent(new Event('input'));
+}"""
 COLOURS = """() => {
     const canvas = document.querySelector('[data-panel=activity] canvas');
     const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
@@ -39,7 +44,7 @@ def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes
     tmp_path: Path,
 ) -> None:
     with (
-        start(RING, "--dashboard", "--backend", "in-process", cwd=tmp_path) as running,
+        start(RING, "--dashboard", "--record", "--backend", "in-process", cwd=tmp_path) as running,
         browser_page() as page,
     ):
         url = address(running)
@@ -102,7 +107,18 @@ def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes
 
         assert Visitor(url).post("/do/stop") == 204
         page.wait_for_selector("#phase.ended")
-        assert running.finish().exit_code == 0
+        finished = running.finish()
+        assert finished.exit_code == 0
+
+        # The recorded run is one file with a slider, which needs no server.
+        assert main(["report", str(finished.run_folder)]) == 0
+        page.goto(f"file://{finished.run_folder}/report/panels.html")
+        page.wait_for_selector("canvas[data-peak]")
+        last = page.get_attribute("canvas", "data-peak")
+        page.locator("#time").evaluate(BACK)
+        page.wait_for_function(
+            "(last) => document.querySelector('canvas').dataset.peak !== last", arg=last
+        )
 
 
 def test_spikes_are_shown_as_a_raster_with_the_rate_of_the_population(tmp_path: Path) -> None:
