@@ -123,7 +123,7 @@ def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes
 
 def test_spikes_are_shown_as_a_raster_with_the_rate_of_the_population(tmp_path: Path) -> None:
     with (
-        start(RING / "spiking.json", "--dashboard", cwd=tmp_path) as running,
+        start(RING / "spiking.json", "--dashboard", "--record", cwd=tmp_path) as running,
         browser_page() as page,
     ):
         url = address(running)
@@ -145,4 +145,14 @@ def test_spikes_are_shown_as_a_raster_with_the_rate_of_the_population(tmp_path: 
         page.wait_for_function(f"() => ({PEAK})() !== undefined")
 
         assert Visitor(url).post("/do/stop") == 204
-        assert running.finish().exit_code == 0
+        page.wait_for_selector("#phase.ended")
+        finished = running.finish()
+        assert finished.exit_code == 0
+
+        # The page of the recorded run has the same rate.
+        assert main(["report", str(finished.run_folder)]) == 0
+        page.goto(f"file://{finished.run_folder}/report/panels.html")
+        page.wait_for_selector("canvas[data-peak]")
+        assert float(page.get_attribute("canvas[data-rate]", "data-rate")) == pytest.approx(
+            IN_BUMP / NEURONS / STEP_S, rel=0.05
+        )
