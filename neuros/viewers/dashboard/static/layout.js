@@ -6,7 +6,7 @@ import {Raster} from "./raster.js";
 import {want} from "./wants.js";
 
 const OUTPUT_PANELS = {raster: Raster, activity: Activity};
-const WIDTHS = {narrow: 1, wide: 2, full: 3};
+const WIDTHS = ["narrow", "wide", "full"]; // one, two and three thirds of the page
 const RASTERS_AT_FIRST = 2;
 const AT_FIRST = [
   ["world", "full"], ["graph", "wide"], ["details", "narrow"], ["connections", "wide"],
@@ -25,7 +25,6 @@ export class Layout {
       (section) => [section.dataset.panel, section]));
     this.key = `neuros layout ${plan.project}`;
     this.panels = [];
-    this.outputs = [];
     for (const [name, section] of this.sections) section.append(this.tools(() => this.panels
       .find((each) => each.panel === name)));
     const at = (id) => document.querySelector(`#layout-${id}`);
@@ -108,7 +107,7 @@ export class Layout {
         panel.content ??= new OutputPanel(panel, this);
         panel.section = panel.content.section;
       }
-      for (const width of Object.keys(WIDTHS)) {
+      for (const width of WIDTHS) {
         panel.section.classList.toggle(width, width === (panel.width ?? "narrow"));
       }
       const body = panel.section.querySelector(".body");
@@ -126,7 +125,7 @@ export class Layout {
     const width = element("select", {"aria-label": "width", onchange: () => {
       find().width = width.value;
       this.changed();
-    }}, ...Object.keys(WIDTHS).map((each) => new Option(each)));
+    }}, ...WIDTHS.map((each) => new Option(each)));
     const height = element("input", {type: "number", min: 80, max: 2000, step: 20,
       placeholder: "height", "aria-label": "height in pixels", onchange: () => {
         const asked = Math.round(Number(height.value));
