@@ -32,7 +32,7 @@ FIGURES = ROOT / "docs" / "figures"
 DEADLINE_MS = 120_000
 RERUN_DRAWS_MS = 40_000  # on a canvas that says nothing of what it shows, without a graphics card
 WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
-
+RING = ROOT / "tests" / "viewers" / "dashboard" / "ring" / "spiking.json"
 
 LONG = ("--set", "nodes.robot.environment.DURATION=1000")
 
@@ -76,6 +76,23 @@ def shoot_dashboard(page: Any) -> None:
         page.screenshot(path=FIGURES / "dashboard.png")
 
 
+def shoot_panels(page: Any) -> None:
+    """The spikes of a ring as a raster and as a heat map."""
+    with page_of(RING, "dashboard", "--dashboard") as url:
+        page.goto(url)
+        page.wait_for_function("() => window.neuros?.layout")
+        panels = [
+            {"panel": kind, "output": "ring.spikes", "width": "full"}
+            for kind in ("raster", "activity")
+        ]
+        page.evaluate("(panels) => window.neuros.layout.use(panels)", panels)
+        page.wait_for_function(
+            "() => document.querySelector('[data-panel=activity] canvas')?.dataset.columns >= 99",
+            timeout=DEADLINE_MS,
+        )
+        page.locator("main").screenshot(path=FIGURES / "dashboard_panels.png")
+
+
 def shoot_world(page: Any) -> None:
     """The vehicle of the tutorial, and WhiskEye, in 3-D."""
     with tempfile.TemporaryDirectory() as folder:
@@ -117,6 +134,7 @@ def main() -> None:
         )
         page = browser.new_page(viewport={"width": 1300, "height": 1000})
         shoot_dashboard(page)
+        shoot_panels(page)
         shoot_world(page)
         shoot_rerun(page)
         browser.close()

@@ -238,6 +238,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.findings import findings_of
     from neuros.analysis.page import report_page
+    from neuros.analysis.panels_page import panels_page
     from neuros.analysis.run_record import open_for_review
     from neuros.analysis.world_page import world_pages
 
@@ -255,10 +256,18 @@ def _report(options: argparse.Namespace) -> int:
     text = report_page(run, findings, {t: (text, data) for t, text, data in figures.values()})
     files = {f"{name}.png": data for name, (_, _, data) in figures.items()}
     worlds = {f"world_{node}.html": page.encode() for node, page in world_pages(run).items()}
-    _write(folder, {**files, _PAGE: text.encode(), **worlds})
+    try:
+        panels = panels_page(run)
+    except EnvironmentFault as fault:
+        panels = None
+        print(f"missing: panels: {fault}")
+    pages = {} if panels is None else {"panels.html": panels.encode()}
+    _write(folder, {**files, _PAGE: text.encode(), **worlds, **pages})
     print(f"{folder / _PAGE}: {len(figures)} figures")
     for name in worlds:
         print(f"{folder / name}: the world in 3-D")
+    for name in pages:
+        print(f"{folder / name}: spikes and activity")
     return 0
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from neuros.control import WORLD
+from neuros.node.batches import ArrayBatch, SpikeBatch
 from neuros.node.instruments import Observe, Tap
 from neuros.ports import Way, WorldLook
 
@@ -36,6 +37,9 @@ class _Request:
         self._wants_all = bool(wanted.get("all"))
         self._wants_image = bool(wanted.get("image"))
         self._most = int(wanted.get("most_elements", 0))
+        self._spikes = SpikeBatch() if wanted.get("spikes") else None
+        arrays: Sequence[str] = wanted.get("arrays", ())
+        self._arrays = {name: ArrayBatch(parse_path(name)) for name in arrays}
         self._values: list[list[float | None]] = []
         self._all: dict[str, Any] | None = None
         self._image: Preview | None = None
@@ -45,7 +49,9 @@ class _Request:
     def is_met(self) -> bool:
         """Whether no further packet is wanted."""
         has_values = not self._paths or len(self._values) >= MOST_VALUES
-        return has_values and not self._wants_all and not self._wants_image
+        batches = (*self._arrays.values(), *([self._spikes] if self._spikes else ()))
+        is_gathered = all(batch.is_full for batch in batches)
+        return has_values and is_gathered and not self._wants_all and not self._wants_image
 
     def look_at(self, packet: Any) -> None:
         """Take from a packet what is wanted; what cannot be taken is no fault of the node's."""
@@ -53,6 +59,11 @@ class _Request:
             if self._paths and len(self._values) < MOST_VALUES:
                 values = [number_at(packet, path) for path in self._paths]
                 self._values.append([time.monotonic(), *values])
+            if self._spikes is not None and not self._spikes.is_full:
+                self._spikes.add(packet)
+            for batch in self._arrays.values():
+                if not batch.is_full:
+                    batch.add(packet)
             if self._wants_all:
                 self._wants_all = False
                 self._all = all_fields(packet, self._most)
@@ -67,6 +78,10 @@ class _Request:
         found: dict[str, Any] = {}
         if self._values:
             found |= {"fields": self._names, "values": self._values}
+        if self._spikes is not None and (spikes := self._spikes.encode()):
+            found["spikes"] = spikes
+        if arrays := {name: rows for name, b in self._arrays.items() if (rows := b.encode())}:
+            found["arrays"] = arrays
         if self._all is not None:
             found["all"] = self._all
         if self._image is not None:
@@ -115,8 +130,10 @@ class Sampler:
 
         Of each port: ``fields``, paths like ``pose.position.x`` or ``data[3]``, read of up to
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
-        ``most_elements``); ``image``, a small picture of one packet. ``#world`` stands for the
-        simulated world of the node, which is shown at once.
+        ``most_elements``); ``image``, a small picture of one packet; ``spikes``, the spikes
+        of all packets; ``arrays``, paths of arrays, read of a few packets (see
+        :mod:`neuros.node.batches`). ``#world`` stands for the simulated world of the node, which
+        is shown at once.
         """
         asked = self._asked.get(asker, {})
         answers = {port: answer for port, request in asked.items() if (answer := request.answer())}

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
+from neuros.project.dashboard import dashboard_mistakes
 from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
@@ -61,6 +62,7 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
         _duplicate_connections,
         _connection_ends,
         _budget_mistakes,
+        dashboard_mistakes,
         _qos_of_connections,
         _rules_without_sense,
         _long_names,

@@ -16,6 +16,7 @@ from neuros.project.checks import (
     remarks,
     unread_variables,
 )
+from neuros.project.dashboard import dashboard_of
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
 from neuros.project.model import (
     NETWORK,
@@ -263,6 +264,7 @@ def load_project(
         description=parsed.root.string("description") or "",
         budgets=_budgets_of(parsed),
         names=names,
+        dashboard=dashboard_of(parsed),
     )
     return Loaded(project, (*remarks(parsed), *doubts))
 

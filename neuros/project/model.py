@@ -235,7 +235,11 @@ class Budgets:
 
 @dataclass(frozen=True)
 class Project:
-    """A whole project, valid in itself."""
+    """A whole project, valid in itself.
+
+    Attributes:
+        dashboard: the layout of the dashboard as the file has it, ``None`` if it has none.
+    """
 
     name: str
     nodes: tuple[Node, ...]
@@ -244,6 +248,7 @@ class Project:
     description: str = ""
     budgets: Budgets = Budgets()
     names: Names = _NO_NAMES
+    dashboard: Mapping[str, Any] | None = field(default=None, hash=False)
 
     @property
     def folder(self) -> Path:

@@ -130,6 +130,8 @@ def project_to_json(project: Project) -> dict[str, Any]:
     content |= names_to_json(project.names)
     if budgets := budgets_to_json(project.budgets):
         content["budgets"] = budgets
+    if project.dashboard is not None:
+        content["dashboard"] = project.dashboard
     return content
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from neuros.control import LookAll, NodeStatus, Watch
 from neuros.control.link import ControlLink
+from neuros.project.dashboard import IMAGES
 
 MOST_NUMBERS = 16
 _MOST_BEAMS = 1500
@@ -46,7 +47,6 @@ _NUMBERS: dict[str, list[str]] = {
         f"{part}.{axis}" for part in ("angular_velocity", "linear_acceleration") for axis in _XYZ
     ],
 }
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _NOT_FINITE = ("nan", "inf", "-inf")  # as a sample tells them; the next may be a number
 _SCAN = "sensor_msgs/msg/LaserScan"
 

@@ -18,11 +18,11 @@ from neuros.backends.sidecars import start_sidecar
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd, Reaper
+from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
 from neuros.project.graph import guarantee
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
 from neuros.viewers.registered import Shown, Viewer
-from neuros.viewers.visual_types import IMAGES
 from neuros.viewers.windows import open_page
 
 HOST = "127.0.0.1"
@@ -215,6 +215,7 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
     """
     return {
         "project": project.name,
+        "dashboard": project.dashboard,
         "nodes": [
             {
                 "name": node.name,
@@ -289,4 +290,6 @@ def _source(node: Node, port: Port, key: str, title: str) -> dict[str, Any]:
         "title": f"{node.name}.{title}",
         "type": port.type,
         "is_image": port.type in IMAGES,
+        "is_spikes": port.type == SPIKES,
+        "array": ARRAYS.get(port.type, ""),
     }

@@ -418,7 +418,8 @@ class LiveRun:
             geometry = sample.pop("geometry", None)
             if geometry is not None and (asked := self._geometries.pop(node, None)):
                 asked.set_result(geometry)
-            for row in sample.get("values", ()):
+            rows = [sample.get("values", ()), *sample.get("arrays", {}).values()]
+            for row in itertools.chain(*rows):
                 row[0] -= self._start_s
             if "image" in sample:
                 sample["image"] = {

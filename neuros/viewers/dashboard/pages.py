@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 _MOST_WAITING = 100
-_FLAGS = ("all", "image", "frames", "contacts")
+_FLAGS = ("all", "image", "spikes", "frames", "contacts")
+_LISTS = ("fields", "arrays")
 
 Wanted = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By node and port, what is to be sampled (see :class:`neuros.node.sampling.Sampler`)."""
@@ -23,7 +24,7 @@ def wanted_of(asked: Any) -> Wanted:
     return {
         str(node): {
             str(port): {
-                "fields": [str(field) for field in each.get("fields", ())],
+                **{key: [str(path) for path in each.get(key, ())] for key in _LISTS},
                 **{flag: bool(each.get(flag)) for flag in _FLAGS},
             }
             for port, each in ports.items()
@@ -115,8 +116,10 @@ class Pages:
         for page in self._pages.values():
             for node, ports in page.wanted.items():
                 for port, each in ports.items():
-                    into = merged.setdefault(node, {}).setdefault(port, {"fields": []})
-                    into["fields"] = list(dict.fromkeys([*into["fields"], *each.get("fields", ())]))
+                    into = merged.setdefault(node, {}).setdefault(port, {})
+                    for key in _LISTS:
+                        both = [*into.get(key, ()), *each.get(key, ())]
+                        into[key] = list(dict.fromkeys(both))
                     for flag in _FLAGS:
                         into[flag] = bool(into.get(flag) or each.get(flag))
         return merged

@@ -4,8 +4,9 @@ import {element, milliseconds, number, percent, rate, Row} from "./format.js";
 import {wantAllOf} from "./wants.js";
 
 export class Details {
-  constructor(plan, series) {
+  constructor(plan, series, onArray) {
     this.plan = plan;
+    this.onArray = onArray;
     this.series = series;
     this.title = document.querySelector("#details-title");
     this.box = document.querySelector("#details");
@@ -58,7 +59,14 @@ export class Details {
     for (const [path, value] of Object.entries(sample.all ?? {})) {
       const isNumber = typeof value !== "string";
       if (!this.rows.has(path)) {
-        this.row(path).cells[0].append(isNumber ? this.button(name, path) : path);
+        const {cells: [cell]} = this.row(path);
+        cell.append(isNumber ? this.button(name, path) : path);
+        // What has an element 0 that is a number is an array of numbers.
+        const array = path.endsWith(".length") ? path.slice(0, -".length".length) : null;
+        if (array && `${array}[0]` in sample.all) {
+          cell.append(" ", element("button", {class: "field", title: `draw ${array} as a heat map`,
+            onclick: () => this.onArray(name, array)}, "heat map"));
+        }
       }
       this.rows.get(path).cells[1].textContent = isNumber ? number(Number(value), 6) : value;
     }

@@ -9,24 +9,46 @@ export class Images {
   constructor(sources) {
     const box = document.querySelector("#images");
     this.pictures = new Map();
+    this.isOn = true;
     const images = sources.filter((source) => source.is_image);
     if (images.length) box.replaceChildren();
     images.forEach((source, place) => {
       const switched = element("input", {type: "checkbox"});
       switched.checked = place < SHOWN_AT_FIRST;
-      switched.addEventListener("change", () => this.switch(source.name, switched.checked));
+      switched.addEventListener("change", () => {
+        this.switch(source.name);
+        this.onChange?.();
+      });
       const size = element("span");
       const image = element("img", {alt: source.title});
       box.append(element("div", {class: "picture", "data-source": source.name},
         element("h3", {}, element("label", {}, switched, ` ${source.title}`), size), image));
-      this.pictures.set(source.name, {image, size});
-      this.switch(source.name, switched.checked);
+      this.pictures.set(source.name, {image, size, switched});
     });
+    this.atFirst = images.slice(0, SHOWN_AT_FIRST).map((source) => source.name);
   }
 
-  switch(name, isOn) {
-    want(name, (entry) => { entry.image = isOn; });
-    this.pictures.get(name).image.hidden = !isOn;
+  switch(name) {
+    const {image, switched} = this.pictures.get(name);
+    want(name, (entry) => { entry.image = this.isOn && switched.checked; });
+    image.hidden = !switched.checked;
+  }
+
+  // Whether the page shows this panel.
+  enable(isOn) {
+    this.isOn = isOn;
+    for (const name of this.pictures.keys()) this.switch(name);
+  }
+
+  // Of a layout: the outputs to show.
+  choose({outputs = this.atFirst}) {
+    for (const [name, {switched}] of this.pictures) switched.checked = outputs.includes(name);
+  }
+
+  chosen() {
+    const outputs = [...this.pictures].filter(([, {switched}]) => switched.checked);
+    const names = outputs.map(([name]) => name);
+    return String(names) === String(this.atFirst) ? {} : {outputs: names};
   }
 
   show(name, sample) {

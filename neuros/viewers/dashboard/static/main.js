@@ -4,6 +4,7 @@ import {Details} from "./details.js";
 import {number} from "./format.js";
 import {Graph} from "./graph.js";
 import {Images} from "./images.js";
+import {Layout} from "./layout.js";
 import {showLoad} from "./load.js";
 import {Log} from "./log.js";
 import {Series} from "./series.js";
@@ -21,20 +22,22 @@ const handlers = {
   begin(plan) {
     log.clear();
     wants.begin(plan.page, plan.sources, plan.nodes.filter((node) => node.is_here));
-    if (view) return; // the same run, seen again: charts and selection stay
+    if (view) return view.layout.forget(); // the same run, seen again: charts and selection stay
     document.title = `${plan.project} – NeuROS`;
     document.querySelector("#project").textContent = plan.project;
-    const series = new Series(plan.project);
-    const details = new Details(plan, series);
+    const series = new Series();
+    const images = new Images(plan.sources);
+    const details = new Details(plan, series, (...array) => layout.draw(...array));
     const select = (kind, name) => { details.select(kind, name); view.tables.select(name); };
     view = {
       series, details,
       graph: new Graph(document.querySelector("#graph"), plan, select),
       tables: new Tables(plan, select),
-      images: new Images(plan.sources),
+      images,
       worlds: new Worlds(),
     };
-    series.restore();
+    const layout = view.layout = new Layout(plan, {series, images});
+    series.onChange = images.onChange = () => layout.remember();
     window.neuros = view; // for the console of the browser
   },
   figures(figures) {
@@ -52,6 +55,7 @@ const handlers = {
       view.series.show(name, sample);
       view.images.show(name, sample);
       view.worlds.show(name, sample);
+      view.layout.show(name, sample);
     }
   },
   phase(phase) {

@@ -7,36 +7,60 @@ const KEPT_S = 60;
 const HEIGHT = 150;
 
 export class Series {
-  constructor(project) {
+  constructor() {
     this.box = document.querySelector("#series");
     this.hint = document.querySelector("#series-hint");
     this.charts = new Map();
-    this.key = `neuros series ${project}`;
+    this.isOn = true;
   }
 
-  // What was plotted when this project was last looked at in this browser.
-  restore() {
-    for (const [source, path] of JSON.parse(localStorage.getItem(this.key) ?? "[]")) {
-      if (!this.has(source, path)) this.toggle(source, path);
+  // Of a layout: the fields to plot.
+  choose({fields = []}) {
+    const asked = new Set(fields.map(({output, field}) => `${output} ${field}`));
+    for (const {source, path} of [...this.charts.values()]) {
+      if (!asked.has(`${source} ${path}`)) this.remove(source, path);
     }
+    for (const {output, field} of fields) if (!this.has(output, field)) this.add(output, field);
+  }
+
+  chosen() {
+    const fields = [...this.charts.values()].map(
+      ({source, path}) => ({output: source, field: path}));
+    return fields.length ? {fields} : {};
+  }
+
+  // Whether the page shows this panel.
+  enable(isOn) {
+    this.isOn = isOn;
+    for (const {source, path} of this.charts.values()) this.ask(source, path, isOn);
+  }
+
+  ask(source, path, isOn) {
+    want(source, (entry) => isOn ? entry.fields.add(path) : entry.fields.delete(path));
   }
 
   has(source, path) { return this.charts.has(`${source} ${path}`); }
 
   toggle(source, path) {
-    const key = `${source} ${path}`;
-    const chart = this.charts.get(key);
-    if (chart) {
-      chart.remove();
-      this.charts.delete(key);
-    } else {
-      this.charts.set(key, new Chart(this.box, source, path, () => this.toggle(source, path)));
-    }
-    want(source, (entry) => chart ? entry.fields.delete(path) : entry.fields.add(path));
+    const isNew = !this.has(source, path);
+    if (isNew) this.add(source, path);
+    else this.remove(source, path);
+    this.onChange?.();
+    return isNew;
+  }
+
+  add(source, path) {
+    this.charts.set(`${source} ${path}`,
+      new Chart(this.box, source, path, () => this.toggle(source, path)));
+    this.ask(source, path, this.isOn);
+    this.hint.hidden = true;
+  }
+
+  remove(source, path) {
+    this.charts.get(`${source} ${path}`).remove();
+    this.charts.delete(`${source} ${path}`);
+    this.ask(source, path, false);
     this.hint.hidden = this.charts.size > 0;
-    localStorage.setItem(this.key,
-      JSON.stringify([...this.charts.values()].map((each) => [each.source, each.path])));
-    return !chart;
   }
 
   show(source, sample) {

@@ -1,0 +1,105 @@
+"""The key ``"dashboard"`` of a project: which panels the page of a run has, and its checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from neuros.errors import Problem
+from neuros.project.message_types import normalised
+from neuros.project.parsed import ParsedProject
+from neuros.project.scanner import Element
+from neuros.project.suggest import did_you_mean, listed
+
+SPIKES = "neuros_msgs/msg/Spikes"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+ARRAYS: Mapping[str, str] = {
+    **{
+        f"std_msgs/msg/{kind}MultiArray": "data"
+        for kind in ("Byte", *(f"{sign}Int{n}" for sign in ("", "U") for n in (8, 16, 32, 64)))
+    },
+    "std_msgs/msg/Float32MultiArray": "data",
+    "std_msgs/msg/Float64MultiArray": "data",
+    "sensor_msgs/msg/JointState": "position",
+    "sensor_msgs/msg/LaserScan": "ranges",
+}
+"""By message type, the array that is drawn unless ``field`` names another one."""
+
+# What a panel must say, and what it may say, besides its size.
+_KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    **dict.fromkeys(("world", "graph", "details", "connections", "nodes", "log", "load"), ((), ())),
+    "series": ((), ("fields",)),
+    "images": ((), ("outputs",)),
+    "raster": (("output",), ("seconds",)),
+    "activity": (("output",), ("field", "seconds")),
+}
+_SIZE = ("panel", "width", "height")
+
+
+def dashboard_of(parsed: ParsedProject) -> Mapping[str, Any] | None:
+    """The layout of a valid project, as it is written; ``None`` if it has none."""
+    element = parsed.root.member("dashboard")
+    return None if element is None else element.plain
+
+
+def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
+    """Panels that occur twice, keys without meaning, and outputs that do not fit."""
+    dashboard = parsed.root.member("dashboard")
+    types = _types(parsed) if dashboard is not None else {}
+    seen: set[str] = set()
+    for panel in () if dashboard is None else dashboard.items("panels"):
+        kind = panel.string("panel")
+        if kind is None or kind not in _KEYS:
+            continue
+        needed, allowed = _KEYS[kind]
+        if not needed and kind in seen:
+            yield panel.value["panel"].problem(f"the panel '{kind}' occurs twice")
+        seen.add(kind)
+        for key in needed:
+            if key not in panel.value:
+                yield panel.problem(f"the panel '{kind}' needs the key '{key}'")
+        for key, member in panel.value.items():
+            if key not in (*needed, *allowed, *_SIZE) and key in _ALL_KEYS:
+                has = listed([*needed, *allowed, *_SIZE[1:]])
+                yield member.key_problem(
+                    f"'{key}' has no meaning for the panel '{kind}'", f"it may have {has}"
+                )
+        named = [panel.member("output"), *(each.member("output") for each in panel.items("fields"))]
+        for output in (*named, *panel.items("outputs")):
+            if output is not None and isinstance(output.value, str):
+                yield from _misfit(kind, panel, output, types, is_complete=parsed.is_complete)
+
+
+_ALL_KEYS = {key for needed, allowed in _KEYS.values() for key in (*needed, *allowed)}
+
+
+def _types(parsed: ParsedProject) -> dict[str, str]:
+    """The type of every output, and of every input with an external topic, by NODE.NAME."""
+    found: dict[str, str] = {}
+    for node in parsed.nodes:
+        for side in ("outputs", "inputs"):
+            for port in node.items(side):
+                name = port.string("name") if side == "outputs" else port.string("external_topic")
+                if name is not None:
+                    written = port.string("type") or ""
+                    found[f"{node.string('name')}.{name}"] = normalised(written) or written
+    return found
+
+
+def _misfit(
+    kind: str, panel: Element, output: Element, types: Mapping[str, str], *, is_complete: bool
+) -> Iterator[Problem]:
+    name = output.value
+    if name not in types:
+        if is_complete:
+            hint = did_you_mean(name, types) or "write NODE.OUTPUT"
+            yield output.problem(f"there is no output '{name}'", hint)
+        return
+    type_name = types[name]
+    if kind == "raster" and type_name != SPIKES:
+        yield output.problem(f"a raster shows {SPIKES}, but '{name}' is {type_name}")
+    elif kind == "images" and type_name not in IMAGES:
+        yield output.problem(f"'{name}' is {type_name}, which is not an image")
+    elif kind == "activity" and type_name not in (SPIKES, *ARRAYS) and "field" not in panel.value:
+        text = f"which array of {type_name} is to be drawn?"
+        yield panel.problem(text, "name it with 'field', as \"data\"")
