@@ -11,6 +11,8 @@ from array import array
 from collections.abc import Sequence
 from typing import Any
 
+from neuros.time import to_seconds
+
 MOST_SPIKES = 20_000
 """Spikes per question; further ones are counted only."""
 MOST_PACKETS = 4000
@@ -45,8 +47,7 @@ class SpikeBatch:
             raise ValueError(f"{len(senders)} senders do not fit {len(times)} times")
         self._count += len(senders)
         self._size = max(self._size, packet.size)
-        stamp = packet.header.stamp
-        self._stamp_s = stamp.sec + stamp.nanosec / 1e9
+        self._stamp_s = to_seconds(packet)
         room = max(0, MOST_SPIKES - len(self._times))
         self._times.extend(array("d", times[:room]))
         self._senders.extend(array("I", senders[:room]))
