@@ -50,6 +50,7 @@ BY_NAME = {
         "upgrades/test_upgrades.py",
     ),
     "process": (
+        "messages/test_stubs.py",
         "recording/test_provenance.py",
         "backends/environments/test_container_pythons.py",
         "backends/test_charliecloud_back_end.py",
@@ -64,6 +65,7 @@ BY_NAME = {
         "faults/",
         "fuzz/",
         "simulators/test_mujoco_opengl.py::TestDoctor",
+        "snn/test_documented_node.py::test_its_spikes",
         "test_installation.py",
         "test_packages_installed.py",
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",

@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from neuros.errors import UsageError
+from neuros.project.dashboard import SPIKES
 from neuros.recording.labelled import Topic, library
-
-SPIKES = "neuros_msgs/msg/Spikes"
 
 Floats = npt.NDArray[np.float64]
 

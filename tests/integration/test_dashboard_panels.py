@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from launching import start
+from needs import COMPILER
 from viewers.dashboard.browser import browser_page
 from viewers.dashboard.visitor import Visitor, address
 
@@ -121,6 +122,7 @@ def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes
         )
 
 
+@pytest.mark.needs(*COMPILER)
 def test_spikes_are_shown_as_a_raster_with_the_rate_of_the_population(tmp_path: Path) -> None:
     with (
         start(RING / "spiking.json", "--dashboard", "--record", cwd=tmp_path) as running,

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from message_values import message_classes
 from mypy import api as mypy
+from needs import COMPILER, require
 
 from neuros.cli.main import main
 from neuros.messages.stubs import write_stubs
@@ -57,6 +58,7 @@ def checked(*paths: Path, monkeypatch: pytest.MonkeyPatch, stubs: Path) -> list[
 
 @pytest.fixture(scope="module")
 def typings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    require(*COMPILER)
     folder = tmp_path_factory.mktemp("stubs") / "typings"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.path", [*sys.path])  # the command adds built messages

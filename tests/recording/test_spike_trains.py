@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import COMPILER, require
 
 import neuros
 import neuros.bag
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.spike_trains import SPIKES, trains_of
+from neuros.project.dashboard import SPIKES
+from neuros.recording.spike_trains import trains_of
 from neuros.snn import Spikes
 
 PLUGIN = """
@@ -49,6 +51,7 @@ def hear(node, spikes):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> neuros.Run:
+    require(*COMPILER)
     folder = tmp_path_factory.mktemp("spikes")
     ports = [{"name": "spikes", "type": SPIKES}]
     nodes: list[dict[str, Any]] = [{"name": "population", "outputs": ports}]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import COMPILER
 from std_msgs.msg import Float64, Float64MultiArray
 
 from neuros.snn import Spikes
@@ -48,6 +49,7 @@ def test_it_decodes_the_direction_that_its_spikes_stand_for_and_repeats_it(tmp_p
     assert np.sqrt(np.mean(error[1:] ** 2)) < math.radians(10)
 
 
+@pytest.mark.needs(*COMPILER)
 def test_its_spikes_are_messages(tmp_path):
     (tmp_path / "snn.py").write_text("\n".join(["from neuros.time import to_stamp", *blocks()]))
     with PluginHarness(
