@@ -43,7 +43,7 @@ class Robot:
         self._eye = mujoco.Renderer(self._model, *EYE)
         self._outside = mujoco.Renderer(self._model, *OUTSIDE)
         self._camera = mujoco.MjvCamera()
-        self._camera.azimuth, self._camera.elevation, self._camera.distance = 115, -28, 2.6
+        self._camera.azimuth, self._camera.elevation, self._camera.distance = 115, -50, 1.9
 
     @property
     def heading_rad(self) -> float:
