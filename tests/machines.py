@@ -76,9 +76,11 @@ def run(*command: str) -> None:
     assert done.returncode == 0, f"{' '.join(command)}: {done.stderr}"
 
 
-def require_machines(*tools: str) -> None:
-    """End the test where it cannot have machines, or one of these tools."""
+def require_machines(*tools: str, has_own_clock: bool = False) -> None:
+    """End the test where it cannot have machines, one of these tools, or a clock of its own."""
     require("root")
     require(*tools)
-    if subprocess.call(["unshare", "--mount", "--uts", "--net", "true"], stderr=subprocess.DEVNULL):
+    clock = ["--time", "--monotonic=1"] if has_own_clock else []
+    command = ["unshare", "--mount", "--uts", "--net", *clock, "true"]
+    if subprocess.call(command, stderr=subprocess.DEVNULL):
         cannot_run("namespaces", "the kernel lets root have none here, as in a container")

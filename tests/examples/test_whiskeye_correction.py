@@ -97,6 +97,23 @@ class TestRings:
             told.append((alone.heading_rad, beside.heading_rad))
         assert told == [(each, each) for each in expected]
 
+    def test_the_activity_of_each_ring_is_a_bump_at_its_heading(self, head_direction):
+        alone, beside = self.pair(head_direction)
+        at_zero = np.zeros(head_direction.NEURONS_PER_RING, int)
+        for _ in range(25):
+            alone.step(0.0, 0.02)
+            at_zero += alone.activity
+        assert alone.activity.shape == at_zero.shape
+        beside.correct(math.radians(90), 300.0, math.radians(30))
+        for _ in range(100):
+            alone.step(0.0, 0.02)
+        turned = np.zeros_like(at_zero)
+        for _ in range(25):
+            alone.step(0.0, 0.02)
+            turned += beside.activity
+        moved = math.remainder(direction_rad(turned) - direction_rad(at_zero), math.tau)
+        assert math.degrees(moved) == pytest.approx(90, abs=8)
+
     def test_a_correction_pulls_the_bump_of_that_ring_alone(self, head_direction):
         alone, beside = self.pair(head_direction)
         beside.correct(math.radians(30), 120.0, math.radians(30))
@@ -108,6 +125,12 @@ class TestRings:
         for _ in range(25):
             alone.step(0.0, 0.02)
         assert math.degrees(beside.heading_rad) == pytest.approx(30, abs=8)
+
+
+def direction_rad(activity):
+    """Of the population vector."""
+    phases = np.linspace(0.0, math.tau, activity.size, endpoint=False)
+    return float(np.angle(np.sum(activity * np.exp(1j * phases))))
 
 
 def test_a_biased_gyroscope_is_corrected_and_the_ring_alone_drifts(load):

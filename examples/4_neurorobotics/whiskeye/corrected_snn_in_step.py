@@ -10,6 +10,6 @@ def start(node):
     start_integrator(node)
 
 
-@neuros_function(inputs=["imu", "odom_correction"], outputs=["estimate", "uncorrected"])
+@neuros_function(inputs=["imu", "odom_correction"], outputs=["estimate", "uncorrected", "activity"])
 def integrate(node, imu, odom_correction):
     return estimates(node, imu, odom_correction)

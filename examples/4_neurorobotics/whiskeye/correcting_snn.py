@@ -23,8 +23,10 @@ def start_integrator(node: Any) -> None:
     )
 
 
-def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any]:
-    """The packets ``estimate`` and ``uncorrected``, with the stamp of the IMU's packet."""
+def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any, Any]:
+    """The packets ``estimate`` and ``uncorrected``, with the stamp of the IMU's packet, and
+    ``activity``: the bump of the ring that is corrected.
+    """
     integrator = node.get_user_data()
     if odom_correction is not None:
         seen = odom_correction.vector
@@ -34,4 +36,6 @@ def estimates(node: Any, imu: Any, odom_correction: Any) -> tuple[Any, Any]:
     for packet, heading_rad in zip(packets, headings_rad, strict=True):
         packet.header.stamp, packet.header.frame_id = imu.header.stamp, "world"
         packet.vector.z = heading_rad
-    return packets
+    activity = node.make_packet("activity")
+    activity.data = integrator.corrected.activity.astype(float)
+    return *packets, activity

@@ -13,11 +13,12 @@ from heading_error import compare, heading_error, yaw_of
 
 from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
 from neuros.time import to_nanoseconds, to_seconds
-from neuros.visualise import VisualiseImages, VisualiseLines, VisualiseRotations
+from neuros.visualise import VisualiseImages, VisualiseLines, VisualiseRing, VisualiseRotations
 
 COLOURS = {"uncorrected": "C0", "vision": "C2", "corrected": "C3"}
 NAMES = {"uncorrected": "ring alone", "vision": "vision alone", "corrected": "corrected ring"}
 TRUTH, SURPRISE = "true heading", "prediction error of the view"
+RING = "bump of the corrected ring"
 PREDICTED = "what the network predicts for the left and the right eye"
 
 
@@ -26,11 +27,14 @@ class Headings:
 
     def __init__(self):
         self.truths = {}
+        self.newest_s = 0.0
         self.told = {name: {} for name in NAMES}
         self.angles = VisualiseRotations("WhiskEye: corrected by its eyes", duration=None)
         self.angles.add_quaternion(TRUTH, "0.6")
         for name, colour in COLOURS.items():
             self.angles.add_radians(NAMES[name], colour)
+        self.ring = VisualiseRing("bump", duration=None, below=self.angles)
+        self.ring.add_ring(RING, COLOURS["corrected"])
         self.surprise = VisualiseLines(SURPRISE, None, y_label="mean square", below=self.angles)
         self.surprise.add_line(SURPRISE)
         self.views = VisualiseImages("predicted view", below=self.angles)
@@ -41,6 +45,7 @@ class Headings:
         if not math.isnan(heading_rad):  # of vision, where there was no picture
             self.told[name][stamp] = heading_rad
             self.angles.plot(NAMES[name], heading_rad, stamp * 1e-9)
+            self.newest_s = stamp * 1e-9
 
 
 @neuros_initialise()
@@ -69,6 +74,12 @@ def show_vision(node, estimate):
 @neuros_function(inputs="corrected")
 def show_corrected(node, estimate):
     node.get_user_data().keep("corrected", estimate)
+
+
+@neuros_function(inputs="activity")
+def show_activity(node, activity):
+    headings = node.get_user_data()
+    headings.ring.plot(RING, activity.data, headings.newest_s)  # this message has no stamp
 
 
 @neuros_function(inputs="prediction_error")

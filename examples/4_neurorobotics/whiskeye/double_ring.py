@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neuros.snn import PopulationVector, Spikes
-from neuros.snn.spikes import Floats
+from neuros.snn.spikes import Floats, Indices
 
 NEURONS_PER_RING = 120
 CAPACITANCE_PF = 250.0
@@ -68,11 +68,18 @@ class DoubleRing(ABC):
     def __init__(self) -> None:
         self._population = PopulationVector(np.tile(PREFERRED_RAD, 2))
         self._raw_rad = self._zero_rad = self._heading_rad = 0.0
+        self._spikes = Spikes(np.empty(0, np.int64), np.empty(0))
 
     @property
     def heading_rad(self) -> float:
         """The last heading, in (-pi, pi], counter-clockwise positive."""
         return self._heading_rad
+
+    @property
+    def activity(self) -> Indices:
+        """Spikes of the last step, of both rings, by preferred heading, ``(N,)``: the bump."""
+        spikes = np.bincount(self._spikes.neuron, minlength=2 * NEURONS_PER_RING)
+        return spikes.reshape(2, NEURONS_PER_RING).sum(axis=0)
 
     @property
     @abstractmethod
@@ -115,6 +122,7 @@ class DoubleRing(ABC):
 
     def _decode(self, spikes: Spikes) -> None:
         """Population vector over the spikes of the last step; without spikes the heading stays."""
+        self._spikes = spikes
         decoded_rad = self._population.of_spikes(spikes).angle_rad
         if math.isnan(decoded_rad):
             return

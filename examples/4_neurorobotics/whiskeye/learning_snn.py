@@ -11,12 +11,14 @@ def start(node):
     return node.make_packet("estimate")  # heading 0, before the first packet of the IMU
 
 
-@neuros_function(inputs=["imu", "odom_correction"], outputs=["estimate", "uncorrected", "bias"])
+@neuros_function(
+    inputs=["imu", "odom_correction"], outputs=["estimate", "uncorrected", "activity", "bias"]
+)
 def integrate(node, imu, odom_correction):
     bias = node.make_packet("bias")
-    estimate, uncorrected = estimates(node, imu, odom_correction)
+    estimate, uncorrected, activity = estimates(node, imu, odom_correction)
     bias.header, bias.vector.z = estimate.header, node.get_user_data().learnt_rad_s
-    return estimate, uncorrected, bias
+    return estimate, uncorrected, activity, bias
 
 
 @neuros_finalise()

@@ -3,6 +3,7 @@
 from correction_visualiser import (
     Headings,
     report,
+    show_activity,
     show_corrected,
     show_predicted_view,
     show_prediction_error,
@@ -20,6 +21,7 @@ LEARNT = "learnt bias"
 # The hooks that are imported are those of this node, too.
 __all__ = [
     "report",
+    "show_activity",
     "show_bias",
     "show_corrected",
     "show_predicted_view",
