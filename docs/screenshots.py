@@ -3,14 +3,16 @@
 
 ::
 
-    .venv/bin/python docs/screenshots.py
+    .venv/bin/python docs/screenshots.py [--weights RUN/trainer/weights.npz]
 
-It needs ``install.py --dev --extras rerun``, Chromium, and what the examples need. Look at what it
+With the weights of a run of WhiskEye's ``training.json`` it makes the picture of the corrected
+ring, too. It needs ``install.py --dev --extras rerun``, Chromium, and what the examples need. Look at what it
 has made.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import re
 import shutil
@@ -117,6 +119,22 @@ def world_of(page: Any, project: Path, file: Path, sim_s: float, *arguments: str
         page.locator("#world-section").screenshot(path=file)
 
 
+def shoot_correction(page: Any, weights: Path) -> None:
+    """WhiskEye, corrected by what its eyes see, under a bias of the gyroscope."""
+    values = {"pcn.environment.WEIGHTS": weights, "snn.environment.GYRO_BIAS": 0.1}
+    arguments = [text for key, value in values.items() for text in ("--set", f"nodes.{key}={value}")]
+    project = WHISKEYE.with_name("prediction.json")
+    with page_of(project, "dashboard", "--dashboard", *arguments, *LONG) as url:
+        page.goto(url)
+        page.wait_for_function(
+            "() => document.querySelector('#world').dataset.drawn > 3"
+            " && document.querySelector('[data-panel=activity] canvas')?.dataset.columns >= 99"
+            " && [...document.querySelectorAll('.chart')].every((c) => c.dataset.points > 800)",
+            timeout=DEADLINE_MS,
+        )
+        page.screenshot(path=FIGURES / "whiskeye_dashboard.png")
+
+
 def shoot_rerun(page: Any) -> None:
     """WhiskEye as ``--visualisations`` shows it where there is no RViz."""
     with page_of(WHISKEYE, "visualisations", "-z", *LONG) as url:
@@ -128,6 +146,9 @@ def shoot_rerun(page: Any) -> None:
 
 def main() -> None:
     """Make all pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--weights", type=lambda text: Path(text).resolve(), metavar="FILE")
+    weights = parser.parse_args().weights
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
@@ -136,6 +157,8 @@ def main() -> None:
         shoot_dashboard(page)
         shoot_panels(page)
         shoot_world(page)
+        if weights is not None:
+            shoot_correction(page, weights)
         shoot_rerun(page)
         browser.close()
 

@@ -5,6 +5,7 @@ import {want} from "./wants.js";
 
 const KEPT_S = 60;
 const HEIGHT = 150;
+const COLOUR = "#1a66c2";
 
 export class Series {
   constructor() {
@@ -77,6 +78,20 @@ function rangeOf(_, low, high) {
   return [low - margin, high + margin];
 }
 
+// Values between two that are none (NaN), to which no line leads: they are drawn as points.
+function lone(plot, place) {
+  const values = plot.data[place];
+  const [first, last] = plot.series[0].idxs;
+  const found = [];
+  for (let index = first; index <= last; index += 1) {
+    const isNumber = (values[index] ?? null) !== null;
+    if (isNumber && (values[index - 1] ?? null) === null && (values[index + 1] ?? null) === null) {
+      found.push(index);
+    }
+  }
+  return found;
+}
+
 class Chart {
   constructor(box, source, path, onClose) {
     this.source = source;
@@ -90,7 +105,7 @@ class Chart {
     this.plot = new uPlot({
       width: this.element.clientWidth - 12, height: HEIGHT, legend: {show: false},
       scales: {x: {time: false}, y: {range: rangeOf}}, axes: [{size: 28}, {size: 62}],
-      series: [{}, {stroke: "#1a66c2", width: 1.3, points: {show: false}}],
+      series: [{}, {stroke: COLOUR, width: 1.3, points: {show: true, size: 4, fill: COLOUR, filter: lone}}],
     }, this.data, this.element);
     this.observer = new ResizeObserver(() => this.plot.setSize(
       {width: this.element.clientWidth - 12, height: HEIGHT}));
