@@ -6,8 +6,8 @@
     .venv/bin/python docs/screenshots.py [--weights RUN/trainer/weights.npz]
 
 With the weights of a run of WhiskEye's ``training.json`` it makes the picture of the corrected
-ring, too. It needs ``install.py --dev --extras rerun``, Chromium, and what the examples need. Look at what it
-has made.
+ring, too. It needs ``install.py --dev --extras rerun``, Chromium, and what the examples need. Look
+at what it has made.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def world_of(page: Any, project: Path, file: Path, sim_s: float, *arguments: str
 def shoot_correction(page: Any, weights: Path) -> None:
     """WhiskEye, corrected by what its eyes see, under a bias of the gyroscope."""
     values = {"pcn.environment.WEIGHTS": weights, "snn.environment.GYRO_BIAS": 0.1}
-    arguments = [text for key, value in values.items() for text in ("--set", f"nodes.{key}={value}")]
+    arguments = [f"--set=nodes.{key}={value}" for key, value in values.items()]
     project = WHISKEYE.with_name("prediction.json")
     with page_of(project, "dashboard", "--dashboard", *arguments, *LONG) as url:
         page.goto(url)
