@@ -34,8 +34,8 @@ _LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
 _MOST_UNSENT_BYTES = 1 << 22
 _NICENESS = 5
 _PATIENCE_S = 30.0
-# A node has 5 s in all to end.
-_PATIENCE_AT_END_S = 4.0
+# A node has 5 s in all to end, and its finalise hooks come before.
+_PATIENCE_AT_END_S = 3.0
 _LENGTH = struct.Struct("!I")
 # The program needs no ROS: it must not start a second time to find its libraries.
 _ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
