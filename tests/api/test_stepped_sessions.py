@@ -15,7 +15,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from api_projects import ENDLESS, dice
+from api_projects import ENDLESS, THROWER, dice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from std_msgs.msg import Float64, String
@@ -24,6 +24,7 @@ from test_python_api import thrown
 import neuros
 from containers import require_containers, wait_until
 from neuros.api.session import Session
+from neuros.cli.main import main
 from neuros.errors import ProjectError, RunError, UsageError
 
 # The input that a test pushes the robot by.
@@ -199,6 +200,31 @@ def test_however_rounds_are_put_together_the_recorded_packets_are_those_of_a_fre
     stepped, whole = ([m.data for _, m in run.bag[EYES].messages()] for run in (s.close(), free))
     assert stepped == whole[: len(stepped)]
     assert len(stepped) >= sum(parts)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("back_end", ["in-process", "process", "docker"])
+def test_what_is_stepped_to_its_end_is_verified_against_a_free_run(
+    tmp_path: Path, back_end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if back_end == "docker":
+        require_containers()
+    made = dice(tmp_path, ENDLESS)
+    ending = (
+        'THROWN.append(packet.data)\n    if len(THROWN) == 60:\n        node.shutdown("thrown")'
+    )
+    thrower = THROWER.replace("    return packet", f"    {last}\n    return packet")
+    (made / "thrower.py").write_text(f"THROWN = []\n{thrower}")
+    project = neuros.Project.from_file(made)
+    free = project.run(backend="process", seed=3, output=tmp_path / "free").check()
+    held = tmp_path / "held"
+    with project.session(backend=back_end, seed=3, digests=True, output=held) as s:
+        while s.step(timeout_s=DEADLINE_S):
+            pass
+    assert s.close().exit_code == 0
+    capsys.readouterr()
+    assert main(["verify", str(free.folder), str(held)]) == 0
+    assert "identical" in capsys.readouterr().out
 
 
 def test_between_two_steps_nothing_starts(held: Session) -> None:
