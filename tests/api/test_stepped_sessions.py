@@ -210,9 +210,7 @@ def test_what_is_stepped_to_its_end_is_verified_against_a_free_run(
     if back_end == "docker":
         require_containers()
     made = dice(tmp_path, ENDLESS)
-    ending = (
-        'THROWN.append(packet.data)\n    if len(THROWN) == 60:\n        node.shutdown("thrown")'
-    )
+    last = 'THROWN.append(packet.data)\n    if len(THROWN) == 60:\n        node.shutdown("thrown")'
     thrower = THROWER.replace("    return packet", f"    {last}\n    return packet")
     (made / "thrower.py").write_text(f"THROWN = []\n{thrower}")
     project = neuros.Project.from_file(made)
