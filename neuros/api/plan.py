@@ -14,7 +14,6 @@ from pathlib import Path
 
 from neuros.api.request import Request
 from neuros.backends.environments.pythons import Pythons, require_one_python
-from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import without_mark
 from neuros.backends.placement import place, usable_cores
 from neuros.backends.reaper import Reaper
@@ -110,7 +109,12 @@ def _address(host: str) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and how; ``is_held``: for a session."""
+    """A project, which of its nodes to start, where, and how.
+
+    Attributes:
+        is_held: for a session.
+        places: the machine of each node that does not run on this one.
+    """
 
     project: Project
     names: tuple[str, ...]
@@ -120,6 +124,7 @@ class Plan:
     network: Network = THIS_MACHINE
     messages: Messages | None = None
     is_held: bool = False
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -145,11 +150,6 @@ class Plan:
     def notices(self) -> list[Notice]:
         """What the user should know of the choice."""
         return [*self.chosen.notices, *self.deployment.notices]
-
-    @property
-    def places(self) -> Mapping[str, str]:
-        """The machine of each node that does not run on this one."""
-        return self.deployment.places if isinstance(self.deployment, Machines) else {}
 
     @property
     def nodes_here(self) -> list[Node]:
@@ -222,13 +222,17 @@ def make_plan(
     names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
     wanted, machines = request.backend or AUTO, None
+    places: Mapping[str, str] = {}
     if request.deployment is not None:
         _check_deployment(request)
         file = load_deployment(Path(request.deployment), project)
-        nodes = [node for node in nodes if node.name not in file.places]
-        wanted, network = _ON_MACHINES, Network(bool(file.places))
+        places = file.places
+        nodes = [node for node in nodes if node.name not in places]
+        wanted, network = _ON_MACHINES, Network(bool(places))
     chosen = choose(wanted, project, nodes, request.backend_options or {})
     if request.deployment is not None:
+        from neuros.backends.machines.deployment import Machines
+
         machines = Machines(
             file, project, chosen.deployment, monitors_load=request.monitor_system_load
         )
@@ -238,7 +242,7 @@ def make_plan(
         _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
-    plan = Plan(project, names, chosen, request, pythons, network, messages)
+    plan = Plan(project, names, chosen, request, pythons, network, messages, places=places)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
             f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"
