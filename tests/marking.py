@@ -46,6 +46,7 @@ BY_NAME = {
         "conformance/test_conformance.py::test_random_projects",
         "conformance/test_conformance.py::test_what_once",
         "integration/",
+        "recording/test_datasets.py",
         "recording/test_spike_trains.py",
         "upgrades/test_upgrades.py",
     ),

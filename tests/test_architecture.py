@@ -62,7 +62,7 @@ PACKAGES = (
     Package(7, ("api",)),
     Package(7, ("bag",)),
     Package(7, ("testing",)),
-    Package(8, ("pytest_plugin", "gym")),
+    Package(8, ("pytest_plugin", "gym", "datasets")),
     Package(8, ("cli", "doctor", "replay")),
 )
 # neuros itself holds public names; every package may ask it for the version. Those of others
@@ -95,6 +95,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "api.export": {"yaml"},
     "pytest_plugin": {"pytest"},
     "gym": {"gymnasium", "mujoco", "numpy"},
+    "datasets": {"gymnasium", "minari", "numpy"},
     "api.sweep": {"tabulate"},
     "executors.pools": {"distributed"},
     "executors.slurm": {"submitit"},

@@ -20,7 +20,7 @@ Column: TypeAlias = npt.NDArray[Any]
 """Values of one field, a row per packet."""
 
 LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
-_IMAGE = "sensor_msgs/msg/Image"
+IMAGE = "sensor_msgs/msg/Image"
 _UNITS = {
     "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
     "builtin_interfaces/msg/Time": {"sec": "s", "nanosec": "ns"},
@@ -120,10 +120,10 @@ def dataset_of(topic: Topic, types: Mapping[str, Any], start_ns: int) -> Any:
         "time": ("time", time_s, {"units": "s", "long_name": clock}),
         "wall_time": ("time", wall_ns.astype("datetime64[ns]")),
     }
-    images = [name for name, (of, _) in found.items() if of == _IMAGE and name.endswith("data")]
+    images = [name for name, (of, _) in found.items() if of == IMAGE and name.endswith("data")]
     for name in images:
         prefix = name.removesuffix("data")
-        if (pixels := _pixels(columns, prefix)) is not None:
+        if (pixels := pixels_of(columns, prefix)) is not None:
             dims = [f"{prefix}{dim}" for dim in ("y", "x", "channel")][: pixels.ndim - 1]
             variables[name] = (("time", *dims), pixels)
             if pixels.ndim == 4:
@@ -152,7 +152,7 @@ def _fields(
             yield f"{prefix}{name}", (type_name, its)
 
 
-def _pixels(columns: Mapping[str, Column], prefix: str) -> Column | None:
+def pixels_of(columns: Mapping[str, Column], prefix: str) -> Column | None:
     """Images ``(time, y, x[, channel])``; ``None`` unless all have one size and known pixels."""
     data = columns[f"{prefix}data"]
     about = [columns[f"{prefix}{name}"] for name in ("height", "width", "step", "is_bigendian")]

@@ -1,0 +1,256 @@
+"""Datasets for imitation and offline reinforcement learning, from recorded runs.
+
+::
+
+    from pathlib import Path
+
+    import neuros.datasets
+
+    runs = sorted(Path("runs/cartpole").iterdir())
+    observation, action = ["cart.joints.position", "cart.joints.velocity"], "policy.force"
+    steps = neuros.datasets.steps(runs[0], observation, action)         # NumPy
+    neuros.datasets.minari(runs, "cartpole/expert-v0", observation, action)
+
+Each run is an episode. Each packet of the first observation begins a step.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+import neuros.bag
+from neuros.errors import UsageError
+from neuros.project.suggest import did_you_mean
+from neuros.recording.bag_reader import Bag, RecordedTopic
+from neuros.recording.labelled import (
+    IMAGE,
+    LOG_TIME,
+    PUBLISH_TIME,
+    Column,
+    has_simulated_time,
+    library,
+    pixels_of,
+)
+
+Run: TypeAlias = "str | os.PathLike[str]"
+Names: TypeAlias = "str | Sequence[str]"
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of a run, in the order in which they happened.
+
+    Attributes:
+        observation: by name, an array with a row per step: the newest packet at its beginning.
+        action: by name, an array with a row per step: the newest packet at its end.
+        time_s: when each step began: simulated time, or without it, wall time since the first.
+    """
+
+    observation: dict[str, Column]
+    action: dict[str, Column]
+    time_s: npt.NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+def steps(run: Run, observation: Names, action: Names) -> Steps:
+    """What a policy saw and did in a recorded run, step by step.
+
+    A step begins with each packet of the first observation, and ends before the next one. Other
+    observations hold the newest packet that was sent before the step began, actions the newest that
+    was sent before it ended; the order is that of the recording. Steps before each output has sent,
+    and the last step if no action was sent in it, are left out.
+
+    Args:
+        run: the run folder, or a rosbag2 folder.
+        observation, action: ``node.output``, for all numbers of its messages (without time stamps),
+            or ``node.output.field``. An image is an array ``(step, y, x[, channel])``.
+
+    Raises:
+        UsageError: if there is no such output or field, if it holds no numbers, or arrays whose
+            length changes; for a run without steps.
+        EnvironmentFault: as :func:`neuros.bag.open`.
+    """
+    with neuros.bag.open(run) as bag:
+        seen = [_Signal(bag, name) for name in _listed(observation)]
+        done = [_Signal(bag, name) for name in _listed(action)]
+    begins = seen[0].sent_ns
+    ends = np.append(begins[1:], np.iinfo(np.int64).max)
+    rows = [each.places(begins, "right") for each in seen] + [each.places(ends) for each in done]
+    is_whole = np.min(rows, axis=0) >= 0
+    if len(begins):  # what the last observation led to may not have been sent any more
+        last = max((each.sent_ns[-1] for each in done if len(each.sent_ns)), default=0)
+        is_whole[-1] &= last > begins[-1]
+    if not is_whole.any():
+        raise UsageError(f"{os.fspath(run)} has no step in which each output has sent")
+    values = {
+        each.name: each.values[row[is_whole]] for each, row in zip(seen + done, rows, strict=True)
+    }
+    return Steps(
+        {each.name: values[each.name] for each in seen},
+        {each.name: values[each.name] for each in done},
+        seen[0].time_s[is_whole],
+    )
+
+
+def minari(
+    runs: Run | Sequence[Run],
+    dataset_id: str,
+    observation: Names,
+    action: Names,
+    *,
+    reward: Callable[[Any, Any], float] = lambda observation, action: 0.0,
+    **options: Any,
+) -> Any:
+    """Write recorded runs as a dataset of Minari, an episode each, and return it.
+
+    The last step gives the observation that ends the episode, which is *truncated*. One name makes
+    a ``Box``, a list a ``Dict`` of boxes, as in :mod:`neuros.gym`. Source of the format: O.
+    Younis et al., "Minari", 2024; the library writes it, to where ``MINARI_DATASETS_PATH`` says.
+
+    Args:
+        dataset_id: ``name-v0``, or ``namespace/name-v0``.
+        observation, action: as for :func:`steps`.
+        reward: called with what was observed when a step ended, and with its action.
+        options: those of ``minari.create_dataset_from_buffers``: ``author``, ``data_format``, ...
+
+    Raises:
+        EnvironmentFault: if Minari is not installed.
+        UsageError: as :func:`steps`; for a run of one step.
+        ValueError: for a name that Minari refuses.
+    """
+    library("minari", "steps()")
+    from minari import create_dataset_from_buffers
+    from minari.data_collector import EpisodeBuffer
+
+    episodes = [steps(run, observation, action) for run in _listed_runs(runs)]
+    buffers = []
+    for number, found in enumerate(episodes):
+        if len(found) < 2:
+            raise UsageError(f"{os.fspath(_listed_runs(runs)[number])} has one step only")
+        last = len(found) - 1
+        seen = _as_asked(found.observation, observation)
+        done = _as_asked({key: column[:-1] for key, column in found.action.items()}, action)
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=seen,
+                actions=done,
+                rewards=[float(reward(_row(seen, n + 1), _row(done, n))) for n in range(last)],
+                terminations=[False] * last,
+                truncations=[False] * (last - 1) + [True],
+                infos={},
+            )
+        )
+    return create_dataset_from_buffers(
+        dataset_id,
+        buffers,
+        observation_space=_space([each.observation for each in episodes], observation),
+        action_space=_space([each.action for each in episodes], action),
+        **{"jpeg_encoding": False, **options},
+    )
+
+
+class _Signal:
+    """A part of what an output has sent: a row per packet."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic, field = _split(bag, name)
+        columns = topic.columns()
+        self.name = name
+        self.sent_ns: npt.NDArray[np.int64] = columns[LOG_TIME]
+        owns_time = has_simulated_time(columns)
+        self.time_s = (
+            columns[PUBLISH_TIME] / 1e9 if owns_time else (self.sent_ns - self.sent_ns[:1]) / 1e9
+        )
+        self.values = _values(topic, columns, name, field)
+
+    def places(self, until_ns: npt.NDArray[np.int64], side: str = "left") -> npt.NDArray[np.intp]:
+        """Of the newest packet before each time (``right``: or at it); -1 where there is none."""
+        found: npt.NDArray[np.intp] = np.searchsorted(self.sent_ns, until_ns, side=side) - 1  # type: ignore[call-overload]
+        return found
+
+
+def _split(bag: Bag, name: str) -> tuple[RecordedTopic, str]:
+    """The topic of ``node.output.field``, and the field."""
+    node, _, rest = name.partition(".")
+    output, _, field = rest.partition(".")
+    try:
+        return bag[f"{node}.{output}"], field
+    except KeyError as error:
+        raise UsageError(str(error.args[0])) from None
+
+
+def _values(topic: RecordedTopic, columns: Mapping[str, Column], name: str, field: str) -> Column:
+    """The numbers of a topic, or of one of its fields: of an image its pixels, else joined."""
+    if topic.type == IMAGE and field in ("", "data"):
+        pixels = pixels_of(columns, "")
+        if pixels is None:
+            raise UsageError(f"{name}: the images differ in size, or their pixels are not known")
+        is_bgr = len(columns["encoding"]) > 0 and str(columns["encoding"][0]).startswith("bgr")
+        return pixels[..., [2, 1, 0, *range(3, pixels.shape[-1])]] if is_bgr else pixels
+    fields = {key: c for key, c in columns.items() if key not in (LOG_TIME, PUBLISH_TIME)}
+    if field:
+        within = (f"{field}.", f"{field}[")
+        found = {k: c for k, c in fields.items() if k == field or k.startswith(within)}
+        if not found:
+            hint = did_you_mean(field, fields) or f"it has {', '.join(fields)}"
+            raise UsageError(f"'{name}': {topic.type} has no field '{field}' ({hint})")
+    else:
+        found = {k: c for k, c in fields.items() if not k.endswith(("stamp.sec", "stamp.nanosec"))}
+    for key, column in found.items():
+        if column.dtype == object and not isinstance(next(iter(column), ""), str):
+            raise UsageError(f"'{name}': the length of {key} changes from packet to packet")
+    numbers = [c.reshape(len(c), -1) for c in found.values() if c.dtype.kind in "biuf"]
+    if not any(column.shape[1] for column in numbers):
+        raise UsageError(f"'{name}' holds no numbers")
+    return np.concatenate(numbers, axis=1)
+
+
+def _listed(names: Names) -> list[str]:
+    listed = [names] if isinstance(names, str) else [*names]
+    if not listed or len({*listed}) < len(listed):
+        raise UsageError("name one output or more, each once" if listed else "name an output")
+    return listed
+
+
+def _listed_runs(runs: Run | Sequence[Run]) -> list[Run]:
+    listed = [runs] if isinstance(runs, (str, os.PathLike)) else [*runs]
+    if not listed:
+        raise UsageError("a dataset needs a run")
+    return listed
+
+
+def _as_asked(columns: dict[str, Column], names: Names) -> Any:
+    return columns[names] if isinstance(names, str) else columns
+
+
+def _row(columns: Any, place: int) -> Any:
+    if isinstance(columns, dict):
+        return {name: column[place] for name, column in columns.items()}
+    return columns[place]
+
+
+def _space(episodes: Sequence[dict[str, Column]], names: Names) -> Any:
+    """The space of what was recorded; its bounds are those of the type of the numbers."""
+    from gymnasium import spaces
+
+    boxes: dict[str, Any] = {}
+    for name, column in episodes[0].items():
+        kind, shape = column.dtype, column.shape[1:]
+        if any(each[name].shape[1:] != shape for each in episodes):
+            raise UsageError(f"'{name}' has another length in one of the runs")
+        low, high = (-np.inf, np.inf) if kind.kind == "f" else _bounds(kind)
+        boxes[name] = spaces.Box(low, high, shape, kind.type)
+    return boxes[names] if isinstance(names, str) else spaces.Dict(boxes)
+
+
+def _bounds(kind: np.dtype[Any]) -> tuple[int, int]:
+    return (0, 1) if kind.kind == "b" else (int(np.iinfo(kind).min), int(np.iinfo(kind).max))
