@@ -16,6 +16,7 @@ Each run is an episode. Each packet of the first observation begins a step.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,13 +42,15 @@ from neuros.recording.labelled import (
 Run: TypeAlias = "str | os.PathLike[str]"
 Names: TypeAlias = "str | Sequence[str]"
 
+_NEVER = np.iinfo(np.int64).max
+
 
 @dataclass(frozen=True)
 class Steps:
     """The steps of a run, in the order in which they happened.
 
     Attributes:
-        observation: by name, an array with a row per step: the newest packet at its beginning.
+        observation: by name, an array with a row per step: the packet that the action answers.
         action: by name, an array with a row per step: the newest packet at its end.
         time_s: when each step began: simulated time, or without it, wall time since the first.
     """
@@ -63,10 +66,11 @@ class Steps:
 def steps(run: Run, observation: Names, action: Names) -> Steps:
     """What a policy saw and did in a recorded run, step by step.
 
-    A step begins with each packet of the first observation, and ends before the next one. Other
-    observations hold the newest packet that was sent before the step began, actions the newest that
-    was sent before it ended; the order is that of the recording. Steps before each output has sent,
-    and the last step if no action was sent in it, are left out.
+    A step begins with each packet of the first observation, and ends before the next one. Actions
+    are the newest packets that were sent before the step ended. Other observations are the newest
+    that were sent before the first action of the step, or before the step began where it has no
+    action. The order is that of the recording. Steps before each output has sent, and the last step
+    if no action was sent in it, are left out.
 
     Args:
         run: the run folder, or a rosbag2 folder.
@@ -82,12 +86,19 @@ def steps(run: Run, observation: Names, action: Names) -> Steps:
         seen = [_Signal(bag, name) for name in _listed(observation)]
         done = [_Signal(bag, name) for name in _listed(action)]
     begins = seen[0].sent_ns
-    ends = np.append(begins[1:], np.iinfo(np.int64).max)
-    rows = [each.places(begins, "right") for each in seen] + [each.places(ends) for each in done]
+    ends = np.append(begins[1:], _NEVER)
+    # What a hook sends together is recorded one after the other: all of it is there by the answer.
+    answers = np.min([each.first_after(begins) for each in done], axis=0)
+    has_answer = answers < ends
+    seen_by = np.where(has_answer, answers, begins)
+    first = np.arange(len(begins))
+    rows = [
+        first,
+        *(each.before(seen_by) for each in seen[1:]),
+        *(each.before(ends - 1) for each in done),
+    ]
     is_whole = np.min(rows, axis=0) >= 0
-    if len(begins):  # what the last observation led to may not have been sent any more
-        last = max((each.sent_ns[-1] for each in done if len(each.sent_ns)), default=0)
-        is_whole[-1] &= last > begins[-1]
+    is_whole[-1:] &= has_answer[-1:]
     if not is_whole.any():
         raise UsageError(f"{os.fspath(run)} has no step in which each output has sent")
     values = {
@@ -172,10 +183,14 @@ class _Signal:
         )
         self.values = _values(topic, columns, name, field)
 
-    def places(self, until_ns: npt.NDArray[np.int64], side: str = "left") -> npt.NDArray[np.intp]:
-        """Of the newest packet before each time (``right``: or at it); -1 where there is none."""
-        found: npt.NDArray[np.intp] = np.searchsorted(self.sent_ns, until_ns, side=side) - 1  # type: ignore[call-overload]
-        return found
+    def before(self, times_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+        """The place of the newest packet before each time, or at it; -1 where there is none."""
+        return np.searchsorted(self.sent_ns, times_ns, side="right") - 1
+
+    def first_after(self, times_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """When the first packet after each time was sent."""
+        sent_ns = np.append(self.sent_ns, _NEVER)
+        return sent_ns[np.searchsorted(self.sent_ns, times_ns, side="right")]
 
 
 def _split(bag: Bag, name: str) -> tuple[RecordedTopic, str]:
@@ -183,7 +198,7 @@ def _split(bag: Bag, name: str) -> tuple[RecordedTopic, str]:
     node, _, rest = name.partition(".")
     output, _, field = rest.partition(".")
     try:
-        return bag[f"{node}.{output}"], field
+        return bag[f"{node}.{output}" if output else name], field
     except KeyError as error:
         raise UsageError(str(error.args[0])) from None
 
@@ -205,13 +220,23 @@ def _values(topic: RecordedTopic, columns: Mapping[str, Column], name: str, fiel
             raise UsageError(f"'{name}': {topic.type} has no field '{field}' ({hint})")
     else:
         found = {k: c for k, c in fields.items() if not k.endswith(("stamp.sec", "stamp.nanosec"))}
-    for key, column in found.items():
-        if column.dtype == object and not isinstance(next(iter(column), ""), str):
-            raise UsageError(f"'{name}': the length of {key} changes from packet to packet")
-    numbers = [c.reshape(len(c), -1) for c in found.values() if c.dtype.kind in "biuf"]
+    numbers = [
+        plain.reshape(len(plain), math.prod(plain.shape[1:]))
+        for plain in (_plain(f"'{name}': {key}", column) for key, column in found.items())
+        if plain.dtype.kind in "biuf"
+    ]
     if not any(column.shape[1] for column in numbers):
         raise UsageError(f"'{name}' holds no numbers")
     return np.concatenate(numbers, axis=1)
+
+
+def _plain(name: str, column: Column) -> Column:
+    """A column of arrays of one length as one array; every other as it is."""
+    if column.dtype != object or not all(isinstance(each, np.ndarray) for each in column):
+        return column
+    if len({each.shape for each in column}) > 1:
+        raise UsageError(f"{name} changes its length from packet to packet")
+    return np.stack([*column]) if len(column) else np.empty((0, 0))
 
 
 def _listed(names: Names) -> list[str]:

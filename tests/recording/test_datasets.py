@@ -40,18 +40,24 @@ def move(node, command):
 BRAIN = """
 from neuros.hooks import neuros_function
 
-@neuros_function(inputs=["camera", "pose"], outputs=["command", "said"])
+@neuros_function(inputs=["camera", "pose"], outputs=["command", "said", "joints"])
 def act(node, camera, pose):
     command, said = node.make_packet("command"), node.make_packet("said")
     command.data = 10.0 * pose.point.x
     said.data = [1] * int(pose.point.x)
-    return command, said
+    joints = node.make_packet("joints")
+    joints.name, joints.position = ["a", "b"], [pose.point.x, 1.0]
+    return command, said, joints
 """
 LISTENER = """
 from neuros.hooks import neuros_function
 
 @neuros_function(inputs="said")
 def hear(node, said):
+    pass
+
+@neuros_function(inputs="joints")
+def feel(node, joints):
     pass
 """
 POSE, CAMERA, COMMAND = "robot.pose.point", "robot.camera", "brain.command"
@@ -67,16 +73,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     seen = [port("camera", "sensor_msgs/msg/Image"), port("pose", "geometry_msgs/msg/PointStamped")]
     command = port("command", "std_msgs/msg/Float64")
     said = port("said", "std_msgs/msg/UInt8MultiArray")
+    joints = port("joints", "sensor_msgs/msg/JointState")
     nodes: list[dict[str, Any]] = [
         {"name": "robot", "outputs": seen, "inputs": [command]},
-        {"name": "brain", "outputs": [command, said], "inputs": seen},
-        {"name": "listener", "inputs": [said]},
+        {"name": "brain", "outputs": [command, said, joints], "inputs": seen},
+        {"name": "listener", "inputs": [said, joints]},
     ]
     plugins = {"robot": ROBOT, "brain": BRAIN, "listener": LISTENER}
     for node in nodes:
         node |= {"plugin": f"{node['name']}.py", "container": "neuros_python"}
         (folder / node["plugin"]).write_text(plugins[node["name"]])
-    ends = ["robot.camera brain", "robot.pose brain", "brain.command robot", "brain.said listener"]
+    ends = ["robot.camera brain", "robot.pose brain", "brain.command robot"]
+    ends += ["brain.said listener", "brain.joints listener"]
     connections = []
     for end in ends:
         source, destination = end.split()
@@ -112,6 +120,12 @@ def test_an_image_has_rows_columns_and_channels_in_the_order_rgb(run: Path) -> N
     assert pixels[1, 0, 0].tolist() == [255, 0, 1]
 
 
+@pytest.mark.parametrize("observation", [[POSE, CAMERA], [CAMERA, POSE]])
+def test_what_a_hook_has_sent_together_is_in_one_step(run: Path, observation: list[str]) -> None:
+    seen = neuros.datasets.steps(run, observation, COMMAND).observation
+    assert seen[CAMERA][:, 0, 0, 2].tolist() == seen[POSE][:, 0].tolist()
+
+
 def test_all_numbers_of_a_message_are_taken_but_those_of_its_time_stamp(run: Path) -> None:
     all_of_it = neuros.datasets.steps(run, "robot.pose", COMMAND).observation["robot.pose"]
     point = neuros.datasets.steps(run, POSE, COMMAND).observation[POSE]
@@ -120,13 +134,19 @@ def test_all_numbers_of_a_message_are_taken_but_those_of_its_time_stamp(run: Pat
     assert set(stamp.observation["robot.pose.header.stamp.sec"].ravel().tolist()) == {7}
 
 
+def test_arrays_of_a_message_with_texts_are_taken_where_their_length_stays(run: Path) -> None:
+    steps = neuros.datasets.steps(run, POSE, "brain.joints")
+    position = steps.action["brain.joints"]
+    assert position.tolist() == [[x, 1.0] for x in steps.observation[POSE][:, 0]]
+
+
 @pytest.mark.parametrize(
     ("observation", "action", "said"),
     [
         ("robot.smell", COMMAND, "robot.smell"),
         ("robot.pose.pint", COMMAND, "has no field 'pint'"),
         ("robot.pose.header.frame_id", COMMAND, "holds no numbers"),
-        (POSE, "brain.said", "the length of data changes"),
+        (POSE, "brain.said", "data changes its length"),
         ([], COMMAND, "name an output"),
         ([POSE, POSE], COMMAND, "each once"),
     ],
