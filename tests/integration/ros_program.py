@@ -15,6 +15,8 @@ from neuros.transport.teardown import give_up
 
 message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
 
+_ANSWER_S = 2.0  # rmw_fastrtps gives an answer up after 0.1 s where it has not found the client
+
 
 class RosProgram:
     """A node in a context of its own."""
@@ -29,6 +31,7 @@ class RosProgram:
         self.node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def listen(self, topic: str, type_name: str) -> list[Any]:
         """What is heard on a topic from now on; grows."""
@@ -37,12 +40,25 @@ class RosProgram:
         return heard
 
     def call(self, service: type, name: str, request: Any, timeout_s: float = 20.0) -> Any:
-        """Call a service and wait for its answer."""
-        client = self.node.create_client(service, name)
+        """Call a service until it answers, with one client for all calls of it.
+
+        A client finds a service before that has found the client, and then the answer is lost. So
+        the first request is one that can be repeated.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service, name)
+        client = self._clients[name]
         self.spin_until(client.service_is_ready, timeout_s)
-        future = client.call_async(request)
-        self.spin_until(future.done, timeout_s)
-        return future.result()
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            future = client.call_async(request)
+            again_s = min(time.monotonic() + _ANSWER_S, deadline_s)
+            while not future.done() and time.monotonic() < again_s:
+                self.spin(0.01)
+            if future.done():
+                return future.result()
+            client.remove_pending_request(future)
+            assert time.monotonic() < deadline_s, f"{name}: no answer within {timeout_s:g} s"
 
     def spin(self, timeout_s: float = 0.0) -> None:
         """Handle one event, if there is one."""

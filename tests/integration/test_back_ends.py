@@ -79,4 +79,6 @@ def talk_to_the_gate(program: RosProgram) -> None:
         return bool(told.success)  # whether its timer has run
 
     program.spin_until(has_ticked)
+    # The service knows the client from here on, so that its last answer is not lost.
+    assert not program.call(SetBool, "/gate/stop", SetBool.Request(data=False)).success
     assert program.call(SetBool, "/gate/stop", SetBool.Request(data=True)).success

@@ -20,7 +20,8 @@ def begin(node):
         return response
 
     def stop(request, response):
-        node.shutdown("told to by a service")
+        if request.data:
+            node.shutdown("told to by a service")
         response.success = request.data
         return response
 
