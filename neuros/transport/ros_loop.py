@@ -165,7 +165,8 @@ class RosLoop:
     def run(self) -> None:
         """Run until :meth:`stop`.
 
-        Where a timer is overdue, and one may always be, all that waits is handled before it.
+        Where a timer is overdue, and one may always be, what waits is handled before it: all of it,
+        or as much as the first hook that takes longer than a turn.
         """
         while not self._is_stopping:
             self._planned_ns = self._next_due_ns()
@@ -226,7 +227,7 @@ class RosLoop:
         self.has_taken_in = True
         self.turns += 1
         events = self._events
-        begin_ns = now_ns = time.monotonic_ns()
+        begin_ns = since_ns = now_ns = time.monotonic_ns()
         length_ns = _TURN_NS
         is_first = True
         while events and not self._is_stopping:
@@ -239,13 +240,17 @@ class RosLoop:
                 event()
             except BaseException as error:
                 self._on_failure(error)
+            since_ns, now_ns = now_ns, time.monotonic_ns()
             if not self.has_taken_in:
                 break
-            since_ns, now_ns = now_ns, time.monotonic_ns()
             if now_ns - begin_ns > length_ns:
                 length_ns = max(length_ns, self._fair_turn_ns(now_ns - since_ns))
                 if now_ns - begin_ns > length_ns:
                     break
+        # What a tick sends after a long hook is newer than what waits for the next one.
+        if self._has_older_events and now_ns - since_ns > _TURN_NS:
+            events.remove((self._end_older_events, False))
+            self._has_older_events = False
         # Turns that do nothing any more would keep the executor from ending.
         if events and not self._has_posted_turn and not self._is_stopping:
             self._post_turn()

@@ -189,6 +189,34 @@ def test_timers_are_called_when_they_are_due(loop: Loop) -> None:
     assert min(late_ns) >= 0
 
 
+@pytest.mark.parametrize(
+    ("turn_s", "expected"),
+    [(60.0, ["tick", "hook", "hook", "hook"]), (0.0, ["tick", "hook", "tick", "hook"])],
+    ids=["short", "long"],
+)
+def test_a_timer_that_is_always_overdue_alternates_with_long_events(
+    turn_s: float, expected: list[str], loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those shorter than a turn that wait are all handled before it, or they would pile up."""
+    monkeypatch.setattr(ros_loop, "_TURN_NS", int(turn_s * 1e9))
+    seen: list[str] = []
+
+    def hook() -> None:
+        seen.append("hook")
+        if seen.count("hook") == 3:
+            loop.loop.stop()
+
+    def on_due() -> None:
+        seen.append("tick")
+        if len(seen) == 1:
+            for _ in range(3):
+                loop.loop.post(hook)
+
+    loop.loop.add_timer(lambda: 1, on_due)
+    loop.run()
+    assert seen[:4] == expected
+
+
 def test_without_the_events_executor_a_wait_set_takes_its_place(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
