@@ -162,7 +162,6 @@ class Probed(Report):
         number: that of the probe.
         is_startable: whether a hook could start on a packet that has arrived.
         is_wakeable: whether a timer, a thread or an external input may wake the node.
-        is_running: whether the node has been initialised and may start hooks.
         is_idle: whether no event waits.
     """
 
@@ -170,7 +169,6 @@ class Probed(Report):
     number: int
     is_startable: bool
     is_wakeable: bool
-    is_running: bool
     is_idle: bool
 
 

@@ -209,7 +209,7 @@ def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
 def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
     """Whether no node can ever run a hook again."""
     return not under_way(probes, connections) and all(
-        probe.is_running and probe.is_idle and not probe.is_wakeable for probe in probes.values()
+        probe.is_idle and not probe.is_wakeable for probe in probes.values()
     )
 
 

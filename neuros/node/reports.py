@@ -131,7 +131,6 @@ class NodeReports:
             is_wakeable=has_free_threads
             or engine.is_wakeable
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
-            is_running=engine.is_running,
             is_idle=is_idle,
         )
 

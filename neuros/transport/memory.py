@@ -9,11 +9,14 @@ from __future__ import annotations
 from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
+from time import monotonic_ns
 from typing import Any, Protocol
 
 from neuros.ports import EventLoop, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.ownership import Given
+
+_LONG_NS = 1_000_000  # as long as a turn of events: see neuros.transport.ros_loop
 
 
 class GraphBridge(Protocol):
@@ -35,6 +38,7 @@ class MemoryHub:
     Args:
         loop: where packets and acknowledgements are events.
         copy: what it returns must share nothing with its argument.
+        clock: monotonic, in nanoseconds.
 
     Attributes:
         arrivals: what is on its way to each node.
@@ -44,10 +48,12 @@ class MemoryHub:
         self,
         loop: EventLoop,
         copy: Callable[[Any], Any],
+        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self.loop = loop
         self.post = loop.post
         self.copy = copy
+        self.clock = clock
         self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self.inboxes: dict[str, Inbox] = {}
         self._links: dict[Connection, MemoryLink] = {}
@@ -100,6 +106,8 @@ class MemoryTransport:
         self._hub = hub
         self._bridge = bridge
         self._is_open = False
+        self._start_ns = 0
+        self._is_turn_of_others = False
         self._given = Given()
         self.watched = self._given.watched
         self._digest = digest
@@ -150,12 +158,31 @@ class MemoryTransport:
         return acknowledge_if_open
 
     def note_execution(self) -> None:
-        """A hook has ended: what is on its way here comes before the next one."""
+        """A hook has ended: what is on its way here comes before the next one.
+
+        After one that took long, so does what waits for the other nodes, and what comes of it: they
+        share one thread, and ticks that are always overdue would have it for themselves.
+        """
         self._arrivals.first = self._arrivals.sent
+        is_long = self._hub.clock() - self._start_ns > _LONG_NS
+        if is_long and self._loop.has_waiting_events:
+            self._is_turn_of_others = True
+            self._hub.post(self._end_turn_of_others)
         self._loop.note_execution()
 
     def has_taken_in(self) -> bool:
-        return self._arrivals.arrived >= self._arrivals.first and self._loop.has_taken_in
+        is_next = (
+            self._arrivals.arrived >= self._arrivals.first
+            and not self._is_turn_of_others
+            and self._loop.has_taken_in
+        )
+        if is_next:
+            self._start_ns = self._hub.clock()
+        return is_next
+
+    def _end_turn_of_others(self) -> None:
+        self._is_turn_of_others = False
+        self._arrivals.first = self._arrivals.sent
 
     def waiting_for(self) -> Sequence[Connection]:
         joined = self._hub.inboxes
@@ -197,7 +224,7 @@ class _Arrivals:
     Attributes:
         sent: how many have been sent so far, but for packets that were lost in transport.
         arrived: how many of them have arrived.
-        first: how many come before the next hook: those sent until the last one had ended.
+        first: how many come before the next hook.
     """
 
     __slots__ = ("arrived", "first", "sent")

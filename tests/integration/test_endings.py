@@ -195,6 +195,24 @@ def test_a_deadlock_ends_the_project_and_names_its_cycle(bench: Bench) -> None:
     assert bench.saved("robot", "brain")
 
 
+def test_an_initialise_hook_that_waits_for_ever_is_a_deadlock_too(bench: Bench) -> None:
+    bench.project(
+        "robot.sensors -> brain.sensors",
+        "brain.command -> robot.command",
+        robot="""
+@neuros_initialise(inputs="command")
+def begin(node, command): ...
+@neuros_tick(seconds=0.01, outputs="sensors")
+def step(node):
+    return node.make_packet("sensors")
+""",
+        brain=CONTROL,
+    )
+    finished = bench.launch()
+    assert finished.exit_code == 1
+    assert "robot waits for `command` from brain" in last_line(finished)
+
+
 def test_a_loop_that_is_full_is_a_deadlock_too(bench: Bench) -> None:
     bench.project(
         "robot.sensors -> brain.sensors",

@@ -81,7 +81,6 @@ class Host:
                 number=message["number"],
                 is_startable=False,
                 is_wakeable=not self.is_idle,
-                is_running=True,
                 is_idle=self.is_idle,
             )
 

@@ -44,7 +44,6 @@ def probe(node: str = "a", number: int = 0, **changes: Any) -> Probed:
         "metrics": metrics | changes.pop("metrics", {}),
         "is_startable": False,
         "is_wakeable": False,
-        "is_running": True,
         "is_idle": True,
         **changes,
     }
@@ -117,9 +116,7 @@ def test_a_project_is_dead_when_nothing_can_wake_any_node() -> None:
     assert is_dead({"a": sender(AB, 1, 0), "b": receiver(AB, 1, 0)}, [AB])
 
 
-@pytest.mark.parametrize(
-    "change", [{"is_wakeable": True}, {"is_idle": False}, {"is_running": False}], ids=str
-)
+@pytest.mark.parametrize("change", [{"is_wakeable": True}, {"is_idle": False}], ids=str)
 def test_one_node_that_could_still_do_something_is_enough(change: dict[str, bool]) -> None:
     assert not is_dead({"a": sender(AB, 1, 0), "b": receiver(AB, 1, 0, **change)}, [AB])
 

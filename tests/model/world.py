@@ -398,6 +398,5 @@ def _answer_of(node: ModelNode, number: int) -> Probed:
         number=number,
         is_startable=node.engine.has_startable_packet,
         is_wakeable=False,
-        is_running=True,
         is_idle=True,
     )

@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import pytest
+
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench
-from neuros.testing.transports import TransportChecks
+from neuros.testing.transports import TransportBench, TransportChecks
+from neuros.testing.wiring import wire
 
 
 class MemoryNetwork:
     """Nodes in one process, on a loop that goes step by step."""
 
     def __init__(self, files: Sequence[NodeFile]) -> None:
-        self._loop = StepLoop(ManualClock())
-        bench = Workbench(self._loop, Topics(), [])
+        self.clock = ManualClock()
+        self.loop = StepLoop(self.clock)
+        bench = Workbench(self.loop, Topics(), [])
         self._transports = {file.node.name: bench.transport(file) for file in files}
 
     def transport(self, node: str) -> Transport:
@@ -24,12 +28,12 @@ class MemoryNetwork:
 
     def run_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         while not condition():
-            if not self._loop.step():
+            if not self.loop.step():
                 return condition()
         return True
 
     def settle(self) -> None:
-        self._loop.run()
+        self.loop.run()
 
     def listen(self, topic: str, type_name: str) -> list[Any] | None:
         return None
@@ -42,3 +46,24 @@ class MemoryNetwork:
 class TestMemoryTransport(TransportChecks):
     def network(self, files: Sequence[NodeFile]) -> MemoryNetwork:
         return MemoryNetwork(files)
+
+
+@pytest.mark.parametrize("takes_ns", [1_000, 2_000_000], ids=["short", "long"])
+def test_after_a_long_hook_what_waits_for_other_nodes_comes_first_and_what_they_answer(
+    takes_ns: int,
+) -> None:
+    with TransportBench(MemoryNetwork, wire("a.out -> b.in", 0), wire("c.out -> b.in", 0)) as bench:
+        network, (from_a, from_c) = bench.network, bench.connections
+        assert isinstance(network, MemoryNetwork)
+        bench.meet()
+        bench.inboxes["b"].on_arrival = lambda *_: bench.acknowledge(from_c, 1)
+        busy = network.transport("c")
+        assert busy.has_taken_in()
+        bench.send(1, from_a)
+        network.clock.now_ns += takes_ns
+        busy.note_execution()
+        may_start = [busy.has_taken_in()]
+        while network.loop.step():
+            may_start.append(busy.has_taken_in())
+        # At first, after the packet for b, (after the turn of the others,) after the answer to c.
+        assert may_start == ([False, False, False, True] if takes_ns > 1_000_000 else [True] * 3)
