@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +103,9 @@ def test_the_policy_of_the_project_gives_the_packets_of_its_own_run(
 ) -> None:
     """What is learnt in an environment holds for the node in the project."""
     monkeypatch.syspath_prepend(str(EXAMPLE))
-    from policy import push
+    from policy import push, read
 
-    weights = np.loadtxt(EXAMPLE / "weights.txt")
+    layers = read(EXAMPLE / "weights.txt")
     taken_over = env.unwrapped.session  # type: ignore[attr-defined]
     taken_over.reset(seed=5)
     project = neuros.Project.from_file(EXAMPLE)
@@ -113,7 +113,7 @@ def test_the_policy_of_the_project_gives_the_packets_of_its_own_run(
         for _ in range(5):
             joints = taken_over["cart.joints"].packet
             assert joints == s["cart.joints"].packet
-            force = push(weights, joints.position, joints.velocity)
+            force = push(layers, joints.position, joints.velocity)
             taken_over.send("cart.force", Float64(data=force))
             taken_over.step()
             s.step()
@@ -308,3 +308,43 @@ def test_a_policy_is_learnt_in_two_minutes_and_balances_as_a_node(tmp_path: Path
         run = project.run(backend="in-process", duration="10sim", seed=seed).check()
         assert run.node_results["policy"]["upright_s"] > 9.9
     assert before.node_results["policy"]["upright_s"] < 3.0
+
+
+def test_a_network_that_stable_baselines3_has_trained_balances_as_a_node(tmp_path: Path) -> None:
+    assert _upright_s(EXAMPLE, tmp_path, seeds=(1, 2, 3)) == [pytest.approx(10.0, abs=0.1)] * 3
+
+
+@pytest.mark.acceptance
+def test_stable_baselines3_trains_it_in_two_minutes_and_the_node_acts_as_its_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("stable_baselines3", reason="pip install torch stable-baselines3")
+    made = shutil.copytree(EXAMPLE, tmp_path / "cartpole")
+    monkeypatch.syspath_prepend(str(made))
+    import policy
+    import train_sb3
+
+    env = train_sb3.make_flat()
+    try:
+        model = train_sb3.learn(env)
+    finally:
+        env.close()
+    train_sb3.write(made / "network.npz", model)
+    layers = policy.read(made / "network.npz")
+    for seen in np.random.default_rng(1).normal(0.0, 0.3, (100, 4)):
+        force = policy.push(layers, seen[:2], seen[2:])
+        assert force == pytest.approx(model.predict(seen, deterministic=True)[0][0], abs=1e-5)
+    assert min(_upright_s(made, tmp_path, seeds=(1, 2, 3))) > 9.9
+
+
+def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]:
+    """For how long the network of an example keeps the pole upright in 10 s of simulated time."""
+    project = neuros.Project.from_file(example)
+    network = project.with_settings({"nodes.policy.environment.POLICY": "network.npz"})
+    runs = [
+        network.run(
+            backend="in-process", duration="10sim", seed=seed, output=folder / f"run{seed}"
+        ).check()
+        for seed in seeds
+    ]
+    return [run.node_results["policy"]["upright_s"] for run in runs]

@@ -1,4 +1,9 @@
-"""Balances the pole with what train.py has learnt: four weights in weights.txt."""
+"""Balances the pole with the policy of the file POLICY.
+
+weights.txt has the four weights that train.py has learnt, network.npz the network of train_sb3.py.
+"""
+
+import os
 
 import numpy as np
 
@@ -8,9 +13,27 @@ RATE_HZ = 50
 FALLEN_RAD, END_M = 0.2, 2.4
 
 
-def push(weights, position, velocity):
+def linear(weights):
+    """A policy that weighs the positions and velocities of cart and pole: one layer."""
+    return [(np.reshape(weights, (1, 4)), np.zeros(1))]
+
+
+def read(file):
+    """The layers of a policy, weights and biases each, from the first to the last."""
+    if file.suffix == ".txt":
+        return linear(np.loadtxt(file))
+    with np.load(file) as arrays:
+        count = len(arrays.files) // 2
+        return [(arrays[f"weights{n}"], arrays[f"biases{n}"]) for n in range(count)]
+
+
+def push(layers, position, velocity):
     """The force, from -1 to 1, for positions and velocities of cart and pole."""
-    return float(np.clip(weights @ np.concatenate([position, velocity]), -1.0, 1.0))
+    values = np.concatenate([position, velocity])
+    for weights, biases in layers[:-1]:
+        values = np.tanh(weights @ values + biases)
+    weights, biases = layers[-1]
+    return float(np.clip(weights @ values + biases, -1.0, 1.0)[0])
 
 
 def has_fallen(position):
@@ -20,7 +43,8 @@ def has_fallen(position):
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data({"weights": np.loadtxt(node.resolve_path("weights.txt")), "upright": 0})
+    layers = read(node.resolve_path(os.environ["POLICY"]))
+    node.set_user_data({"layers": layers, "upright": 0})
 
 
 @neuros_function(inputs="joints", outputs="force")
@@ -28,7 +52,7 @@ def act(node, joints):
     own = node.get_user_data()
     own["upright"] += not has_fallen(joints.position)
     force = node.make_packet("force")
-    force.data = push(own["weights"], joints.position, joints.velocity)
+    force.data = push(own["layers"], joints.position, joints.velocity)
     return force
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from policy import has_fallen, push
+from policy import has_fallen, linear, push
 
 import neuros.gym
 
@@ -35,7 +35,7 @@ def steps_upright(env, weights, seed):
     """Steps until the pole falls, or the episode is over."""
     seen, _ = env.reset(seed=seed)
     for step in range(1, STEPS + 1):
-        force = push(weights, seen[POSITION], seen[VELOCITY])
+        force = push(linear(weights), seen[POSITION], seen[VELOCITY])
         seen, _, has_ended, is_over, _ = env.step([force])
         if has_ended or is_over:
             return step
