@@ -76,6 +76,9 @@ class Transport(Protocol):
     def note_execution(self) -> None:
         """A hook has ended: what has reached the node meanwhile comes before the next one."""
 
+    def give_way(self) -> None:
+        """That hook took long: what waits for other nodes of this process comes first, too."""
+
     def has_taken_in(self) -> bool:
         """Whether that has been handled."""
 

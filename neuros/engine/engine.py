@@ -26,6 +26,8 @@ from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node
 
+_LONG_NS = 1_000_000  # as long as a turn of events: see neuros.transport.ros_loop
+
 
 class Effects(Links, Protocol):
     """The only way out of an engine: its calls are all that the engine does to the world."""
@@ -38,6 +40,9 @@ class Effects(Links, Protocol):
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook of the plugin; raises ``HookError``."""
+
+    def give_way(self) -> None:
+        """A hook has taken long: let the other nodes of the process go on before the next one."""
 
     def post(self, event: Callable[[], None]) -> None:
         """Have a delivery to the node itself handled after all events that already wait."""
@@ -382,6 +387,8 @@ class Engine:
             self.since_ns = end_ns
             if not self.execution_log.is_full:
                 self.execution_log.note_execution(hook, start_ns, end_ns)
+        if end_ns - start_ns > _LONG_NS:
+            self._effects.give_way()
         for output, packet in hook.packets_of(result):
             self._send(output, packet, self.since_ns)
         if isinstance(hook, Source):

@@ -53,6 +53,7 @@ class NodeEffects:
         self.acknowledger = transport.acknowledger
         self.has_taken_in = transport.has_taken_in
         self._note_execution = transport.note_execution
+        self.give_way = transport.give_way
         self._instruments = instruments
         self._sent: dict[str, Tap] = {}
         self._taps_to_itself: dict[Connection, Tap] = {}

@@ -48,7 +48,7 @@ class StepLoop:
     has_taken_in = True
 
     def __init__(self, clock: ManualClock) -> None:
-        self.clock = clock
+        self._clock = clock
         self._events: deque[Event] = deque()
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._is_stopping = False
@@ -85,7 +85,7 @@ class StepLoop:
 
     def advance_to(self, time_ns: int) -> None:
         """Set the clock, and run the timers that are due then."""
-        self.clock.now_ns = time_ns
+        self._clock.now_ns = time_ns
         for next_due_ns, on_due in self._timers:
             due_ns = next_due_ns()
             if due_ns is not None and due_ns <= time_ns:
@@ -255,7 +255,7 @@ class Workbench(WithoutPeers):
         self.loop = loop
         self.topics = topics
         self.packets = RosPackets()
-        self.hub = MemoryHub(loop, self.packets.copy, loop.clock)
+        self.hub = MemoryHub(loop, self.packets.copy)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 

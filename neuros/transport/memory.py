@@ -9,14 +9,11 @@ from __future__ import annotations
 from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Sequence
-from time import monotonic_ns
 from typing import Any, Protocol
 
 from neuros.ports import EventLoop, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.ownership import Given
-
-_LONG_NS = 1_000_000  # as long as a turn of events: see neuros.transport.ros_loop
 
 
 class GraphBridge(Protocol):
@@ -38,7 +35,6 @@ class MemoryHub:
     Args:
         loop: where packets and acknowledgements are events.
         copy: what it returns must share nothing with its argument.
-        clock: monotonic, in nanoseconds.
 
     Attributes:
         arrivals: what is on its way to each node.
@@ -48,12 +44,10 @@ class MemoryHub:
         self,
         loop: EventLoop,
         copy: Callable[[Any], Any],
-        clock: Callable[[], int] = monotonic_ns,
     ) -> None:
         self.loop = loop
         self.post = loop.post
         self.copy = copy
-        self.clock = clock
         self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self.inboxes: dict[str, Inbox] = {}
         self._links: dict[Connection, MemoryLink] = {}
@@ -106,7 +100,6 @@ class MemoryTransport:
         self._hub = hub
         self._bridge = bridge
         self._is_open = False
-        self._start_ns = 0
         self._is_turn_of_others = False
         self._given = Given()
         self.watched = self._given.watched
@@ -158,27 +151,25 @@ class MemoryTransport:
         return acknowledge_if_open
 
     def note_execution(self) -> None:
-        """A hook has ended: what is on its way here comes before the next one.
-
-        After one that took long, so does what waits for the other nodes, and what comes of it: they
-        share one thread, and ticks that are always overdue would have it for themselves.
-        """
+        """A hook has ended: what is on its way here comes before the next one."""
         self._arrivals.first = self._arrivals.sent
-        is_long = self._hub.clock() - self._start_ns > _LONG_NS
-        if is_long and self._loop.has_waiting_events:
-            self._is_turn_of_others = True
-            self._hub.post(self._end_turn_of_others)
         self._loop.note_execution()
 
+    def give_way(self) -> None:
+        """What waits for the other nodes comes before the next hook, and what they answer.
+
+        All share one thread, and ticks that are always overdue would have it for themselves.
+        """
+        if self._loop.has_waiting_events:
+            self._is_turn_of_others = True
+            self._hub.post(self._end_turn_of_others)
+
     def has_taken_in(self) -> bool:
-        is_next = (
+        return (
             self._arrivals.arrived >= self._arrivals.first
             and not self._is_turn_of_others
             and self._loop.has_taken_in
         )
-        if is_next:
-            self._start_ns = self._hub.clock()
-        return is_next
 
     def _end_turn_of_others(self) -> None:
         self._is_turn_of_others = False

@@ -79,6 +79,8 @@ class _NullTransport:
 
     def note_execution(self) -> None: ...
 
+    def give_way(self) -> None: ...
+
     def watched(self, function: HookFunction) -> HookFunction:
         return function
 

@@ -203,6 +203,9 @@ class RosTransport:
     def note_execution(self) -> None:
         self._loop.note_execution()
 
+    def give_way(self) -> None:
+        """No other node is in this process."""
+
     def has_taken_in(self) -> bool:
         return self._loop.has_taken_in
 

@@ -69,6 +69,8 @@ class NetworkNode:
             functools.partial(sender.engine.on_acknowledgement, connection, position),
         )
 
+    def give_way(self) -> None: ...
+
     def has_taken_in(self) -> bool:
         return True
 

@@ -40,6 +40,8 @@ class Written:
     def has_taken_in(self) -> bool:
         return True
 
+    def give_way(self) -> None: ...
+
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
         return lambda position: self.log.append(("acknowledge", str(connection), position))
 

@@ -278,3 +278,10 @@ def test_what_a_node_sends_itself_is_taken_in_before_the_next_hook_too():
         bench.posted_event()
         assert len(bench.waiting) <= 3
     assert {"send", "take"} <= set(bench.ran[-3:])
+
+
+def test_a_hook_that_takes_more_than_a_millisecond_gives_way_to_other_nodes():
+    bench = Bench(function("f", "x"), connections=[wire(A)])
+    for bench.hook_s, ways_given in (0.001, 0), (0.0011, 1), (0.0, 1):
+        assert bench.packet(A) == ["f"]
+        assert bench.ways_given == ways_given

@@ -105,6 +105,8 @@ class ModelNode:
     def has_taken_in(self) -> bool:
         return True
 
+    def give_way(self) -> None: ...
+
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         if self.is_over:
             raise Broken(f"hook {self.name}.{hook.name} starts after the end")

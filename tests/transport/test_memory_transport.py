@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import pytest
-
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench
@@ -18,8 +16,7 @@ class MemoryNetwork:
     """Nodes in one process, on a loop that goes step by step."""
 
     def __init__(self, files: Sequence[NodeFile]) -> None:
-        self.clock = ManualClock()
-        self.loop = StepLoop(self.clock)
+        self.loop = StepLoop(ManualClock())
         bench = Workbench(self.loop, Topics(), [])
         self._transports = {file.node.name: bench.transport(file) for file in files}
 
@@ -48,22 +45,27 @@ class TestMemoryTransport(TransportChecks):
         return MemoryNetwork(files)
 
 
-@pytest.mark.parametrize("takes_ns", [1_000, 2_000_000], ids=["short", "long"])
-def test_after_a_long_hook_what_waits_for_other_nodes_comes_first_and_what_they_answer(
-    takes_ns: int,
-) -> None:
+def test_who_gives_way_starts_after_what_waits_for_other_nodes_and_what_they_answer() -> None:
     with TransportBench(MemoryNetwork, wire("a.out -> b.in", 0), wire("c.out -> b.in", 0)) as bench:
         network, (from_a, from_c) = bench.network, bench.connections
         assert isinstance(network, MemoryNetwork)
         bench.meet()
         bench.inboxes["b"].on_arrival = lambda *_: bench.acknowledge(from_c, 1)
         busy = network.transport("c")
-        assert busy.has_taken_in()
         bench.send(1, from_a)
-        network.clock.now_ns += takes_ns
         busy.note_execution()
+        assert busy.has_taken_in()
+        busy.give_way()
         may_start = [busy.has_taken_in()]
         while network.loop.step():
             may_start.append(busy.has_taken_in())
-        # At first, after the packet for b, (after the turn of the others,) after the answer to c.
-        assert may_start == ([False, False, False, True] if takes_ns > 1_000_000 else [True] * 3)
+        # At first, after the packet for b, after the turn of the others, after the answer to c.
+        assert may_start == [False, False, False, True]
+
+
+def test_with_nothing_under_way_it_starts_at_once() -> None:
+    with TransportBench(MemoryNetwork) as bench:
+        bench.meet()
+        busy = bench.network.transport("c")
+        busy.give_way()
+        assert busy.has_taken_in()
