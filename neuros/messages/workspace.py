@@ -91,6 +91,12 @@ class Workspaces:
         except CycleError:
             return None
 
+    def definition(self, package: str, name: str) -> Path | None:
+        """The ``.msg`` file of a message, ``None`` if it is not in a workspace."""
+        if name not in (self.messages(package) or ()):
+            return None
+        return self.packages[package].folder / "msg" / f"{name}.msg"
+
     def builds(self, names: Iterable[str]) -> list[Built]:
         """Packages and all that they depend on, built or not, as :meth:`closure` orders them."""
         packages = self.closure(names)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from neuros.errors import Problem
+from neuros.project.message_fields import misfit
 from neuros.project.message_types import normalised
 from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element
@@ -16,7 +17,7 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 ARRAYS: Mapping[str, str] = {
     **{
         f"std_msgs/msg/{kind}MultiArray": "data"
-        for kind in ("Byte", *(f"{sign}Int{n}" for sign in ("", "U") for n in (8, 16, 32, 64)))
+        for kind in (f"{sign}Int{n}" for sign in ("", "U") for n in (8, 16, 32, 64))
     },
     "std_msgs/msg/Float32MultiArray": "data",
     "std_msgs/msg/Float64MultiArray": "data",
@@ -43,7 +44,7 @@ def dashboard_of(parsed: ParsedProject) -> Mapping[str, Any] | None:
 
 
 def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
-    """Panels that occur twice, keys without meaning, and outputs that do not fit."""
+    """Panels that occur twice, keys without meaning, outputs and fields that do not fit."""
     dashboard = parsed.root.member("dashboard")
     types = _types(parsed) if dashboard is not None else {}
     seen: set[str] = set()
@@ -68,6 +69,8 @@ def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
         for output in (*named, *panel.items("outputs")):
             if output is not None and isinstance(output.value, str):
                 yield from _misfit(kind, panel, output, types, is_complete=parsed.is_complete)
+        for element in {"activity": [panel], "series": panel.items("fields")}.get(kind, ()):
+            yield from _field_misfit(element, types, parsed, wants_array=kind == "activity")
 
 
 _ALL_KEYS = {key for needed, allowed in _KEYS.values() for key in (*needed, *allowed)}
@@ -103,3 +106,14 @@ def _misfit(
     elif kind == "activity" and type_name not in (SPIKES, *ARRAYS) and "field" not in panel.value:
         text = f"which array of {type_name} is to be drawn?"
         yield panel.problem(text, "name it with 'field', as \"data\"")
+
+
+def _field_misfit(
+    element: Element, types: Mapping[str, str], parsed: ParsedProject, *, wants_array: bool
+) -> Iterator[Problem]:
+    """A field that the messages of the output do not have, or that cannot be drawn."""
+    path, type_name = element.string("field"), types.get(element.string("output") or "", "")
+    if path and normalised(type_name):
+        wrong = misfit(type_name, path, parsed.roots.packages, wants_array=wants_array)
+        if wrong is not None:
+            yield element.value["field"].problem(*wrong)

@@ -30,6 +30,9 @@ class MessagePackages(Protocol):
     def installed(self, package: str) -> Path | None:
         """The folder that it is, or will be, built into, ``None`` if there is no such package."""
 
+    def definition(self, package: str, name: str) -> Path | None:
+        """The ``.msg`` file of a message, ``None`` if there is none."""
+
 
 class NoPackages:
     """There are none (:class:`MessagePackages`)."""
@@ -38,6 +41,9 @@ class NoPackages:
         return None
 
     def installed(self, package: str) -> None:
+        return None
+
+    def definition(self, package: str, name: str) -> None:
         return None
 
 

@@ -50,6 +50,9 @@ class ArmPackage:
     def installed(self, package: str) -> Path | None:
         return self.folder if package == "arm_msgs" else None
 
+    def definition(self, package: str, name: str) -> Path | None:
+        return self.folder / "msg" / f"{name}.msg" if package == "arm_msgs" else None
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Folder:
