@@ -10,20 +10,25 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 _HEAD = """\
 # Made by `neuros types`: the fields of {package}'s messages. Make it again when those change.
-from array import array
-from collections.abc import Sequence
-from typing import Any, ClassVar
-
-import numpy as np
-{imports}
 """
-# PEP 484: so the modules that have no stubs, such as srv, are not taken for missing.
+# Names that annotations may use, and their imports.
+_IMPORTS = {
+    " array[": "from array import array",
+    "Sequence[": "from collections.abc import Sequence",
+    "Any": "from typing import Any",
+    "ClassVar[": "from typing import ClassVar",
+    "np.": "import numpy as np",
+}
+# PEP 484: so the modules that have no stubs, such as srv, are not taken for missing. Pyright asks
+# for a file of each, too.
 _OTHER_MODULES = """\
+# pyright: reportIncompleteStub=false
 from typing import Any
 
 def __getattr__(name: str) -> Any: ...
@@ -64,7 +69,11 @@ def write_stubs(types: Iterable[str], folder: Path) -> list[Path]:
     for package, text in sorted(done.items()):
         file = folder / package / "msg" / "__init__.pyi"
         file.parent.mkdir(parents=True, exist_ok=True)
-        (folder / package / "__init__.pyi").write_text(_OTHER_MODULES, "utf-8")
+        for module in ("", "srv", "action"):
+            if not module or find_spec(f"{package}.{module}"):
+                other = folder / package / module / "__init__.pyi"
+                other.parent.mkdir(exist_ok=True)
+                other.write_text(_OTHER_MODULES, "utf-8")
         file.write_text(text, "utf-8")
         files.append(file)
     return files
@@ -78,12 +87,13 @@ def _stub(package: str) -> tuple[str, set[str]]:
     fields = {each: each.get_fields_and_field_types() for each in classes}
     elements = (_parts(kind)[1] for types in fields.values() for kind in types.values())
     needed = {element.partition("/")[0] for element in elements if "/" in element} - {package}
-    imports = "".join(f"\nimport {each}.msg" for each in sorted(needed))
-    text = _HEAD.format(package=package, imports=imports)
+    text = ""
     for each in classes:
         lines = [*_constants(each), *_fields(fields[each], package)]
         text += f"\nclass {each.__name__}:\n" + "".join(f"    {line}\n" for line in lines)
-    return text, needed
+    imports = [line for use, line in _IMPORTS.items() if use in text]
+    imports += [f"import {each}.msg" for each in sorted(needed)]
+    return "\n".join([_HEAD.format(package=package) + "\n".join(imports), text]), needed
 
 
 def _constants(message: Any) -> Iterator[str]:

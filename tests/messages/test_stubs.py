@@ -105,6 +105,17 @@ def test_every_message_of_ros_has_a_stub_that_is_right(
     assert checked(*files, monkeypatch=monkeypatch, stubs=tmp_path) == []
 
 
+def test_pyright_finds_services_beside_the_stubs_and_no_import_without_use(tmp_path: Path) -> None:
+    write_stubs(["sensor_msgs/msg/Imu"], tmp_path)
+    assert (tmp_path / "sensor_msgs/srv/__init__.pyi").is_file()
+    assert not (tmp_path / "builtin_interfaces/srv").exists()
+    for file in tmp_path.rglob("msg/__init__.pyi"):
+        text = file.read_text()
+        for name in re.findall(r"^(?:from .+ )?import ([\w.]+)(?: as np)?$", text, re.MULTILINE):
+            used = {"numpy": "np"}.get(name, name)
+            assert re.search(rf"(?<![\w.]){re.escape(used)}[\[.\],]", text), (file, name)
+
+
 def test_a_folder_that_cannot_be_written_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
