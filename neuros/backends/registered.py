@@ -39,12 +39,12 @@ def choose(
     if wanted != AUTO:
         back_end = BACK_ENDS.load(wanted)
         _check_names(back_end, options)
-        return Chosen(back_end, back_end.prepare(project, nodes, _values(back_end, options)))
+        return Chosen(back_end, back_end.prepare(project, nodes, option_values(back_end, options)))
     candidates, notices = _candidates()
     reasons: list[tuple[BackEnd, str]] = []
     for back_end in candidates:
         try:
-            deployment = back_end.prepare(project, nodes, _values(back_end, options))
+            deployment = back_end.prepare(project, nodes, option_values(back_end, options))
         except EnvironmentFault as fault:
             reasons.append((back_end, back_end.why_not(fault)))
             continue
@@ -66,7 +66,7 @@ def _check_names(back_end: BackEnd, options: Mapping[str, Any]) -> None:
             )
 
 
-def _values(back_end: BackEnd, options: Mapping[str, Any]) -> dict[str, Any]:
+def option_values(back_end: BackEnd, options: Mapping[str, Any]) -> dict[str, Any]:
     """The value of each option of a back end: what is given, the environment's, the default."""
     return {each.name: each.value(options.get(each.name)) for each in back_end.options}
 

@@ -22,7 +22,7 @@ from neuros.api.loading import load_with_messages
 from neuros.backends.domain import choose_domain
 from neuros.backends.machines.deployment import Machines
 from neuros.backends.placement import usable_cores
-from neuros.backends.registered import BACK_ENDS
+from neuros.backends.registered import BACK_ENDS, option_values
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine
@@ -59,7 +59,7 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
     project = load_with_messages(PROJECT)[0].project
     for back_end in sorted(back_ends, key=lambda each: each.rank or 0):
         try:
-            back_end.prepare(project, project.nodes, {})
+            back_end.prepare(project, project.nodes, option_values(back_end, {}))
         except EnvironmentFault as fault:
             yield Finding.absent(
                 "delivery", f"{back_end.name}: not tried: {back_end.why_not(fault)}"
