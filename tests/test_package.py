@@ -8,13 +8,19 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import time
 import zipfile
 from collections.abc import Iterator, Mapping
 from email.parser import HeaderParser
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from launching import start
+from PIL import Image, ImageChops
+from viewers.dashboard.browser import browser_page
+from viewers.dashboard.visitor import address
 
 from neuros.backends.environments.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
@@ -24,6 +30,8 @@ from neuros.installation.progress import Progress
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ("containers", "examples", "schema", "workspace")
 SOURCES = ("neuros", *DATA, "tests/integration/back_ends")
+SCREENSHOTS = ROOT / "build" / "screenshots"
+IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 2"
 FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
 PYTHONS = [(3, minor) for minor in range(10, NEWEST_FOR_NEST[1] + 1)]
 _DIGESTS = """
@@ -158,6 +166,52 @@ class TestInstalled:
             assert ": valid: " in said
 
 
+def see_a_robot_that_turns(project: Path, environ: Mapping[str, str], screenshots: Path) -> None:
+    """Launch with the dashboard, and look at its page in a browser until the robot has turned.
+
+    The pictures, of before and after, are for whoever releases.
+    """
+    program = shutil.which("neuros", path=environ["PATH"])
+    assert program is not None
+    lasting = ("--set", "nodes.robot.environment.DURATION=1000")
+    screenshots.mkdir(parents=True, exist_ok=True)
+    with (
+        start(
+            project,
+            *("--dashboard", "--backend", "process", *lasting),
+            cwd=project.parent,
+            program=(program, "launch"),
+            PATH=environ["PATH"],
+        ) as running,
+        browser_page() as page,
+    ):
+        page.set_default_timeout(120_000)  # without a graphics card
+        page.on("dialog", lambda question: question.accept())
+        page.goto(address(running))
+        page.wait_for_function(IS_DRAWN)
+        page.click("#pause")
+        page.wait_for_selector("#phase.paused")
+        view = page.locator("#world canvas")
+        before = view.screenshot()
+        page.screenshot(path=screenshots / "before.png")
+        page.click("#resume")
+        page.wait_for_selector("#phase.running")
+        give_up_s = time.monotonic() + 120
+        while differing_pixels(before, view.screenshot()) < 100:
+            assert time.monotonic() < give_up_s, "the robot does not move"
+        page.screenshot(path=screenshots / "after.png")
+        page.click("#stop")
+        page.wait_for_selector("#phase.ended")
+        assert running.finish().exit_code == 0
+
+
+def differing_pixels(one: bytes, other: bytes) -> int:
+    """How many pixels of two pictures (PNG) are of another colour."""
+    pictures = [Image.open(BytesIO(each)).convert("RGB") for each in (one, other)]
+    difference = ImageChops.difference(*pictures).convert("L")
+    return sum(difference.histogram()[40:])
+
+
 @pytest.mark.acceptance
 @pytest.mark.ros
 @pytest.mark.parametrize("version", PYTHONS, ids=lambda version: ".".join(map(str, version)))
@@ -178,6 +232,9 @@ def test_three_commands_lead_to_a_robot_that_moves(
     log = tmp_path / "log"
     assert not run_installs(made / "bin" / "python", uv, wanted, made, log, progress, environ)
     run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
+    see_a_robot_that_turns(
+        tmp_path / "whiskeye", environ, SCREENSHOTS / ".".join(map(str, version))
+    )
     command = ("neuros", "launch", "whiskeye", "--backend", "process", "-o", "run")
     assert "head-direction error: RMS" in run(*command, cwd=tmp_path, environ=environ)
     for example in ("clock", "voting", "elevator"):
