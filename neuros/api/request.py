@@ -52,8 +52,9 @@ class ProjectOptions:
         is_repeatable=True,
         metavar="PATH=VALUE",
         help="change a key of the project: nodes.NAME.KEY...=VALUE,"
-        " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE; VALUE is JSON if it parses,"
-        " else text, and always text in environment; without VALUE the key is removed",
+        " connections.SRC.OUT.DST.IN.KEY=VALUE or budgets.KEY=VALUE; VALUE is read as JSON, or as"
+        " text if it is no JSON; in environment it is always text; PATH= without a VALUE removes"
+        " the key",
     )
     namespace: str | None = option(
         "--namespace",
@@ -94,16 +95,16 @@ class Request(ProjectOptions):
         parse=int,
         metavar="ID",
         page="command_line.md#ros-domain",
-        default_help="ROS_DOMAIN_ID; else 0 where the project has external topics, or -n or"
-        " --network is used; else the first free one of 1 to 101",
+        default_help="ROS_DOMAIN_ID; else 0 for a project with external topics, or with -n or"
+        " --network; else the first free domain from 1 to 101",
         help="use this ROS domain",
     )
     network: bool = option(
         "--network",
         default=False,
         page="network.md",
-        help="connect to nodes on other machines of the network, instead of this machine only;"
-        " every machine of the network can then read and send packets",
+        help="also connect to nodes on other machines; every machine of the network can then read"
+        " and send packets of the run",
     )
     peers: str | None = option(
         "--peers",
@@ -118,24 +119,24 @@ class Request(ProjectOptions):
         metavar="SECONDS",
         default_help="wait for ever",
         page="network.md#how-it-ends",
-        help="end with exit code 4 if a node elsewhere that a connection leads to was not found"
-        " after this time",
+        help="end with exit code 4 if a node that runs elsewhere, and that a connection leads to,"
+        " was not found within this time",
     )
     deployment: str | os.PathLike[str] | None = option(
         "--deployment",
         metavar="FILE",
         is_recorded=False,
         page="deployment.md",
-        help="run nodes on the machines that this file names for them, which are reached by ssh;"
-        " the others run here, and so does everything else",
+        help="run nodes on the machines that this file gives them, over ssh; all other nodes, and"
+        " all other processes of the run, stay on this machine",
     )
     isolate: bool = option(
         "--isolate",
         default=False,
         page="security.md#a-network-of-the-runs-own",
         help="give the run a network of its own, so that no other program of this machine can read"
-        " or send its packets; impossible with nodes elsewhere or external inputs, and from Python"
-        " possible with the back end docker only",
+        " or send its packets; not possible with nodes elsewhere or with external inputs; from"
+        " Python, only with the back end docker",
     )
     backend: str | None = option(
         "--backend",
@@ -146,7 +147,7 @@ class Request(ProjectOptions):
         page="back_ends.md",
         help="run nodes on this back end: each in a container (docker), each in a process"
         " (process), or all in one process (in-process); auto: docker where an engine has the"
-        " images, else process; other distributions may add back ends",
+        " images, else process; other Python packages may add back ends",
     )
     backend_options: Mapping[str, Any] | None = option(
         page="back_ends.md",
@@ -156,8 +157,8 @@ class Request(ProjectOptions):
         "--duration",
         metavar="SECONDS",
         default_help="no limit",
-        help="end the run this long after the first hook started, when packets under way have"
-        " arrived: 30 seconds, or 30sim in simulated time",
+        help="end the run this long after its first hook started, and let packets under way"
+        " arrive: 30 means seconds, 30sim simulated seconds",
     )
     output: str | os.PathLike[str] | None = option(
         "-o",
@@ -178,16 +179,17 @@ class Request(ProjectOptions):
         "--monitor-system-load",
         default=False,
         page="command_line.md#system-load",
-        help="once per second, write the use of processor, memory, network and threads by the"
-        " machine and by each node to system_load.csv in the run folder",
+        help="write the load of the machine and of each node to system_load.csv in the run"
+        " folder, once per second: processor, memory, network, threads",
     )
     digests: bool = option(
         "--digests",
         default=False,
         page="command_line.md#neuros-verify",
-        help="keep a digest of every packet, for `neuros verify`. Other back ends always do;"
-        " in-process must serialise packets for it, and without this option keeps digests only if"
-        " all connections are lossless and it costs under 2 %% of the processor time",
+        help="keep a digest of every packet, for `neuros verify`. All back ends but in-process"
+        " always do that. In-process must serialise packets for it; without this option, it keeps"
+        " digests only if all connections are lossless and digests take under 2 %% of the"
+        " processor time",
     )
     record: bool | Sequence[str] = option(
         "-r",
@@ -204,8 +206,8 @@ class Request(ProjectOptions):
         metavar="NAME",
         group=_RECORDING,
         page="recording.md",
-        help="record this topic, which need not be one of the project; without -r, record nothing"
-        " else",
+        help="record this topic, of the project or not; without -r, only the topics of -t are"
+        " recorded",
     )
     exclude: Sequence[str] = option(
         "--exclude",
@@ -225,13 +227,17 @@ class Request(ProjectOptions):
         "--progress",
         is_negatable=True,
         is_recorded=False,
-        default_help="on if it is known when the run ends",
+        default_help="on if the run has a known end",
         page="command_line.md#progress",
         help="show the progress of the run: in a terminal on the last line, elsewhere on a new"
         " line every 10 s",
     )
     verbose: bool = option(
-        "-v", "--verbose", default=False, is_recorded=False, help="show DEBUG records, too"
+        "-v",
+        "--verbose",
+        default=False,
+        is_recorded=False,
+        help="also show log records of the severity DEBUG",
     )
 
     def __post_init__(self) -> None:
@@ -275,16 +281,17 @@ class LaunchOptions(Request):
         metavar="NAME",
         is_recorded=False,
         page="dashboard.md#viewers",
-        help="show the run with this viewer: dashboard, rqt_graph, rviz2 or rerun; other"
-        " distributions may add viewers",
+        help="show the run with this viewer: dashboard, rqt_graph, rviz2 or rerun; other Python"
+        " packages may add viewers",
     )
     dashboard: bool = option(
         "--dashboard",
         default=False,
         is_recorded=False,
         page="dashboard.md",
-        help="serve a page on 127.0.0.1 that shows the run in a browser: live graph, fields over"
-        " time, images, logs, load; it can pause, step and stop the run; its address is printed",
+        help="print the address (on 127.0.0.1) of a page that shows the run in a browser: robots"
+        " in 3-D, the graph, packets, images, logs, load; the page can pause, step and stop the"
+        " run",
     )
     dashboard_port: int | None = option(
         "--dashboard-port",
@@ -348,7 +355,7 @@ class ExportOptions(ProjectOptions):
         Request,
         "peers",
         default_help="the names of the containers; with --host-network, multicast finds them",
-        help="name the machines that nodes look for each other on",
+        help="name the machines on which nodes look for each other",
     )
     peer_timeout: int = option(
         "--peer-timeout",
@@ -361,14 +368,13 @@ class ExportOptions(ProjectOptions):
     host_network: bool = option(
         "--host-network",
         default=False,
-        help="have containers use the network of their machine, not one of their own; not for"
-        " kubernetes",
+        help="let containers use the network of their machine; not for kubernetes",
     )
     registry: str | None = option(
         "--registry",
         metavar="PREFIX",
-        help="begin the names of images with this, as in registry.lab/robots, from where other"
-        " machines pull them",
+        help="put this in front of the names of images, so that other machines can pull them:"
+        " registry.lab/robots, for example",
     )
     volume_claim: str | None = option(
         "--volume-claim",
@@ -387,7 +393,7 @@ class ExportOptions(ProjectOptions):
     spread: bool = option(
         "--spread",
         default=False,
-        help="for slurm: run each node of the project on a node of the allocation of its own",
+        help="for slurm: run each node of the project on its own node of the allocation",
     )
 
 
@@ -429,8 +435,8 @@ class SweepOptions:
         "--set",
         is_repeatable=True,
         metavar="PATH=VALUE,...",
-        help="set a key of the project, as for launch, to one value or to several, separated by"
-        " commas outside of brackets and quotes",
+        help="set a key of the project, as launch does, to each of these values; commas separate"
+        " them, but not within brackets or quotes",
     )
     seeds: Iterable[int] = option(
         "--seeds",
@@ -438,8 +444,8 @@ class SweepOptions:
         default=(),
         metavar="SEED,...",
         default_help="as in the files",
-        help="give each of these seeds to every environment variable of a node that has SEED in"
-        " its name",
+        help="run with each of these seeds: every environment variable of a node with SEED in its"
+        " name gets the seed",
     )
     repeat: int = option(
         "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"
@@ -452,7 +458,7 @@ class SweepOptions:
         page="python.md#sweeps-on-a-cluster",
         help="where the runs are made: local (this machine), slurm or slurm=PARTITION (an array"
         " of Slurm jobs), dask=ADDRESS (Dask workers), dask (Dask workers on this machine); other"
-        " distributions may add executors, and Python programs may give any executor of"
+        " Python packages may add executors, and Python programs may pass any executor of"
         " concurrent.futures",
     )
     jobs: int | None = option(

@@ -19,9 +19,9 @@ _EXIT_CODES = {2: 130, 15: 143, 1: 143}
 def add_export(export: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     export.description = (
-        "Write a project as files with which Docker Compose, Docker Swarm or Kubernetes start its"
-        " nodes, a container for each, without NeuROS on the machine; or as a batch script that"
-        " launches it on Slurm."
+        "Write the files with which Docker Compose, Docker Swarm or Kubernetes start a project,"
+        " without NeuROS on their machines; each node gets a container. Or write a batch script"
+        " that launches the project on Slurm."
     )
     export.add_argument("form", choices=FORMS, help="for which engine")
     add_project(export, ExportOptions)

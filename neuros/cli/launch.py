@@ -228,7 +228,7 @@ def add_sweep(command: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     command.description = (
         "Run a project with every combination of values and seeds, and write one"
-        " table (sweep.csv). What has finished before in the same folder is not run again."
+        " table (sweep.csv). Runs that have already finished in the same folder are not repeated."
     )
     command.epilog = _SWEEP_EPILOG
     command.add_argument(

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from neuros.control import NodeStatus
     from neuros.project.model import NodeFile
 
-_RUN = "as `neuros ps` shows it (its first digits are enough), or a project"
+_RUN = "the id that `neuros ps` shows (its first digits are enough), or the name of a project"
 _ECHO_PERIOD_S = 0.1
 _HZ_PERIOD_S = 1.0
 _POLL_S = 0.1
@@ -65,8 +65,8 @@ class _Topic:
 def add_topic(topic: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     topic.description = (
-        "List the topics of a run that goes on, show packets of one, or count them. It needs no"
-        " installation of ROS 2, and does the same for every back end."
+        "List the topics of a run in progress, show the packets of a topic, or count them. This"
+        " needs no installation of ROS 2, and works with every back end."
     )
     actions = topic.add_subparsers(title="actions", metavar="ACTION", required=True)
     show = actions.add_parser("list", help="show topics, their types and connections")
@@ -89,7 +89,7 @@ def add_topic(topic: argparse.ArgumentParser) -> None:
             "--count",
             type=positive_number,
             metavar="N",
-            help="end after so many (default: with the run)",
+            help="show this many, then end (default: all, until the run ends)",
         )
         add_format(action)
         action.set_defaults(command=command)
@@ -244,10 +244,10 @@ def _named(topics: Sequence[_Topic], wanted: str) -> _Topic:
 
 def add_logs(logs: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    logs.description = "Show what the nodes of a run have logged, in the order of time."
-    logs.add_argument("run", metavar="RUN", help=f"a run folder; of a run that goes on, {_RUN}")
+    logs.description = "Show the log records of all nodes of a run, in the order of time."
+    logs.add_argument("run", metavar="RUN", help=f"a run folder; or, for a run in progress, {_RUN}")
     logs.add_argument(
-        "-f", "--follow", action="store_true", help="show what comes, too, until the run has ended"
+        "-f", "--follow", action="store_true", help="go on with new records until the run has ended"
     )
     logs.add_argument(
         "-n",
@@ -256,7 +256,7 @@ def add_logs(logs: argparse.ArgumentParser) -> None:
         default=[],
         dest="nodes",
         metavar="NAME",
-        help="only of this node (repeatable)",
+        help="show only the records of this node (repeatable)",
     )
     logs.set_defaults(command=_logs)
 

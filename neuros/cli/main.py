@@ -46,7 +46,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "new": Command("copies", "make a small project to begin from"),
+    "new": Command("copies", "make a small project to start with"),
     "example": Command("copies", "list the examples, or copy one"),
     "launch": Command("launch", "run a project"),
     "validate": Command("projects", "check a project without running it"),
@@ -55,12 +55,12 @@ COMMANDS = {
     "build": Command("setup", "build message packages"),
     "ps": Command("runs", "show the runs of this user"),
     "stop": Command("runs", "stop a run, as Ctrl+C does"),
-    "topic": Command("live", "show the topics and packets of a run that goes on"),
+    "topic": Command("live", "show the topics and packets of a run in progress"),
     "logs": Command("live", "show what the nodes of a run have logged"),
     "sweep": Command("launch", "run a project with many values and seeds, and make one table"),
     "verify": Command("runs", "compare the packets of two runs"),
-    "report": Command("runs", "say what limited a run, and draw figures of it"),
-    "compare": Command("runs", "show the figures of runs side by side"),
+    "report": Command("runs", "say what limited the speed of a run, and draw figures"),
+    "compare": Command("runs", "show the numbers of several runs side by side"),
     "bag": Command("runs", "show or complete what a run has recorded"),
     "replay": Command("replay", "run one node of a recorded run again, or publish recorded topics"),
     "export": Command("export", "write a project as files for Docker Compose, Swarm or Kubernetes"),
@@ -70,7 +70,7 @@ COMMANDS = {
     "benchmark": Command(
         "checkout", "measure what NeuROS costs, compared with the same program without it"
     ),
-    "reproduce": Command("checkout", "make the published experiments again"),
+    "reproduce": Command("checkout", "repeat the published experiments"),
     "node": Command("node"),
     "part": Command("export"),
     "import-plugin": Command("projects"),
@@ -157,7 +157,7 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     """The parser of the command line; ``command``: with the options of this one alone."""
     result = _Parser(
         prog="neuros",
-        description="Closed loops of simulators, spiking networks and robots, on ROS 2.",
+        description="Run closed loops of simulators, spiking networks and robots on ROS 2.",
         epilog=EXIT_CODES,
         formatter_class=_Formatter,
     )

@@ -62,7 +62,7 @@ def add_stop(stop: argparse.ArgumentParser) -> None:
         nargs="*",
         metavar="RUN",
         help="the id that `neuros ps` shows (its first digits are enough), or the name of a"
-        " project; needless if there is only one run",
+        " project; not needed if there is only one run",
     )
     stop.add_argument("--all", action="store_true", help="stop all runs of this user")
     stop.set_defaults(command=_stop)
@@ -224,7 +224,7 @@ def add_report(report: argparse.ArgumentParser) -> None:
 def add_compare(compare: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     compare.description = (
-        "Print the figures of several runs side by side. A folder that is not of a run is named"
+        "Print the numbers of several runs side by side. A folder that is no run folder is named"
         " and left out (exit code 2)."
     )
     compare.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
@@ -359,8 +359,8 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     verify.description = (
         "Say whether two runs carried the same packets. If not, name the first difference:"
-        " connection, packet and, if both runs were recorded, field. The folder of a run that was"
-        " started in parts is one that holds their run folders."
+        " connection, packet and, if both runs were recorded, field. For a run that was started"
+        " in parts, name a folder that holds the run folders of all parts."
     )
     verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")

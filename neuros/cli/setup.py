@@ -36,8 +36,8 @@ exit codes:
 def add_build(build: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     build.description = (
-        "Build the message packages of a workspace, and those of NeuROS, unless they are built."
-        " `neuros launch` does so, too."
+        "Build the message packages of a workspace, and NeuROS's own, where they are not built"
+        " yet. `neuros launch` does that, too."
     )
     build.epilog = (
         "exit codes: 0 all are built, 2 there is no such package, 3 a file has mistakes (listed"
