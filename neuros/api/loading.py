@@ -133,11 +133,11 @@ def _network_problems(node: Node) -> Iterator[Problem]:
 def _network_doubts(loaded: Loaded) -> Iterator[Problem]:
     for node in loaded.project.nodes:
         if node.module == NETWORK_MODULE and not find_spec("h5py"):
-            hint = f"h5py is not here: {install_command('nir')}"
-            yield _at_network(node, "the network is not checked before it runs", hint)
+            hint = f"h5py is not installed: {install_command('nir')}"
+            yield _at_network(node, "the network cannot be checked before the run", hint)
         if node.module == NETWORK_MODULE and "exporter" not in node.parameters:
-            text = "is stepped by NIR's own equations, and other libraries have others"
-            hint = 'say which: "parameters": {"exporter": "snntorch"}, see docs/nir.md'
+            text = "is stepped by NIR's own equations, but the library that wrote it may use others"
+            hint = 'name that library: "parameters": {"exporter": "snntorch"}, see docs/nir.md'
             yield _at_network(node, text, hint)
 
 

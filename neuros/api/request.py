@@ -415,7 +415,9 @@ def parse_duration(given: float | str | None) -> Duration:
         return Duration()
     match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(sim)?", str(given).strip())
     if match is None or float(match[1]) <= 0:
-        raise UsageError(f"--duration {given}: give seconds, as 30, or 30sim for simulated time")
+        raise UsageError(
+            f"--duration {given}: give seconds, such as 30, or simulated seconds, such as 30sim"
+        )
     seconds = float(match[1])
     return Duration(sim_s=seconds) if match[2] else Duration(wall_s=seconds)
 

@@ -123,7 +123,9 @@ def _values(given: Mapping[str, Any] | Sequence[str] | None) -> dict[str, list[A
     for text in given or ():
         path, listed = parse_values(text)
         if path in values:
-            raise UsageError(f"--set {path}: is given twice; put the values behind one another")
+            raise UsageError(
+                f"--set {path}: is given twice; give it once, with all values separated by commas"
+            )
         values[path] = listed
     return values
 

@@ -155,7 +155,7 @@ def _stop(options: argparse.Namespace) -> int:
     found = sessions()
     chosen = chosen_runs(options.runs, found, is_all=options.all)
     if not chosen:
-        print("none of your runs is running" if found else "nothing is running")
+        print("you have no run in progress" if found else "nothing is running")
     for session in chosen:
         session.interrupt()
     _await_end(chosen)
@@ -179,10 +179,10 @@ def chosen_runs(
         return own
     shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in own)
     if not names:
-        raise UsageError(f"several runs: name one of {shown}, or give --all")
+        raise UsageError(f"several runs are in progress: name one of {shown}, or give --all")
     for name in names:
         if not any(_is_named(session, name) for session in found):
-            raise UsageError(f"no run of yours is called '{name}'; there are {shown or 'none'}")
+            raise UsageError(f"you have no run called '{name}'; yours are: {shown or 'none'}")
     return [session for session in found if any(_is_named(session, name) for name in names)]
 
 

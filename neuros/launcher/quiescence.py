@@ -104,9 +104,9 @@ class Probing:
         ring = cycle(waits(self._probes, self._connections))
         why = "; ".join(f"{node} {reason}" for node, reason in ring) or "no hook can run"
         return (
-            f"deadlock: nothing can ever run again: {why}. Take the returning input in a hook of"
-            " its own without outputs, or make it required with one packet from an initialise"
-            " hook, or omit discard_limit on one connection of the loop"
+            f"deadlock: nothing can ever run again: {why}. To break the loop, take the returning"
+            " input in a separate hook without outputs; or require it, and send a first packet"
+            " from an initialise hook; or leave out discard_limit on one connection of the loop"
         )
 
     def what_is_left(self, now_s: float) -> list[str]:

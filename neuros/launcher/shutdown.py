@@ -95,7 +95,7 @@ class Shutdown:
             number = signal.Signals(self._signals.pop(0))
             name = SIGNAL_NAMES[number]
             if self.phase in (Phase.RUNNING, Phase.DRAINING):
-                self._output.log("INFO", f"{name}: stopping (once more kills at once)")
+                self._output.log("INFO", f"{name}: stopping (a second one kills at once)")
                 self._stop_with(EXIT_CODES[number], f"ended by {name}")
                 self._outcome.is_signalled = True
             elif self.phase is Phase.STOPPING and self._outcome.is_signalled:
@@ -104,7 +104,7 @@ class Shutdown:
                 self._kill_all()
             elif self.phase is Phase.STOPPING:
                 self._outcome.is_signalled = True
-                self._output.log("INFO", f"{name}: already ending (once more kills at once)")
+                self._output.log("INFO", f"{name}: already ending (a second one kills at once)")
 
     def heed_peers(self) -> None:
         """End where the project has ended elsewhere, and as it did there."""

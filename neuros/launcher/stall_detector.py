@@ -294,9 +294,10 @@ class Backlog:
                 self._named.add(key)
                 yield (
                     "WARN",
-                    f"{node} has fallen behind: it has taken nothing in for over {BEHIND_S:g} s,"
-                    f" though packets wait on `{key}`. A callback of its plugin (of a subscription,"
-                    " timer or service) runs for long, or its process gets no processor time",
+                    f"{node} has fallen behind: it has taken in no packet for over {BEHIND_S:g} s,"
+                    f" though packets wait on `{key}`. A callback of its plugin (of a"
+                    " subscription, timer or service) takes long, or its process gets no"
+                    " processor time",
                 )
 
 

@@ -176,7 +176,7 @@ class Supervisor:
                 self._shutdown.fail(f"control channel: {error}")
         elif self._channels.has(link):
             self._channels.hang_up(link)
-            self._output.log("WARN", f"control channel: hung up: {error}")
+            self._output.log("WARN", f"control channel: a connection was closed: {error}")
 
     def _take(self, link: ControlLink, message: Message) -> None:
         match message:

@@ -136,7 +136,9 @@ class ContextSwitch:
     def why_bound(self, context: Context) -> str:
         """Which library holds state of this node outside of its modules; empty if none does."""
         names = [each.name for each in self._owned.values() if each.owner is context]
-        return f"{names[0]} has been imported, whose state is that of the process" if names else ""
+        if not names:
+            return ""
+        return f"a plugin has imported {names[0]}, which keeps its state for the whole process"
 
     def renew(
         self, context: Context, environment: Mapping[str, str], *, forgets_modules: bool

@@ -246,7 +246,7 @@ def _qos_of_connections(parsed: ParsedProject) -> Iterator[Problem]:
         qos = port.member("qos")
         if qos is not None and port.member("external_topic") is None:
             yield qos.key_problem(
-                f"'qos' is for external topics, and this {side[:-1]} has none",
+                f"'qos' is for external topics, but this {side[:-1]} has no external topic",
                 "the QoS of a connection follows from its discard_limit and queue_size",
             )
 
@@ -257,7 +257,8 @@ def _qos_without_effect(parsed: ParsedProject) -> Iterator[Problem]:
         policies = qos and (qos.string("reliability"), qos.string("durability"))
         if qos is not None and policies == ("best_effort", "transient_local"):
             yield qos.problem(
-                "transient_local has no effect with best_effort: who comes later gets nothing",
+                "transient_local has no effect with best_effort: a subscriber that comes later"
+                " gets nothing",
                 "make it reliable",
             )
 
@@ -274,8 +275,8 @@ def _rules_without_sense(parsed: ParsedProject) -> Iterator[Problem]:
             )
         if names.full(old, only).startswith(f"{names.namespace}{INTERNAL}"):
             yield remap.value[rule].key_problem(
-                f"'{old}' is a topic of NeuROS's own, which keeps its name",
-                "a namespace moves all of them",
+                f"'{old}' is an internal topic of NeuROS and cannot be renamed",
+                "a namespace moves all internal topics",
             )
 
 

@@ -108,11 +108,11 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
             continue
         ways = [key for key in ("ssh", "through") if key in host.value]
         if name == HERE and ways:
-            text = f"'{HERE}' is the machine that launches, and is not reached by '{ways[0]}'"
+            text = f"'{HERE}' is the launching machine, which needs no '{ways[0]}'"
             hint = "give the other machine another name"
             found.append(host.value[ways[0]].key_problem(text, hint))
         elif name != HERE and len(ways) != 1:
-            text = "needs exactly one of 'ssh' and 'through', which say how it is reached"
+            text = "needs exactly one of 'ssh' and 'through', which say how to reach it"
             found.append(host.problem(text, f"this machine is '{HERE}'"))
         elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
             found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))

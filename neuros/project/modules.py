@@ -36,7 +36,7 @@ def why_not(name: str) -> tuple[str, str]:
     if not there:
         return (
             f"there is neither a file '{name}' nor an installed module of that name",
-            "pip install what has it, or write the path of a file, as plugin.py",
+            "install its package with pip, or write the path of a file, such as plugin.py",
         )
     package, locations = there[-1].name, there[-1].submodule_search_locations or []
     names = [f"{package}.{each.name}" for each in pkgutil.iter_modules(locations)]

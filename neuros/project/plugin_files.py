@@ -194,7 +194,7 @@ class _Reader:
                 continue
             name, line = statement.name, statement.lineno
             if name in lines:
-                text = f"hook '{name}' is lost: line {line} defines another '{name}'"
+                text = f"hook '{name}' never runs: line {line} defines another '{name}'"
                 self._plugin.doubts.append(Remark(lines.pop(name), 1, text))
             if isinstance(statement, _FUNCTIONS) and self._read_function(statement):
                 lines[name] = line

@@ -166,7 +166,7 @@ def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
 def half_character(text: str) -> str:
     r"""What is wrong with a text that cannot be written as UTF-8 for a lone ``'\ud800'``, or ""."""
     found = _HALF_CHARACTER.search(text)
-    return f"there is half a character, \\u{ord(found[0]):04x}" if found else ""
+    return f"found half of a character, \\u{ord(found[0]):04x}" if found else ""
 
 
 def read_file(path: Path) -> tuple[Element, list[Problem]]:

@@ -228,8 +228,8 @@ class Bag:
     def refuse(self, fault: str) -> None:
         """Raise a fault of its files, which readers of packets cannot pass over."""
         raise EnvironmentFault(
-            f"{fault}: what it holds now is not what was recorded (`neuros bag repair` keeps the"
-            " packets that can be read)"
+            f"{fault}: its content has changed since it was recorded (`neuros bag repair` keeps"
+            " the packets that can be read)"
         )
 
     @property

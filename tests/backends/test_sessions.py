@@ -164,5 +164,5 @@ def test_a_run_whose_launcher_was_killed_is_ending_until_nothing_is_left(folder:
 def test_a_run_that_is_not_there_is_wrong_usage(session: Session) -> None:
     refused = neuros("stop", "nonsense")
     assert refused.returncode == 2
-    assert refused.stderr.startswith("neuros: no run of yours is called 'nonsense'; there are ")
+    assert refused.stderr.startswith("neuros: you have no run called 'nonsense'; yours are: ")
     assert f"{session.run[:8]} (demo)" in refused.stderr

@@ -385,7 +385,7 @@ def test_durations(text: str | None, duration: Duration) -> None:
 
 @pytest.mark.parametrize("text", ["", "-1", "0sim", "1e3", "nan", "30 s", "sim", "1,5"])
 def test_what_is_no_duration(text: str) -> None:
-    with pytest.raises(UsageError, match="give seconds, as 30, or 30sim"):
+    with pytest.raises(UsageError, match="give seconds, such as 30, or simulated"):
         parse_duration(text)
 
 

@@ -86,7 +86,7 @@ def test_a_run_of_another_user_is_stopped_by_its_id(
     machine: Machine, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["stop", "other"]) == 2
-    assert "no run of yours is called 'other'; there are aaaaaaaa (demo)" in capsys.readouterr().err
+    assert "you have no run called 'other'; yours are: aaaaaaaa (demo)" in capsys.readouterr().err
     assert main(["stop", "bbbb"]) == 0
     assert machine.stopped == ["b" * 16]
 
@@ -96,5 +96,5 @@ def test_where_others_have_runs_only_there_is_nothing_of_ones_own_to_stop(
 ) -> None:
     del machine.there[0]
     assert main(["stop"]) == 0
-    assert capsys.readouterr().out == "none of your runs is running\n"
+    assert capsys.readouterr().out == "you have no run in progress\n"
     assert machine.stopped == []

@@ -114,4 +114,4 @@ def test_logs_are_followed_to_the_end_and_can_be_read_after_it(
     assert main(["logs", str(done.run_folder), "-n", "nobody"]) == 2
     assert "the run has no node 'nobody': it has 'listener' or 'talker'" in capsys.readouterr().err
     assert main(["topic", "list", "0123456789"]) == 2
-    assert "no run of yours is called '0123456789'" in capsys.readouterr().err
+    assert "you have no run called '0123456789'" in capsys.readouterr().err

@@ -392,7 +392,7 @@ def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> 
     assert probing.look(11.1, 11.1) is Verdict.DEAD
     text = probing.why_dead()
     assert "a is blocked on `a.o -> b.x` (1 outstanding)" in text
-    assert "omit discard_limit" in text
+    assert "leave out discard_limit" in text
 
 
 def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:

@@ -258,7 +258,7 @@ def test_packets_that_are_not_taken_in_are_said_too() -> None:
         backlog.report(counted(sent=3), float(second))
         backlog.report(counted(received=2), float(second))
     (text,) = said(backlog, 6.0)
-    assert text.startswith("brain has fallen behind: it has taken nothing in for over 5 s")
+    assert text.startswith("brain has fallen behind: it has taken in no packet for over 5 s")
     assert f"`{KEY}`" in text
 
 

@@ -78,7 +78,7 @@ time.sleep(0.5)
 host.report(is_final=True)
 """
     outcome = run(a=SHUTS_DOWN, b=finalises)
-    assert "Ctrl+C: already ending (once more kills at once)" in run.output.said
+    assert "Ctrl+C: already ending (a second one kills at once)" in run.output.said
     assert outcome.exit_code == 0
     assert outcome.has_final_report("b")
 
@@ -212,7 +212,8 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
     assert outcome.exit_code == 0
     (text,) = [text for text in run.output.said if text.startswith("control channel")]
     assert text == (
-        "control channel: hung up: an unknown program sent something that is not a control message:"
+        "control channel: a connection was closed: an unknown program sent something that is not"
+        " a control message:"
         " b'GET / HTTP/1.1'"
     )
 

@@ -72,10 +72,10 @@ def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
         "here": {"ssh": "me@here"},
     }
     nodes = {"eye": "robbot", "brian": "both"}
-    ways = "needs exactly one of 'ssh' and 'through', which say how it is reached"
+    ways = "needs exactly one of 'ssh' and 'through', which say how to reach it"
     assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes}) == [
         f"/hosts/both: {ways}",
-        "/hosts/here/ssh: 'here' is the machine that launches, and is not reached by 'ssh'",
+        "/hosts/here/ssh: 'here' is the launching machine, which needs no 'ssh'",
         f"/hosts/neither: {ways}",
         "/hosts/option/ssh: is an option, not a destination: user@host",
         "/nodes/brian: the project has no node 'brian'",
@@ -87,7 +87,7 @@ def test_mistakes_are_told_with_problems_of_form(tmp_path: Path) -> None:
     hosts = {"neither": {}, "robot": {"ssh": 5}, "none": 3}
     nodes = {"eye": "robbot", "brian": "robot", "brain": 7}
     assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes, "node": {}}) == [
-        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how it is reached",
+        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how to reach it",
         "/hosts/none: must be an object, but is a whole number",
         "/hosts/robot/ssh: must be a text, but is a whole number",
         "/node: unknown key 'node'",

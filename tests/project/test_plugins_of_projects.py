@@ -265,7 +265,7 @@ def test_what_is_right_or_not_to_be_known_is_no_problem(check: Check, text: str)
     [
         (
             "@neuros_tick(1)\ndef f(node): pass\n@neuros_tick(2)\ndef f(node): pass",
-            "brain.py:3:1: hook 'f' is lost: line 5 defines another 'f'",
+            "brain.py:3:1: hook 'f' never runs: line 5 defines another 'f'",
         ),
         (
             "@neuros_function(['imu', 'odom'])\ndef f(node, odom, imu): pass",

@@ -68,9 +68,9 @@ def test_a_project_file_of_many_megabytes_is_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "said"),
     [
-        ('"environment": {"A": "\\ud800"}', r"half a character, \ud800"),
-        ('"environment": {"\\udfff": "a"}', r"half a character, \udfff"),
-        ('"parameters": {"a": "x\\udc00"}', r"half a character, \udc00"),
+        ('"environment": {"A": "\\ud800"}', r"half of a character, \ud800"),
+        ('"environment": {"\\udfff": "a"}', r"half of a character, \udfff"),
+        ('"parameters": {"a": "x\\udc00"}', r"half of a character, \udc00"),
         ('"resources": {"cpus": 1e400}', "the number is too large"),
         ('"resources": {"pids": 1' + 30 * "0" + "}", "must be at most 4194304"),
         ('"resources": {"memory": "1' + 30 * "0" + 'g"}', "is not allowed as memory"),
@@ -101,7 +101,7 @@ def test_queues_have_a_largest_size(tmp_path: Path, key: str) -> None:
 def test_half_a_character_cannot_be_set_either(tmp_path: Path) -> None:
     (tmp_path / "project.json").write_text(json.dumps({"nodes": [NODE]}))
     text = problems_of(tmp_path, overrides=["nodes.a.environment.A=\udc80"])  # type: ignore[arg-type]
-    assert r"half a character, \udc80" in text
+    assert r"half of a character, \udc80" in text
 
 
 def test_thousands_of_mistakes_are_not_all_sought(tmp_path: Path) -> None:

@@ -321,8 +321,8 @@ class TestStrangers:
             ((3,), lif(4), r"has parameters of the shape \(4,\), and is given the shape \(3,\)"),
             ((3,), lif(3, tau=0.0), "'tau' must be above 0"),
             ((3,), nir.Linear(np.ones((2, 4))), r"takes 4 values, and is given the shape \(3,\)"),
-            ((1,), lif(1, v_threshold=math.nan), "'v_threshold' holds what is no number"),
-            ((1,), nir.Scale(np.array([1e300])), "'scale' holds what is no number"),
+            ((1,), lif(1, v_threshold=math.nan), "'v_threshold' holds a value that is no number"),
+            ((1,), nir.Scale(np.array([1e300])), "'scale' holds a value that is no number"),
             ((1,), nir.Affine(np.ones((1, 1)), np.ones(2)), r"parameters of the shape \(2,\)"),
         ],
     )
@@ -339,7 +339,7 @@ class TestStrangers:
             content["node/nodes/cell/r"] = h5py.ExternalLink("other.h5", "/r")
         with h5py.File(tmp_path / "other.h5", "w") as other:
             other["r"] = single(1)
-        with pytest.raises(NetworkError, match="/node/nodes/cell/r is not what NIR has there"):
+        with pytest.raises(NetworkError, match="/node/nodes/cell/r is not what NIR defines there"):
             read_graph(file)
 
     def test_graphs_in_graphs_without_end_are_refused(self, tmp_path: Path) -> None:
@@ -353,7 +353,7 @@ class TestStrangers:
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(sys.modules, "h5py", None)
-        with pytest.raises(NetworkError, match=r"read with h5py, which is not here: .*nir"):
+        with pytest.raises(NetworkError, match=r"read with h5py, which is not installed: .*nir"):
             read_graph(TRACES / "leaky_zero.nir")
 
 
@@ -463,5 +463,5 @@ class TestProject:
         monkeypatch.setattr(loading, "find_spec", lambda name: None)
         (project / "net.nir").write_text("nothing")
         (warning,) = load_with_messages(project)[0].warnings
-        assert warning.text == "the network is not checked before it runs"
+        assert warning.text == "the network cannot be checked before the run"
         assert "nir" in warning.hint

@@ -70,7 +70,7 @@ def wanted_version(folder: Path) -> Version | None:
     version = (int(match[1]), int(match[2])) if match else (0, 0)
     if not OLDEST <= version <= NEWEST:
         raise EnvironmentFault(
-            f"{file} asks for Python {text!r}: name one that ROS 2 has packages for,"
+            f"{file} asks for Python {text!r}: name a version that ROS 2 has packages for,"
             f" {dotted(OLDEST)} to {dotted(NEWEST)}"
         )
     return version

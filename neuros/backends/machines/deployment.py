@@ -308,7 +308,9 @@ def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
         faults += [f"{side.host.name}: {problem}" for problem in side.left.problems]
     elif not was_lost:
         why = f": {machine.lost}" if machine.lost else ""
-        faults.append(f"not all that nodes have left on {side.host.name} came here{why}")
+        faults.append(
+            f"not all files of nodes on {side.host.name} were copied to this machine{why}"
+        )
     return faults
 
 
@@ -368,6 +370,6 @@ def _own_address(here: Host, address: str) -> str:
             probe.connect((address, _ANY_PORT))  # sends nothing: the kernel chooses the way
         except OSError as error:
             raise EnvironmentFault(
-                f"there is no way to {address} ({error.strerror}), where nodes are to be reached"
+                f"this machine cannot reach {address} ({error.strerror}), the address of its nodes"
             ) from error
         return str(probe.getsockname()[0])

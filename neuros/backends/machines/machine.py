@@ -292,7 +292,7 @@ class Machine:
             self.lost = f"{reason} ({said})" if said else reason
             if self._run is not None:
                 where = f"{self.host.ssh or self.host.name}:{self.folders.run}"
-                self.lost += f"; what has not come from there is in {where}"
+                self.lost += f"; files that were not copied are still in {where}"
             self._arrived.notify_all()
 
     def _connect(self) -> ControlStream:

@@ -236,7 +236,7 @@ class Element:
             self.problem(f"{what} must stand here, not {len(values)}")
             return tuple(default)
         if any(map(math.isnan, values)):
-            self.problem("every number must be one, not nan")
+            self.problem("every value must be a number, not nan")
             return tuple(default)
         return tuple(values)
 

@@ -97,7 +97,8 @@ def read_graph(path: Path) -> Graph:
     try:
         import h5py
     except ImportError:
-        text = f"networks in NIR are read with h5py, which is not here: {install_command('nir')}"
+        needs = f"which is not installed: {install_command('nir')}"
+        text = f"networks in NIR are read with h5py, {needs}"
         raise NetworkError([text]) from None
     reader = _Reader(h5py)
     try:
@@ -133,7 +134,7 @@ class _Reader:
         node = self._child(file, "node", self._h5py.Group)
         kind = self._text(node, "type")
         if kind != "NIRGraph":
-            raise NetworkError([f"the file holds one {kind or 'thing'}, and no NIRGraph"])
+            raise NetworkError([f"the file holds one {kind or 'thing'} instead of a NIRGraph"])
         self._graph(node, "")
         for kind in ("Input", "Output"):
             if not any(k == kind and "/" not in path for path, k in self.kinds.items()):
@@ -224,7 +225,7 @@ class _Reader:
             return self._text(node, name)
         value = np.asarray(dataset[()])
         if value.dtype.kind not in "iufb" or not (abs(value) < _LARGEST).all():
-            self.problems.append(f"node '{path}': '{name}' holds what is no number")
+            self.problems.append(f"node '{path}': '{name}' holds a value that is no number")
         elif name.startswith("tau") and not (value > 0).all():
             self.problems.append(f"node '{path}': '{name}' must be above 0")
         elif name == "shape" and (value.dtype.kind not in "iu" or (value < 1).any()):
@@ -246,7 +247,7 @@ class _Reader:
         outside = getattr(found, "external", None) or getattr(found, "is_virtual", False)
         if not isinstance(found, kind) or outside:
             what = f"{group.name.rstrip('/')}/{name}"
-            raise NetworkError([f"{what} is not what NIR has there"])
+            raise NetworkError([f"{what} is not what NIR defines there"])
         return found
 
 
