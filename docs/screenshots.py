@@ -35,6 +35,7 @@ DEADLINE_MS = 120_000
 RERUN_DRAWS_MS = 40_000  # on a canvas that says nothing of what it shows, without a graphics card
 WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
 RING = ROOT / "tests" / "viewers" / "dashboard" / "ring" / "spiking.json"
+SIZE: Any = {"width": 1300, "height": 1000}
 
 LONG = ("--set", "nodes.robot.environment.DURATION=1000")
 
@@ -64,6 +65,7 @@ def page_of(project: Path, name: str, *arguments: str) -> Iterator[str]:
 def shoot_dashboard(page: Any) -> None:
     """WhiskEye, with a connection selected and two fields plotted."""
     with page_of(WHISKEYE, "dashboard", "--dashboard", *LONG) as url:
+        page.set_viewport_size({**SIZE, "height": 1420})  # all panels
         page.goto(url)
         for connection, field in (
             ("snn.estimate -> visualiser.estimate", "vector.z"),
@@ -76,6 +78,7 @@ def shoot_dashboard(page: Any) -> None:
             timeout=DEADLINE_MS,
         )
         page.screenshot(path=FIGURES / "dashboard.png")
+        page.set_viewport_size(SIZE)
 
 
 def shoot_panels(page: Any) -> None:
@@ -153,7 +156,7 @@ def main() -> None:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )
-        page = browser.new_page(viewport={"width": 1300, "height": 1000})
+        page = browser.new_page(viewport=SIZE)
         shoot_dashboard(page)
         shoot_panels(page)
         shoot_world(page)

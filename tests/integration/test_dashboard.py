@@ -69,6 +69,9 @@ def test_a_visitor_sees_and_steers_a_run_in_a_browser(tmp_path: Path) -> None:
         page.click(f'#connections tr[data-name="{IMU}"]')
         page.click('#details tr[data-name="angular_velocity.z"] button')
         wait_until(page, "() => document.querySelector('.chart')?.dataset.points > 20")
+        page.set_viewport_size({"width": 1200, "height": 1100})
+        hidden = "(panel) => panel.scrollWidth - panel.clientWidth"
+        assert page.locator("#details").evaluate(hidden) == 0, "values are beyond the edge"
         drawn = page.inner_text('#details tr[data-name="header.frame_id"] td:nth-child(2)')
         assert drawn == "head"
 

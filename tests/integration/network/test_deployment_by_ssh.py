@@ -217,7 +217,9 @@ def test_a_connection_that_is_killed_ends_both_machines(which: str, at_work: AtW
     getattr(at_work, which).kill()
     finished = at_work.assert_ends(4, "right cannot be reached any more", GONE_S)
     assert_kept_its_log(finished)
-    there = f"files that were not copied are still in root@{ADDRESSES['right']}:{at_work.there.folder}"
+    there = (
+        f"files that were not copied are still in root@{ADDRESSES['right']}:{at_work.there.folder}"
+    )
     assert there in finished.said("neuros")[-1]
     assert Path(at_work.there.folder, "sink/received.json").exists()
     shutil.rmtree(at_work.there.folder)
