@@ -98,7 +98,10 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     if os.path.exists(output) and not output.is_file():
         raise UsageError(f"{output}: is not a file; name the file to write")
     if os.path.exists(output) and not options.force and not is_ours(output):
-        raise UsageError(f"{output}: exists and is not from this command: name another, or --force")
+        raise UsageError(
+            f"{output}: exists, and was not written by this command: name another"
+            " file, or give --force"
+        )
     folders = [Path(folder) for folder in options.include]
     for folder in folders:
         if not folder.is_dir():

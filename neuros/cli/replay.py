@@ -292,7 +292,7 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
         print(f"different: {node.difference}")
         return EXIT_DIFFERENT
     if not compared.packets and node.has_outputs and (node.notes or not compared.connections):
-        print("unknown: what it sends was not recorded")
+        print("unknown: its packets were not recorded")
         return EXIT_UNKNOWN
     what = count if compared.connections else "it sends nothing"
     print(f"identical: {what}; {_count(node.starts, 'start')} of hooks")

@@ -320,7 +320,7 @@ def explain_failure(text: str) -> str | None:
         return (
             "a package on the index is not the one that the lock file names, and is not installed:"
             " use another index (export PIP_INDEX_URL=https://pypi.org/simple), or, if you trust"
-            " this one, install.py --newest, which does without lock files"
+            " this one, install.py --newest, which uses no lock files"
         )
     if match := re.search(_NOT_FOR_PROCESSOR, text):
         return (

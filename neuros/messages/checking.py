@@ -36,7 +36,7 @@ _ROS_1 = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Dur
 _A_LINE = "a type and a name, as 'float64 angle'"
 _A_TYPE = (
     "bool, byte, char, int8 to int64, uint8 to uint64, float32, float64, string, wstring or"
-    " package/Message, and behind it nothing, [], [3] or [<=3]"
+    " package/Message, optionally followed by [], [3] or [<=3]"
 )
 _A_PACKAGE = "a letter, then letters, digits and single '_', all lower case, as 'rover_msgs'"
 _A_FIELD = "a letter, then letters, digits and single '_', all lower case, as 'joint_positions'"

@@ -220,7 +220,8 @@ class ReplayedNode:
                 if _has_threads():
                     continue
                 raise ReplayParted(
-                    "a thread of the plugin sent packets in the run, and none does in the replay"
+                    "a thread of the plugin sent packets in the run, but no thread does in the"
+                    " replay"
                 ) from None
             event()
 

@@ -165,4 +165,4 @@ def test_a_connection_that_was_left_out(tmp_path: Path) -> None:
     assert "what 'ann' received on bob.ball_out -> ann.ball_in was not recorded" in done.stderr
     done = replay(finished.run_folder, "bob")
     assert done.returncode == 2
-    assert "unknown: what it sends was not recorded" in done.stdout
+    assert "unknown: its packets were not recorded" in done.stdout

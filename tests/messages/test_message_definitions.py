@@ -44,7 +44,7 @@ def test_what_ros_understands_is_no_problem(tmp_path: Path) -> None:
         ("flaot64 x", "2:1", "found the type 'flaot64', expected bool, byte, char"),
         ("flaot64 x", "2:1", "(did you mean 'float64'?)"),
         ("int32] x", "2:1", "found the type 'int32]', expected"),
-        ("int32[<3] x", "2:1", "and behind it nothing, [], [3] or [<=3]"),
+        ("int32[<3] x", "2:1", "optionally followed by [], [3] or [<=3]"),
         ("int32[0] x", "2:1", "found the type 'int32[0]', expected"),
         ("string<=x s", "2:1", "found the type 'string<=x', expected"),
         ("a/b/c x", "2:1", "found the type 'a/b/c', expected"),

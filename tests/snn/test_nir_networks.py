@@ -318,9 +318,9 @@ class TestStrangers:
                 nir.SumPool2d(np.array([2, 2]), np.array([1, 1]), np.array([9000, 9000])),
                 "would hold more than 16777216 values",
             ),
-            ((3,), lif(4), r"has parameters of the shape \(4,\), and is given the shape \(3,\)"),
+            ((3,), lif(4), r"has parameters of the shape \(4,\), but is given the shape \(3,\)"),
             ((3,), lif(3, tau=0.0), "'tau' must be above 0"),
-            ((3,), nir.Linear(np.ones((2, 4))), r"takes 4 values, and is given the shape \(3,\)"),
+            ((3,), nir.Linear(np.ones((2, 4))), r"takes 4 values, but is given the shape \(3,\)"),
             ((1,), lif(1, v_threshold=math.nan), "'v_threshold' holds a value that is no number"),
             ((1,), nir.Scale(np.array([1e300])), "'scale' holds a value that is no number"),
             ((1,), nir.Affine(np.ones((1, 1)), np.ones(2)), r"parameters of the shape \(2,\)"),
@@ -390,9 +390,9 @@ class TestNode:
         assert sorted(problems_of(node, TRACES / "leaky_zero.nir")) == [
             "a network has no parameter 'rest' (did you mean 'reset'?)",
             "the input 'inputs' must be of std_msgs/msg/Float32MultiArray, Float32,"
-            " Float64MultiArray or Float64, and is std_msgs/msg/String",
+            " Float64MultiArray or Float64, but is std_msgs/msg/String",
             "the network has no Input 'inputs', as the input (it has 'input')",
-            "the node declares no input 'input', and the network has an Input of that name",
+            "the node declares no input 'input', but the network has an Input of that name",
             "the parameter 'dt' must be a number of seconds, above 0",
             "the parameter 'exporter' must be 'nir', 'norse' or 'snntorch'",
             "the parameter 'reset' must be 'subtract', 'v_reset' or 'none'",

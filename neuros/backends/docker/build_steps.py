@@ -41,8 +41,8 @@ _CAUSES = (
     ),
     (
         r"ERROR: ResolutionImpossible|have conflicting dependencies",
-        "its requirements.txt cannot be satisfied, as packages in it exclude each other: loosen"
-        " their versions",
+        "its requirements.txt cannot be satisfied, because packages in it exclude each other:"
+        " loosen their versions",
     ),
     (
         r"E: Unable to locate package (?P<what>\S+)|E: Package '?(?P<also>[\w.+-]+)'? has no",

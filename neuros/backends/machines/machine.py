@@ -131,7 +131,7 @@ class Machine:
         ready = self._await(Ready, _CONNECT_S)
         if ready.version != __version__:
             raise self._failed(
-                f"NeuROS {ready.version} is installed there, and {__version__} here: install the"
+                f"NeuROS {ready.version} is installed there, but {__version__} here: install the"
                 " same version on both"
             )
         self._pump.timeout_s = self._timeout_s

@@ -172,9 +172,9 @@ def _port_problems(
         if port.name not in names:
             yield f"the network has no {kind} '{port.name}', as the {side} (it has {listed(names)})"
         if not _TYPES.fullmatch(port.type):
-            yield f"the {side} '{port.name}' must be of {_TYPES_IN_WORDS}, and is {port.type}"
+            yield f"the {side} '{port.name}' must be of {_TYPES_IN_WORDS}, but is {port.type}"
     for name in {*names} - {port.name for port in ports}:
-        yield f"the node declares no {side} '{name}', and the network has an {kind} of that name"
+        yield f"the node declares no {side} '{name}', but the network has an {kind} of that name"
 
 
 def _step_of(part: Part, how: Discretisation) -> _Step:
@@ -316,7 +316,7 @@ class _Delay:
 def _linear(values: Mapping[str, Any], x: Values) -> Values:
     weight = values["weight"]
     if x.ndim == 0 or weight.shape[-1] != x.shape[-1]:
-        raise ValueError(f"takes {weight.shape[-1]} values, and is given the shape {x.shape}")
+        raise ValueError(f"takes {weight.shape[-1]} values, but is given the shape {x.shape}")
     y = _single((weight @ x[..., None])[..., 0])
     return _single(y + _of_shape(values["bias"], y)) if "bias" in values else y
 
@@ -325,7 +325,7 @@ def _flatten(values: Mapping[str, Any], x: Values) -> Values:
     start, end = (int(values[name]) for name in ("start_dim", "end_dim"))
     start, end = (each + x.ndim if each < 0 else each for each in (start, end))
     if not 0 <= start <= end < x.ndim:
-        raise ValueError(f"flattens dimensions {start} to {end}, and is given the shape {x.shape}")
+        raise ValueError(f"flattens dimensions {start} to {end}, but is given the shape {x.shape}")
     return x.reshape(*x.shape[:start], -1, *x.shape[end + 1 :])
 
 
@@ -334,7 +334,7 @@ def _convolution(values: Mapping[str, Any], x: Values) -> Values:
     weight, groups = values["weight"], int(values["groups"])
     out, channels, *kernel = weight.shape
     if groups < 1 or out % groups or x.shape[:1] != (channels * groups,):
-        raise ValueError(f"takes {channels * groups} channels, and is given the shape {x.shape}")
+        raise ValueError(f"takes {channels * groups} channels, but is given the shape {x.shape}")
     dilation, stride = (_each(values[name], len(kernel)) for name in ("dilation", "stride"))
     padding = values["padding"]
     if isinstance(padding, str) and padding == "same":
@@ -402,7 +402,7 @@ def _of_shape(parameter: Any, x: Values) -> Any:
         a in (1, b) for a, b in zip(parameter.shape[::-1], x.shape[::-1], strict=False)
     )
     if not fits:
-        text = f"has parameters of the shape {parameter.shape}, and is given the shape {x.shape}"
+        text = f"has parameters of the shape {parameter.shape}, but is given the shape {x.shape}"
         raise ValueError(text)
     return parameter
 
