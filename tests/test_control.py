@@ -13,8 +13,10 @@ from neuros import control
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
+    FROM_SESSION,
     TO_NODES,
     TO_OBSERVERS,
+    TO_SESSION,
     Ended,
     Finalising,
     HookDeclaration,
@@ -31,7 +33,9 @@ from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "control_channel.md"
-MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS])
+MESSAGES = dict.fromkeys(
+    [*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS, *FROM_SESSION, *TO_SESSION]
+)
 ACCEPTED = {kind_of(each): each for each in MESSAGES}
 METRICS: Any = {"state": {"state": "idle", "cause": ""}, "executing": None, "hooks": {}}
 METRICS |= {"outgoing": {"a.o -> b.x": {"sent": 1}}, "incoming": {}, "accounting": {}}
@@ -185,6 +189,8 @@ def table(kinds: Any) -> str:
         ("To node processes", TO_NODES),
         ("From an observer", FROM_OBSERVERS),
         ("To observers", TO_OBSERVERS),
+        ("From a session to its nodes", FROM_SESSION),
+        ("To a session from its nodes", TO_SESSION),
     ],
 )
 def test_the_page_shows_the_messages_as_they_are(title: str, kinds: Any) -> None:

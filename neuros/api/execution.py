@@ -18,7 +18,7 @@ from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
 from neuros.api.run_folder import make_run_folder, write_node_files
-from neuros.backends.control_sockets import UnixListener
+from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.progress import Progress
@@ -128,6 +128,8 @@ class Execution:
             stack.callback(reaper.finish)
             for file in self._listener.files:
                 reaper.remove_later(file)
+            if self._plan.is_held:
+                reaper.remove_later(self.folder / SESSION_SOCKET_NAME)
             return self._run(reaper, started)
 
     @property

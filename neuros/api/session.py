@@ -12,7 +12,6 @@ import base64
 import contextlib
 import html
 import math
-import select
 import sys
 import threading
 import time
@@ -27,11 +26,12 @@ from neuros.analysis.run_record import run_table
 from neuros.api.live import LiveRun
 from neuros.api.loading import seed_variables
 from neuros.api.run import Run
+from neuros.api.session_link import SessionLink
 from neuros.backends.control_sockets import connect
 from neuros.control import (
     TO_OBSERVERS,
+    AtRest,
     Deliver,
-    Ended,
     LookAll,
     Message,
     NewestPacket,
@@ -39,9 +39,7 @@ from neuros.control import (
     Pause,
     Reset,
     Resume,
-    Settle,
     Settled,
-    StepAll,
     WasReset,
     Watch,
 )
@@ -83,7 +81,6 @@ class Session:
         self._seed = seed
         self._packets = RosPackets()
         self._lock = threading.RLock()
-        self._number = 0
         self._newest: dict[str, NewestPacket] = {}
         self.runs: list[Run] = []
         self._hold(start(seed))
@@ -95,7 +92,7 @@ class Session:
         self._run: Run | None = None
         sys.path[:0] = [path for path in map(str, held.messages) if path not in sys.path]
         try:
-            self._link = self._connect()
+            self._link = SessionLink(self._connect(), self.folder)
             self._link.send(Watch())
             self._begin()
         except BaseException:
@@ -107,7 +104,7 @@ class Session:
         self._newest = {name: NewestPacket(0, "") for name in self._newest}
         self._decoded: dict[str, tuple[int, Any]] = {}
         self._sim_times: Mapping[str, float] = {}
-        self._advance(0, None)
+        self._settle()
 
     # ------------------------------------------------------------------ time
 
@@ -184,7 +181,7 @@ class Session:
                     self._wait_for(lambda message: False, time.monotonic() + duration_s)
             finally:
                 self._link.send(Pause())
-            return self._run is None and self._advance(0, None)
+            return self._run is None and self._settle()
 
     def reset(self, seed: int | None = None) -> None:
         """Bring every node back to where it was when the session began, with a seed.
@@ -231,7 +228,7 @@ class Session:
 
     def _has_come_to_rest(self) -> bool:
         try:
-            return self._advance(0, None)
+            return self._advance(0)
         except RunError:
             return False
 
@@ -266,7 +263,7 @@ class Session:
         data = base64.b64encode(self._packets.encode(packet)).decode()
         with self._lock:
             self._check_running()
-            self._link.send(Deliver(node.name, port.name, data))
+            self._link.deliver(Deliver(node.name, port.name, data))
 
     # ------------------------------------------------------------------ state
 
@@ -287,7 +284,7 @@ class Session:
 
         with self._lock:
             self._check_running()
-            self._advance(0, None)  # what was sent has arrived then
+            self._advance(0)  # what was sent has arrived then
             self._link.send(LookAll({}))
             if not self._wait_for(is_last, None):
                 self._check_running()
@@ -297,6 +294,7 @@ class Session:
         """End the run, drained, and return what it has left behind; a second time the same."""
         with self._lock:
             if self._run is None:
+                self._link.leave_nodes()
                 self._live.stop(reason)
                 self._end()
             assert self._run is not None
@@ -369,7 +367,7 @@ class Session:
         end_s = self._sim_now() + duration_s
         count, at_rest = 1, 0
         while (now_s := self._sim_now()) < end_s - _FINE:
-            if not self._advance(count, None):
+            if not self._advance(count):
                 return False
             gained_s = self._sim_now() - now_s
             at_rest = 0 if gained_s > 0 else at_rest + 1
@@ -393,46 +391,34 @@ class Session:
                 " does a hook wait for an input that the session has to send?"
             )
 
-    def _advance(self, rounds: int, end_s: float | None) -> bool:
+    def _advance(self, rounds: int, end_s: float | None = None) -> bool:
         """Go on by rounds, and wait until nothing moves; whether the run goes on."""
-        self._number += 1
-        number = self._number
-        if rounds:
-            self._link.send(StepAll(rounds))
-        self._link.send(Settle(number, {name: each.number for name, each in self._newest.items()}))
+        return self._note(self._link.advance(rounds, self._known, end_s))
 
-        def is_settled(message: Message) -> bool:
-            if isinstance(message, Settled) and message.number == number:
-                self._sim_times = message.sim_times
-                self._newest.update(message.packets)
-                return True
-            return False
+    def _settle(self) -> bool:
+        """Wait until nothing moves, after what was said to the supervisor."""
+        return self._note(self._link.settle(self._known))
 
-        if self._wait_for(is_settled, end_s):
+    @property
+    def _known(self) -> dict[str, int]:
+        return {name: each.number for name, each in self._newest.items()}
+
+    def _note(self, settled: Settled | AtRest | None) -> bool:
+        if settled is not None:
+            self._sim_times = settled.sim_times
+            self._newest.update(settled.packets)
             return True
+        self._end()
         assert self._run is not None
         self._run.check()
         return False
 
     def _wait_for(self, is_wanted: Callable[[Message], bool], end_s: float | None) -> bool:
-        """Until such a message comes; ``False`` once the run has ended.
-
-        Raises:
-            TimeoutError: if neither comes until ``end_s``.
-        """
-        while True:
-            left_s = None if end_s is None else max(0.0, end_s - time.monotonic())
-            if not select.select([self._link], [], [], left_s)[0]:
-                raise TimeoutError(f"the run has not come to rest in time: {self.folder}")
-            messages = self._link.receive()
-            is_over = messages is None
-            for message in messages or ():
-                if is_wanted(message):
-                    return True
-                is_over = is_over or isinstance(message, Ended)
-            if is_over:
-                self._end()
-                return False
+        """As :meth:`SessionLink.wait_for`."""
+        if self._link.wait_for(is_wanted, end_s):
+            return True
+        self._end()
+        return False
 
     def _newest_of(self, output: str) -> NewestPacket:
         """The newest packet of an output; number 0: there is none yet."""
@@ -440,10 +426,11 @@ class Session:
             if output not in self._newest:
                 self._check_running()
                 self._newest[output] = NewestPacket(0, "")
-                self._advance(0, None)
+                self._advance(0)
             return self._newest[output]
 
     def _end(self) -> None:
+        self._link.leave_nodes()
         self._run = self._live.wait()
         self._link.close()
 

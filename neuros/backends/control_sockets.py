@@ -18,6 +18,8 @@ from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
 
 SOCKET_NAME = "control.sock"
+SESSION_SOCKET_NAME = "session.sock"
+"""Where a process that holds all nodes of a run listens to its session."""
 _GROUP = "neuros.control"
 _SCHEME = "unix"
 _MOST_WAITING = 256
@@ -26,8 +28,8 @@ _MOST_WAITING = 256
 class UnixListener:
     """Listens at a Unix socket in the run folder (:class:`neuros.ports.ControlListener`)."""
 
-    def __init__(self, run_folder: Path) -> None:
-        self._path = run_folder / SOCKET_NAME
+    def __init__(self, run_folder: Path, name: str = SOCKET_NAME) -> None:
+        self._path = run_folder / name
 
     @property
     def address(self) -> str:
@@ -80,7 +82,7 @@ def connect(address: str) -> ControlStream:
     """
     scheme, _, place = address.partition(":")
     if scheme == _SCHEME:
-        return _connect_unix(Path(place))
+        return connect_unix(Path(place))
     from importlib.metadata import entry_points
 
     found = {each.name: each for each in entry_points(group=_GROUP)}
@@ -105,7 +107,8 @@ def connect_by(environ: Mapping[str, str]) -> ControlStream:
     return connect(address)
 
 
-def _connect_unix(path: Path) -> socket.socket:
+def connect_unix(path: Path) -> socket.socket:
+    """Connect to a Unix socket, however long its path is. Raises ``OSError``."""
     connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         with _short_path(path) as name:

@@ -18,9 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.backends.control_sockets import connect_by
+from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener, connect_by
+from neuros.errors import EnvironmentFault
 from neuros.node.process import NodeProcess
-from neuros.ports import Middleware, PacketRecorder
+from neuros.ports import ControlListener, Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
@@ -69,16 +70,29 @@ def _run_node(options: argparse.Namespace) -> int:
         leave.has_leftovers = lambda: bool(getattr(middleware, "has_leftovers", False))
         return middleware
 
+    run_folder = files[0].folders.run
+    has_session = options.held and options.one_process
     leave.exit_code = NodeProcess(
         files,
         make_middleware,
         partial(connect_by, os.environ),
-        open_recorder=_recorders(files[0].folders.run) if options.record else None,
+        open_recorder=_recorders(run_folder) if options.record else None,
         duration_sim_s=options.duration_sim,
         is_held=options.held,
+        session=_session_listener(run_folder) if has_session else None,
         own_logs=options.one_process,
     ).run()
     return leave.exit_code
+
+
+def _session_listener(run_folder: Path) -> ControlListener | None:
+    """Listens to the session; where that cannot be, it steps by the supervisor, only slower."""
+    listener = UnixListener(run_folder, SESSION_SOCKET_NAME)
+    try:
+        listener.open()
+    except EnvironmentFault:
+        return None
+    return listener
 
 
 class _Log(io.FileIO):

@@ -250,7 +250,7 @@ class NewestPacket:
 
 @dataclass(frozen=True)
 class AtRest(Message):
-    """No event waits in a node process, and no hook may start; in answer to ``settle``.
+    """No event waits in a node process, and no hook may start: answer to ``settle``, ``advance``.
 
     Attributes:
         has_begun: whether each node has found its receivers, so that its hooks may run.
@@ -365,6 +365,22 @@ class Deliver(Message):
     data: str
 
 
+# ---------------------------------------------------------------------- from a session
+
+
+@dataclass(frozen=True)
+class Advance(Message):
+    """While paused, take packets, go on by so many steps, then answer ``at_rest`` and pause.
+
+    A session sends it to the process that holds all nodes, past the supervisor.
+    """
+
+    number: int
+    count: int
+    known: Mapping[str, int]
+    packets: tuple[Deliver, ...]
+
+
 # ---------------------------------------------------------------------- from observers
 
 
@@ -452,6 +468,8 @@ TO_NODES: Sequence[type[Message]] = (
     *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
     *(Settle, Deliver, Reset),
 )
+FROM_SESSION: Sequence[type[Message]] = (Advance,)
+TO_SESSION: Sequence[type[Message]] = (AtRest,)
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver, Reset),
 )

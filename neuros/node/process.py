@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import neuros.control as control
-from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
+from neuros.control import ELSEWHERE_VARIABLE, FROM_SESSION, TO_NODES, Message
 from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
@@ -27,7 +27,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
-from neuros.ports import ControlStream, Middleware, PacketRecorder, Voice
+from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder, Voice
 from neuros.project.model import Connection, NodeFile
 from neuros.stacks import StackFile
 
@@ -48,6 +48,7 @@ class NodeProcess:
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
         is_held: whether nodes stand still from the start, for a session.
+        session: listens where that connects to step them, if they are all nodes of the run.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
     """
@@ -61,6 +62,7 @@ class NodeProcess:
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
         is_held: bool = False,
+        session: ControlListener | None = None,
         own_logs: bool = False,
     ) -> None:
         self._files = files
@@ -69,6 +71,7 @@ class NodeProcess:
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._is_held = is_held
+        self._session = session
         self._own_logs = own_logs
         self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
@@ -76,7 +79,8 @@ class NodeProcess:
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
-        self._settle_number = 0
+        self._settling: control.Settle | control.Advance | None = None
+        self._is_draining = False
         self._has_been_reset = False
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
@@ -96,7 +100,7 @@ class NodeProcess:
         self._stack_file = StackFile(own_folder, plugins)
         self._tell(control.Hello(tuple(plugins)))
         with signals_as_socket() as signalled:
-            thread = ControlThread(self._link, signalled, self)
+            thread = ControlThread(self._link, signalled, self, self._session)
             thread.start()
             self._guard(self._live)
             for node in self._nodes:
@@ -132,12 +136,13 @@ class NodeProcess:
             self._probe(message.number)
             return
         if isinstance(message, control.Settle):
-            self._settle_number = message.number
-            self._settle(message)
+            self._settling = message
+            self._settle(message, self._tell)
             return
         if isinstance(message, control.Reset):
             self._reset(message.variables)
             return
+        self._is_draining = self._is_draining or isinstance(message, control.Drain)
         for node in self._nodes:
             match message:
                 case control.Drain(last_round):
@@ -190,19 +195,42 @@ class NodeProcess:
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
 
-    def _settle(self, message: control.Settle) -> None:
+    def advance(self, message: control.Advance, session: ControlLink) -> None:
+        """Do a step of the session, if the run is not at its end. Any thread."""
+        self.post(lambda: self._advance(message, session))
+
+    def _advance(self, message: control.Advance, session: ControlLink) -> None:
+        self._settling = message
+        for packet in message.packets:
+            self._obey_in_loop(packet)
+        if message.count:
+            engines = [node.engine for node in self._nodes if node.engine is not None]
+            is_driven = any(engine.is_driving for engine in engines)
+            for node in self._nodes:
+                node.step(message.count, is_driven=is_driven)
+        self._settle(message, session.send)
+
+    def _settle(
+        self, message: control.Settle | control.Advance, answer: Callable[[Message], object]
+    ) -> None:
         """Answer once no event waits: a hook that may start has a loop-back waiting.
 
         Of several questions the last one counts, else each would wait for the other.
         """
         assert self._middleware is not None
         loop = self._middleware.loop
-        if message.number != self._settle_number:
+        if message is not self._settling:
             return
         if loop.has_waiting_events or not loop.has_taken_in:
-            loop.post_loop_back(lambda: self._settle(message))
-        elif not self._is_ending:
-            self._tell(_at_rest(self._nodes, message))
+            loop.post_loop_back(lambda: self._settle(message, answer))
+            return
+        if isinstance(message, control.Advance):
+            if self._is_draining:
+                return  # the session hears of the end from the supervisor
+            for node in self._nodes:
+                node.pause()  # takes back what hooks could not use of a step
+        if not self._is_ending:
+            answer(_at_rest(self._nodes, message))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
         """Bring all nodes back to their start, if nothing of theirs is beyond reach."""
@@ -312,6 +340,7 @@ class NodeProcess:
 
     def _tell(self, message: Message) -> None:
         assert self._link is not None
+        self._is_draining = self._is_draining or isinstance(message, control.Shutdown)
         with self._tell_lock:
             self._link.send(message)
 
@@ -346,24 +375,36 @@ class ControlThread(threading.Thread):
     time cannot be read, say) fails again in the loop, which knows what to do about it.
     """
 
-    def __init__(self, link: ControlLink, signalled: socket.socket, process: NodeProcess) -> None:
+    def __init__(
+        self,
+        link: ControlLink,
+        signalled: socket.socket,
+        process: NodeProcess,
+        session: ControlListener | None,
+    ) -> None:
         super().__init__(name="neuros-control", daemon=True)
         self._link = link
         self._signalled = signalled
         self._process = process
+        self._session = session
         self._ended = threading.Event()
 
     def run(self) -> None:
         """Until the supervisor hangs up or :meth:`end`."""
         next_report_s = time.monotonic() + _REPORT_S
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._link, selectors.EVENT_READ)
-            selector.register(self._signalled, selectors.EVENT_READ)
+        with selectors.DefaultSelector() as selector, contextlib.ExitStack() as stack:
+            selector.register(self._link, selectors.EVENT_READ, self._on_messages)
+            selector.register(self._signalled, selectors.EVENT_READ, self._on_signal)
+            if self._session is not None:
+                stack.callback(self._session.close)
+                join = functools.partial(self._on_session, self._session, selector, stack)
+                selector.register(self._session, selectors.EVENT_READ, join)
             while not self._ended.is_set():
-                for key, _ in selector.select(max(0.0, next_report_s - time.monotonic())):
-                    if key.fileobj is self._signalled:
-                        self._on_signal()
-                    elif not self._on_messages():
+                ready = selector.select(max(0.0, next_report_s - time.monotonic()))
+                # What the supervisor has said comes before what the session has said since.
+                ready.sort(key=lambda pair: pair[0].fileobj is not self._link)
+                for key, _ in ready:
+                    if not key.data():
                         return
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
@@ -373,26 +414,54 @@ class ControlThread(threading.Thread):
         """Report no more."""
         self._ended.set()
 
-    def _on_signal(self) -> None:
-        try:
+    def _on_signal(self) -> bool:
+        with contextlib.suppress(OSError):
             self._signalled.recv(64)
-        except OSError:
-            return
-        self._process.ask_to_stop()
+            self._process.ask_to_stop()
+        return True
 
     def _on_messages(self) -> bool:
         """Returns False once the supervisor is gone."""
-        try:
-            messages = self._link.receive()
-        except ControlError as error:
-            self._raise_in_loop(error)
-            return True
+        messages = self._received(self._link)
         if messages is None:
             self._process.let_go()
             return False
         for message in messages:
             self._try(functools.partial(self._process.obey, message))
         return True
+
+    def _on_session(
+        self,
+        listener: ControlListener,
+        selector: selectors.BaseSelector,
+        stack: contextlib.ExitStack,
+    ) -> bool:
+        """The session connects: one per run."""
+        stream = listener.accept()
+        if stream is None:
+            return True
+        selector.unregister(listener)
+        link = ControlLink(stream, FROM_SESSION, "the session")
+        stack.callback(link.close)
+
+        def take() -> bool:
+            messages = self._received(link)
+            if messages is None:
+                selector.unregister(link)
+            for message in messages or ():
+                if isinstance(message, control.Advance):
+                    self._process.advance(message, link)
+            return True
+
+        selector.register(link, selectors.EVENT_READ, take)
+        return True
+
+    def _received(self, link: ControlLink) -> list[Message] | None:
+        try:
+            return link.receive()
+        except ControlError as error:
+            self._raise_in_loop(error)
+            return []
 
     def _try(self, action: Event) -> None:
         try:
@@ -481,7 +550,9 @@ class PeerLink:
         self._tell(control.Heard(name, text))
 
 
-def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtRest:
+def _at_rest(
+    nodes: Sequence[NodeRuntime], asked: control.Settle | control.Advance
+) -> control.AtRest:
     """State of all nodes of a process at one moment."""
     names = tuple(node.name for node in nodes)
     engines = [node.engine for node in nodes if node.engine is not None]

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -25,7 +26,10 @@ import neuros
 from containers import require_containers, wait_until
 from neuros.api.session import Session
 from neuros.cli.main import main
+from neuros.control import AtRest, Deliver, Message, Settle, StepAll
+from neuros.control.link import ControlLink
 from neuros.errors import ProjectError, RunError, UsageError
+from neuros.launcher.supervisor import Supervisor
 
 # The input that a test pushes the robot by.
 pytestmark = pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
@@ -223,6 +227,62 @@ def test_what_is_stepped_to_its_end_is_verified_against_a_free_run(
     capsys.readouterr()
     assert main(["verify", str(free.folder), str(held)]) == 0
     assert "identical" in capsys.readouterr().out
+
+
+def test_a_step_goes_straight_to_the_process_that_holds_all_nodes(
+    held: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard: list[object] = []
+    take = Supervisor._take
+
+    def overhear(self: Supervisor, link: ControlLink, message: Message) -> None:
+        heard.append(type(message))
+        take(self, link, message)
+
+    monkeypatch.setattr(Supervisor, "_take", overhear)
+    before = held["robot.pose"].count
+    held.send("robot.push", Float64(data=1.0))
+    held.step(3, timeout_s=DEADLINE_S)
+    assert held["robot.pose"].count == before + 3
+    assert not {StepAll, Settle, AtRest, Deliver}.intersection(heard)
+
+
+def test_a_step_goes_by_the_supervisor_where_the_nodes_are_out_of_reach(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise ConnectionRefusedError(path)
+
+    monkeypatch.setattr("neuros.api.session_link.connect_unix", refuse)
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        assert poses(s, 3) == [1.0, 0.5, 0.25]
+        s.send("robot.push", Float64(data=8.0))
+        assert poses(s, 1) == [8.125]
+
+
+def test_what_is_sent_before_a_free_run_arrives_before_it(held: Session) -> None:
+    held.run(duration_sim_s=1.0)  # the robot is where it wants to be
+    held.send("robot.push", Float64(data=8.0))
+    held.run(duration_sim_s=0.01)
+    assert held["robot.pose"].packet.data == pytest.approx(8.0)
+    before = held["robot.pose"].count
+    held.send("robot.push", Float64(data=8.0))
+    deadline_s = time.monotonic() + DEADLINE_S
+    while held["robot.pose"].count < before + 10:
+        assert time.monotonic() < deadline_s
+        held.run(duration_s=0.01)
+
+
+def test_of_many_packets_sent_at_once_the_newest_are_kept(tmp_path: Path) -> None:
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        for number in range(200):
+            s.send("robot.push", Float64(data=float(number)))
+        assert poses(s, 1) == [191.0]
+        counters = s.state()["robot"].counters
+    assert counters is not None
+    push = counters.metrics["incoming"]["/neuros/session/robot/push -> robot.push"]
+    assert (push["received"], push["discarded"], push["unread"]) == (200, 190, 9)
+    assert not list(s.folder.glob("*.sock"))
 
 
 def test_between_two_steps_nothing_starts(held: Session) -> None:

@@ -393,6 +393,7 @@ SENT: Sequence[control.Message] = (
     control.Step(1, is_driven=True),
     control.Look({"a": {"x": {}}}, 1),
     control.StepAll(3),
+    control.Advance(3, 1, {"a.x": 2}, (control.Deliver("a", "x", "AAAA"),)),
     control.End("done"),
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),
@@ -402,7 +403,7 @@ SENT: Sequence[control.Message] = (
 @target(lambda: [encode(each).rstrip() for each in SENT], change_json, change_bytes)
 def control_message(data: bytes, _: Path) -> None:
     for group in (control.FROM_NODES, control.TO_NODES, control.FROM_OBSERVERS,
-                  control.TO_OBSERVERS):  # fmt: skip
+                  control.TO_OBSERVERS, control.FROM_SESSION):  # fmt: skip
         accepted = {kind_of(each): each for each in group}
         with allowed(ControlError):
             assert decode(encode(decode(data, accepted, "a")), accepted, "a")
