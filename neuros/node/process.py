@@ -26,8 +26,9 @@ from neuros.errors import ControlError, NeurosError
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
+from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
-from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder, Voice
+from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder
 from neuros.project.model import Connection, NodeFile
 from neuros.stacks import StackFile
 
@@ -35,7 +36,6 @@ MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None
 Event = Callable[[], None]
 
 _REPORT_S = 1.0
-_LEAVE_S = 4.0
 
 
 class NodeProcess:
@@ -229,7 +229,7 @@ class NodeProcess:
                 return  # the session hears of the end from the supervisor
             for node in self._nodes:
                 node.pause()  # takes back what hooks could not use of a step
-        if not self._is_ending:
+        if not self.is_ending:
             answer(_at_rest(self._nodes, message))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
@@ -267,14 +267,14 @@ class NodeProcess:
         for file in self._files:
             self._add(file)
         for node in self._nodes:
-            if self._is_ending:
+            if self.is_ending:
                 return
             try:
                 node.load()
                 self._tell(declared(node.name, node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
-        if self._is_ending:
+        if self.is_ending:
             return
         self.report()
         for node in self._nodes:
@@ -291,7 +291,8 @@ class NodeProcess:
                 middleware.loop.post_from_thread(event)
 
     @property
-    def _is_ending(self) -> bool:
+    def is_ending(self) -> bool:
+        """Whether no further hook starts."""
         return self._stop_asked.is_set() or self._has_failed
 
     def _guard(self, action: Event) -> None:
@@ -387,6 +388,7 @@ class ControlThread(threading.Thread):
         self._signalled = signalled
         self._process = process
         self._session = session
+        self._session_link: ControlLink | None = None
         self._ended = threading.Event()
 
     def run(self) -> None:
@@ -406,6 +408,8 @@ class ControlThread(threading.Thread):
                 for key, _ in ready:
                     if not key.data():
                         return
+                if self._process.is_ending and self._session_link is not None:
+                    _shut(self._session_link)
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
                     self._try(self._process.report)
@@ -443,6 +447,8 @@ class ControlThread(threading.Thread):
         selector.unregister(listener)
         link = ControlLink(stream, FROM_SESSION, "the session")
         stack.callback(link.close)
+
+        self._session_link = link
 
         def take() -> bool:
             messages = self._received(link)
@@ -493,63 +499,6 @@ def signals_as_socket() -> Iterator[socket.socket]:
         writer.close()
 
 
-class PeerLink:
-    """Link between a launcher and its peers, through the nodes of this process.
-
-    The launcher knows no ROS. So each of its nodes publishes the launcher's state, and tells it
-    what nodes elsewhere publish; only in a project that is started in parts.
-
-    Args:
-        names: the nodes of this process.
-        elsewhere: content of the environment variable.
-        tell: sends to the supervisor.
-    """
-
-    def __init__(
-        self, names: Sequence[str], elsewhere: str, tell: Callable[[Message], None]
-    ) -> None:
-        self._names = names
-        self._elsewhere = [name for name in elsewhere.split(",") if name]
-        self._tell = tell
-        self._lock = threading.Lock()
-        self._voice: Voice | None = None
-        self._last_state = ""
-        self._may_leave = threading.Event()
-
-    def open(self, middleware: Middleware) -> None:
-        """Speak and listen from now on."""
-        if not self._elsewhere:
-            return
-        voice = middleware.join_peers(self._names, self._elsewhere, self._hear)
-        with self._lock:
-            self._voice = voice
-            if self._last_state:
-                voice.say(self._last_state)
-
-    def say(self, text: str) -> None:
-        """Pass on what the launcher says, as soon as that is possible. Any thread."""
-        with self._lock:
-            self._last_state = text
-            if self._voice is not None:
-                self._voice.say(text)
-
-    def leave(self) -> None:
-        """Nothing more will be said or needs to be heard. Any thread."""
-        self._may_leave.set()
-
-    def close(self) -> None:
-        """Stay until the launcher has said and heard all; it is bound by what it waits for."""
-        if self._voice is None:
-            return
-        self._may_leave.wait(_LEAVE_S)
-        with self._lock:
-            voice, self._voice = self._voice, None
-        voice.close()
-
-    def _hear(self, name: str, text: str | None) -> None:
-        self._tell(control.Heard(name, text))
-
-
 def _at_rest(
     nodes: Sequence[NodeRuntime], asked: control.Settle | control.Advance
 ) -> control.AtRest:
@@ -581,6 +530,14 @@ def _at_rest(
         {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
         packets,
     )
+
+
+def _shut(link: ControlLink) -> None:
+    """Have a send return that waits for a session which does not read, in another thread."""
+    with contextlib.suppress(OSError):
+        end = socket.fromfd(link.fileno(), socket.AF_UNIX, socket.SOCK_STREAM)
+        with end:
+            end.shutdown(socket.SHUT_RDWR)
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -64,6 +65,15 @@ def steer(node, wheels):
         raise RuntimeError("a wheel has broken")
     place, steps = node.get_user_data() or (1.0, 0)
     node.set_user_data((place + wheels.data, steps))
+"""
+EYE = """
+from neuros.hooks import neuros_tick
+
+@neuros_tick(seconds=1.0, outputs="image")
+def look(node):
+    image = node.make_packet("image")
+    image.data = bytes(4_000_000)
+    return image
 """
 BRAIN = """
 from neuros.hooks import neuros_function
@@ -347,6 +357,32 @@ def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> 
             node.resume()
     held.step(timeout_s=DEADLINE_S)
     assert held["robot.pose"].count == before + 2
+
+
+@pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
+def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
+    tmp_path: Path,
+) -> None:
+    eye = {"name": "eye", "plugin": "eye.py", "container": "neuros_python"}
+    eye["outputs"] = [port("image", "std_msgs/msg/UInt8MultiArray")]  # type: ignore[assignment]
+    (tmp_path / "eye.py").write_text(EYE)
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [eye]}))
+    with neuros.Project.from_file(tmp_path).session(backend="in-process") as s:
+        assert s["eye.image"].count == 0
+        children = psutil.Process().children(recursive=True)
+        (node,) = (each for each in children if str(s.folder) in " ".join(each.cmdline()))
+        node.suspend()
+        try:
+            with pytest.raises(TimeoutError):
+                s.step(timeout_s=0.0)
+        finally:
+            node.resume()
+        assert s._link._nodes is not None
+        assert select.select([s._link._nodes], [], [], DEADLINE_S)[0]
+        s._live.interrupt()
+        run = s._live.wait(DEADLINE_S)
+    assert run.exit_code == 130
+    assert run.nodes["eye"]["report"] == "final"
 
 
 def test_the_program_is_interrupted_in_a_step_and_goes_on(held: Session) -> None:
