@@ -1,8 +1,8 @@
 """Connection of a session with its run: it asks, and waits for the answer.
 
-Where one process holds all nodes, steps go straight to it. The supervisor is a thread of the program
-that steps, and takes turns with it: through the supervisor, a step takes up to twice as long. It
-takes no part in such a step; it hears of failures and ends from the nodes.
+Where one process holds all nodes, steps go straight to it. The supervisor is a thread of the
+program that steps, and takes turns with it: through the supervisor, a step takes about twice as
+long. It takes no part in such a step; it hears of failures and ends from the nodes.
 """
 
 from __future__ import annotations
