@@ -381,7 +381,7 @@ class ControlThread(threading.Thread):
         link: ControlLink,
         signalled: socket.socket,
         process: NodeProcess,
-        session: ControlListener | None,
+        session: ControlListener | None = None,
     ) -> None:
         super().__init__(name="neuros-control", daemon=True)
         self._link = link
@@ -408,7 +408,7 @@ class ControlThread(threading.Thread):
                 for key, _ in ready:
                     if not key.data():
                         return
-                if self._process.is_ending and self._session_link is not None:
+                if self._session_link is not None and self._process.is_ending:
                     _shut(self._session_link)
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S

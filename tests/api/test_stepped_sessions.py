@@ -310,6 +310,7 @@ def test_between_two_steps_nothing_starts(held: Session) -> None:
 
 
 def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
+    held.step()
     assert held.sim_time is not None
     end_s = held.sim_time + 1.0
     assert held.run(duration_sim_s=1.0)
