@@ -1,6 +1,6 @@
 """Lists that nodes of a run have written: times, digests and latencies of packets, executions.
 
-Reads what :mod:`neuros.node.packet_log` writes. Both ends' times are of the monotonic clock
+Reads what :mod:`neuros.node.logs` writes. Both ends' times are of the monotonic clock
 of one machine, which all its processes share; the two ends of a connection on different machines
 leave their lists in different run folders, and no latency is worked out for them.
 """

@@ -13,7 +13,7 @@ from string import Template
 from typing import Any
 
 from neuros.analysis.run_record import PastRun
-from neuros.node.world_log import FILE
+from neuros.node.logs import WORLD_LOG
 
 MOST_FRAMES = 6000
 """Of a page; of a longer recording, every k-th frame is shown."""
@@ -27,7 +27,7 @@ def world_pages(run: PastRun) -> dict[str, str]:
     """Pages by node, of those whose world was recorded."""
     found = {}
     for name in run.nodes:
-        scenes = list(_scenes(run.folder / name / FILE))
+        scenes = list(_scenes(run.folder / name / WORLD_LOG))
         if scenes:
             found[name] = _page(f"World of {name} in {run.name}", scenes)
     return found

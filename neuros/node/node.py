@@ -21,11 +21,11 @@ from neuros.node.effects import NodeEffects
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NewestPackets, NodeRecorder
+from neuros.node.logs import WorldLog
 from neuros.node.plugin import load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.node.world_log import WorldLog
 from neuros.ports import Middleware, PacketRecorder, Way
 from neuros.project.model import Connection, NodeFile, Port
 

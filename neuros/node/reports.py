@@ -11,10 +11,9 @@ from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeSt
 from neuros.engine.engine import Engine
 from neuros.engine.snapshot import explain, snapshot, steadily
 from neuros.hooks import HookKind, HookSpec
-from neuros.node.packet_log import PacketLog
+from neuros.node.logs import PacketLog, WorldLog
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.node.world_log import WorldLog
 from neuros.ports import Logger, Middleware, Transport, WorldLook
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import SESSION

@@ -14,7 +14,7 @@ import pytest
 
 import neuros.analysis.world_page as world_page
 from neuros.analysis.run_record import PastRun
-from neuros.node.world_log import FILE, WorldLog
+from neuros.node.logs import WORLD_LOG, WorldLog
 
 
 class World:
@@ -80,7 +80,7 @@ def test_frames_are_in_their_order_and_geometry_is_kept_once(run: PastRun, log: 
     (scene,) = scenes(run)
     assert scene["geometry"] == {"name": "</script> 1"}
     assert scene["times_s"] == scene["x"] == [0, 0.5, 1, 1.5, 2, 2.5]
-    assert (run.folder / "robot" / FILE).read_text().count("geometry") == 1
+    assert (run.folder / "robot" / WORLD_LOG).read_text().count("geometry") == 1
 
 
 def test_each_geometry_has_its_own_frames(run: PastRun, log: WorldLog) -> None:
@@ -120,7 +120,7 @@ def test_half_a_line_of_a_node_that_was_killed_is_left_out(run: PastRun, log: Wo
     world = World()
     world.at(0, 0)
     log.write(world.look)
-    with (run.folder / "robot" / FILE).open("a") as file:
+    with (run.folder / "robot" / WORLD_LOG).open("a") as file:
         file.write('{"version": "1", "fra')
     assert scenes(run)[0]["x"] == [0]
 

@@ -15,8 +15,8 @@ from neuros.engine.input_queue import Subscription
 from neuros.engine.schedule import ExecutionLog
 from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind, HookSpec
-from neuros.node import packet_log
-from neuros.node.packet_log import PacketLog
+from neuros.node import logs
+from neuros.node.logs import PacketLog
 from neuros.project.model import Connection
 
 LEAVING = Connection("node", "out", "other", "in", 0, index=3)
@@ -97,7 +97,7 @@ def test_first_executions_are_written_with_the_names_of_their_hooks(
 def test_a_file_does_not_grow_for_ever(
     tmp_path: Path, node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(packet_log, "MOST_ENTRIES", 2)
+    monkeypatch.setattr(logs, "MOST_ENTRIES", 2)
     log = PacketLog(node, {}, tmp_path)
     for time_ns in (1, 2, 3):
         node.send_windows[LEAVING].spend(time_ns)

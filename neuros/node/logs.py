@@ -1,4 +1,6 @@
-"""The packet log of a node: when each packet was sent and taken, and its digest.
+"""Logs of a node in the folder of its run: of its packets, and of the world that it simulates.
+
+The packet log says when each packet was sent and taken, and has its digest.
 
 ``<node>/packets/<index of the connection>.<what>`` are files of 8-byte numbers, in the byte order
 of the machine, one per packet:
@@ -19,6 +21,12 @@ Where packets are recorded, ``event_log`` has what happened to the engine (see
 
 An entry costs the node's thread some 50 ns. The thread that reports to the supervisor writes them
 out once per second.
+
+The world log says how a simulated world has moved in a recorded run, for ``neuros report`` to show.
+
+``<node>/world.jsonl`` has a JSON object per line: ``version`` of the geometry; ``geometry``, as
+JSON text, where that is another one than in the line before; ``frames``: lists of wall and
+simulated time in seconds, and poses (see :mod:`neuros.simulators.mujoco.scene`).
 """
 
 from __future__ import annotations
@@ -33,6 +41,7 @@ from typing import Any
 
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
+from neuros.ports import Logger, WorldLook
 from neuros.project.model import Connection
 
 FOLDER = "packets"
@@ -128,3 +137,34 @@ class PacketLog:
             f"{self._folder} could not be written to ({error.strerror}): latencies and digests"
             " end there"
         )
+
+
+WORLD_LOG = "world.jsonl"
+_ASKER = -1  # observers have numbers from 1
+
+
+class WorldLog:
+    """Writes the world of one node, about once per second. ``folder`` is the node's own."""
+
+    def __init__(self, folder: Path, logger: Logger) -> None:
+        self._file = folder / WORLD_LOG
+        self._logger = logger
+        self._version: str | None = None
+        self._is_broken = False
+        self._lock = threading.Lock()
+
+    def write(self, look: WorldLook) -> None:
+        """Add the frames since the last time. Any thread; what fails ends the log, not the run."""
+        with self._lock:
+            if self._is_broken:
+                return
+            try:
+                seen = dict(look({"frames": True}, _ASKER))
+                if seen["version"] != self._version:
+                    seen |= look({"geometry": True}, _ASKER)
+                    self._version = seen["version"]
+                with self._file.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(seen) + "\n")
+            except Exception as error:
+                self._is_broken = True
+                self._logger.warning(f"the world is not recorded any more: {error}")
