@@ -9,8 +9,7 @@ from typing import Any
 
 from std_msgs.msg import Float64MultiArray, String
 
-from neuros.node.batches import LONGEST_ARRAY, MOST_ARRAYS, MOST_PACKETS, MOST_SPIKES
-from neuros.node.sampling import Sampler
+from neuros.node.sampling import LONGEST_ARRAY, MOST_ARRAYS, MOST_PACKETS, MOST_SPIKES, Sampler
 
 
 def spikes(senders: list[int], times: list[float], stamp_s: int = 0, size: int = 60) -> Any:
