@@ -1,6 +1,8 @@
-"""``neuros launch`` and ``neuros sweep``: runs with console, signals, and exit code.
+"""``neuros launch``, ``sweep`` and ``export``: runs with console, signals, and exit code.
 
 What runs projects is imported late: ``--help`` and completion read this module, too.
+
+``neuros part`` is what the containers of an exported project start.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from neuros.api.request import LaunchOptions, SweepOptions
+from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request, SweepOptions
 from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.output import JSON, add_format, print_json
@@ -266,3 +268,61 @@ def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) ->
     values = list(row)[: list(row).index("exit_code")]
     what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
     print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)
+
+
+_OF_PARTS = ("domain_id", "peers", "peer_timeout", "duration", "output", "verbose")
+_CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
+
+
+def add_export(export: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    export.description = (
+        "Write the files with which Docker Compose, Docker Swarm or Kubernetes start a project,"
+        " without NeuROS on their machines; each node gets a container. Or write a batch script"
+        " that launches the project on Slurm."
+    )
+    export.add_argument("form", choices=FORMS, help="for which engine")
+    add_project(export, ExportOptions)
+    export.set_defaults(command=_export)
+
+
+def _export(parsed: argparse.Namespace) -> int:
+    from neuros.api.export import export
+    from neuros.cli.environments import build_messages
+
+    project, messages = load_with_messages(parsed)
+    if ended := build_messages(messages):
+        return ended
+    options = replace(parsed_as(ExportOptions, parsed), form=parsed.form)
+    print(export(project, messages.paths, options))
+    return 0
+
+
+def add_part(part: argparse.ArgumentParser) -> None:
+    """Add the arguments of the program."""
+    part.add_argument("file", type=Path)
+    part.add_argument("node")
+    add_options(part, [each for each in options_of(Request) if each.name in _OF_PARTS])
+    part.set_defaults(command=_part)
+
+
+def _part(parsed: argparse.Namespace) -> int:
+    """Start one node of an exported project, and be a peer of the others; returns the exit code."""
+    with signals_noted() as (signals, waker):
+        from neuros.api.execution import Execution
+        from neuros.api.part import part_plan, reach_peers, read_parts
+        from neuros.errors import EnvironmentFault
+
+        declared = [each for each in options_of(Request) if each.name in _OF_PARTS]
+        request = Request(
+            nodes=(parsed.node,), backend="process", network=True, **values_of(declared, parsed)
+        )
+        project = read_parts(parsed.file)
+        try:
+            network = reach_peers(request.peers, request.peer_timeout, signals)
+        except EnvironmentFault:
+            if signals:
+                return _CODES_OF_SIGNALS[signals[0]]
+            raise
+        plan = part_plan(project, network, request)
+        return int(Execution(plan, sys.stdout, signals, waker).run()["exit_code"])
