@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.backends.machines.clock import ClockOffset
-from neuros.backends.machines.machine import agent_command
+from neuros.backends.machines.machine import ClockOffset, agent_command
 from neuros.backends.machines.mirror import Follower, write_chunk
 from neuros.backends.machines.pump import Pump
 from neuros.backends.machines.trees import RECEIVED, RUNS, TreeStore, scan
