@@ -21,8 +21,7 @@ from neuros.launcher.channels import Channels, Observers, Overheard, PauseState
 from neuros.launcher.declarations import Declarations
 from neuros.launcher.outcome import Outcome, Output, Phase, Processes, names_of
 from neuros.launcher.peers import Peers
-from neuros.launcher.quiescence import Probing, Verdict, connections_among
-from neuros.launcher.settling import Settling
+from neuros.launcher.quiescence import Probing, Settling, Verdict, connections_among
 from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.ports import ControlListener, Launcher, RunningNode

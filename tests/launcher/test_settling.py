@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from neuros.control import AtRest, Message, NewestPacket, Pause, Settle, Settled
 from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels
-from neuros.launcher.settling import Settling
+from neuros.launcher.quiescence import Settling
 
 SESSION = cast(ControlLink, "the session")
 
