@@ -15,8 +15,8 @@ from neuros.api.loading import workspaces_of
 from neuros.api.plan import are_made, make_environments
 from neuros.backends.environments.pythons import Pythons
 from neuros.errors import UsageError
-from neuros.messages.cache import message_cache
 from neuros.messages.needed import Messages
+from neuros.messages.workspace import message_cache
 from neuros.project.model import NodeFile
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -174,7 +174,7 @@ def _replay_node(options: argparse.Namespace) -> int:
     from neuros.analysis.recorded_node import RecordedNode, recorded_node
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
-    from neuros.messages.cache import message_cache
+    from neuros.messages.workspace import message_cache
     from neuros.replay.containers import as_on_this_machine
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)

@@ -5,9 +5,9 @@ A ROS package in a ``workspace`` folder (``package.xml``, ``msg/*.msg``, ``srv/*
 ROS distribution is done here with rosidl's generators, which come with the wheels, and gcc:
 
 - :mod:`~neuros.messages.package` finds packages, in workspaces and in ROS, and reads manifests;
-- :mod:`~neuros.messages.workspace` knows all packages that a project sees: order and keys;
+- :mod:`~neuros.messages.workspace` knows all packages that a project sees: order and keys; and
+  what is built, and by which process a package is built now;
 - :mod:`~neuros.messages.checking` finds mistakes in them, line by line;
-- :mod:`~neuros.messages.cache` knows what is built, and by which process a package is built now;
 - :mod:`~neuros.messages.needed` builds what a run needs, with the generators in
   :mod:`~neuros.messages.generation` and the compiler in :mod:`~neuros.messages.compilation`.
 

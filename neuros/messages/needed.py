@@ -17,10 +17,9 @@ from pathlib import Path
 from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.progress import Progress
 from neuros.messages import generation
-from neuros.messages.cache import Built, sweep
 from neuros.messages.compilation import HEADERS, CompilationError, Compilers, Job, compile_package
 from neuros.messages.package import MANIFEST, Package, Ros
-from neuros.messages.workspace import Workspaces, cycle_problem
+from neuros.messages.workspace import Built, Workspaces, cycle_problem, sweep
 from neuros.project.model import Node
 
 # What services and actions are made of, besides what their files name.
