@@ -16,7 +16,7 @@ from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
 from neuros.project.message_types import unknown_type
 from neuros.project.model import NETWORK, NETWORK_MODULE, Node, Project
-from neuros.project.modules import why_not
+from neuros.project.paths import why_no_module
 from neuros.project.scanner import display_name, place_of
 from neuros.recording.provenance import seeds
 
@@ -115,7 +115,7 @@ def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
             package = node.module.partition(".")[0]
             if not _names_package(container.folder, package):
                 pointer = f"{node.pointer}/plugin"
-                text, _ = why_not(node.module)
+                text, _ = why_no_module(node.module)
                 hint = f"nothing in {container.folder} names '{package}'"
                 place = place_of(node.file, pointer)
                 yield Problem(display_name(node.file), *place, pointer, text, hint)

@@ -28,7 +28,6 @@ from neuros.project.model import (
     Project,
     parameters_of,
 )
-from neuros.project.modules import find_module, is_module_name, why_not
 from neuros.project.parsed import (
     ParsedProject,
     apply_namespace,
@@ -37,7 +36,7 @@ from neuros.project.parsed import (
     names_of,
     parse_project,
 )
-from neuros.project.paths import PathError, Roots
+from neuros.project.paths import PathError, Roots, find_module, is_module_name, why_no_module
 from neuros.project.qos import qos_of
 from neuros.project.resources import Access, Resources, access_of, resources_of
 from neuros.project.scanner import Element, SourceError, display_name
@@ -118,7 +117,7 @@ class _Builder:
         try:
             return "", self._roots.find(name, member.source.folder)
         except PathError as error:
-            text, hint = why_not(name)
+            text, hint = why_no_module(name)
             path = find_module(name)
             if path is None and self._is_like_this_machine(element):
                 self.problems.append(member.problem(text, error.hint or hint))

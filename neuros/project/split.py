@@ -18,8 +18,8 @@ from neuros.project.model import (
     parameters_of,
     parameters_to_json,
 )
-from neuros.project.modules import find_module, is_module_name
 from neuros.project.names import names_from, names_to_json
+from neuros.project.paths import find_module, is_module_name
 from neuros.project.qos import qos_of, qos_to_json
 from neuros.project.resources import access_of, keys_of, resources_of
 

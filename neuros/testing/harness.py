@@ -23,7 +23,7 @@ from neuros.messages.workspace import Workspaces
 from neuros.node.plugin import no_module
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
-from neuros.project.modules import find_module, is_module_name
+from neuros.project.paths import find_module, is_module_name
 from neuros.testing.bench import NodeBench
 from neuros.testing.wiring import ports, with_neighbours, with_observer
 from neuros.transport.messages import checked, decode, encode, message_class

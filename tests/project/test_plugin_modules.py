@@ -15,7 +15,7 @@ from neuros.errors import EnvironmentFault, PluginError, ProjectError
 from neuros.project.graph import graph_text
 from neuros.project.load import load_project
 from neuros.project.model import Folders, Project
-from neuros.project.modules import find_module, is_module_name
+from neuros.project.paths import find_module, is_module_name
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.testing import PluginHarness
 
