@@ -238,9 +238,8 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.findings import findings_of
     from neuros.analysis.page import report_page
-    from neuros.analysis.panels_page import panels_page
     from neuros.analysis.run_record import open_for_review
-    from neuros.analysis.world_page import world_pages
+    from neuros.analysis.slider_pages import panels_page, world_pages
 
     run = open_for_review(options.run)
     findings = findings_of(run)

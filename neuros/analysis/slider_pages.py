@@ -1,4 +1,7 @@
-"""Page of a recorded run: spike rasters and heat maps with a slider over time, in one HTML file."""
+"""Pages of a recorded run with a slider over time, each one HTML file.
+
+Panels are spike rasters and heat maps; a world is a 3-D view over simulated time.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -17,6 +21,7 @@ import numpy.typing as npt
 
 from neuros.analysis.run_record import PastRun
 from neuros.errors import UsageError
+from neuros.node.logs import WORLD_LOG
 from neuros.project.dashboard import ARRAYS, SPIKES
 from neuros.recording.bag_reader import RecordedTopic, open_bag
 from neuros.recording.labelled import has_simulated_time
@@ -28,8 +33,8 @@ MOST_ARRAYS = 3000
 LONGEST_ARRAY = 4096
 
 _STATIC = files("neuros") / "viewers" / "dashboard" / "static"
-_PAGE = files("neuros") / "analysis" / "panels_page.html"
-_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.js")
+_PANELS_PAGE = files("neuros") / "analysis" / "panels_page.html"
+_PANELS_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.js")
 _IMPORT = re.compile(r"^import .*$", re.MULTILINE)
 
 
@@ -50,8 +55,8 @@ def panels_page(run: PastRun) -> str | None:
     if not panels:
         return None
     data = json.dumps(panels).replace("</", "<\\/")  # which would end the script that holds it
-    scripts = (_IMPORT.sub("", (_STATIC / name).read_text("utf-8")) for name in _SCRIPTS)
-    page = Template(_PAGE.read_text("utf-8"))
+    scripts = (_IMPORT.sub("", (_STATIC / name).read_text("utf-8")) for name in _PANELS_SCRIPTS)
+    page = Template(_PANELS_PAGE.read_text("utf-8"))
     return page.substitute(
         title=escape(f"Activity in {run.name}"), scripts="\n".join(scripts), panels=data
     )
@@ -93,3 +98,64 @@ def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str
 
 def _packed(numbers: npt.NDArray[Any]) -> str:
     return base64.b64encode(zlib.compress(numbers.tobytes())).decode()
+
+
+MOST_FRAMES = 6000
+"""Of a page; of a longer recording, every k-th frame is shown."""
+
+_WORLD_PAGE = files("neuros") / "analysis" / "world_page.html"
+_WORLD_SCRIPTS = {"library": "vendor/three.iife.min.js", "scene": "scene.js"}
+
+
+def world_pages(run: PastRun) -> dict[str, str]:
+    """Pages by node, of those whose world was recorded."""
+    found = {}
+    for name in run.nodes:
+        scenes = list(_scenes(run.folder / name / WORLD_LOG))
+        if scenes:
+            found[name] = _page(f"World of {name} in {run.name}", scenes)
+    return found
+
+
+def _scenes(file: Path) -> Iterator[dict[str, Any]]:
+    """Each geometry, with the times and poses of its frames; what stood still is left out.
+
+    Where the simulation was reset, time goes on.
+    """
+    scenes: list[tuple[str, list[tuple[float, str]]]] = []
+    before_s, last_s = 0.0, -1.0
+    for line in _lines(file):
+        if "geometry" in line:
+            scenes.append((line["geometry"], []))
+        for _, sim_s, poses in line["frames"]:
+            if before_s + sim_s < last_s:
+                before_s = last_s
+            if before_s + sim_s > last_s or not scenes[-1][1]:
+                last_s = before_s + sim_s
+                scenes[-1][1].append((last_s, poses))
+    stride = -(-sum(len(frames) for _, frames in scenes) // MOST_FRAMES)
+    for geometry, frames in scenes:
+        if kept := frames[::stride]:
+            poses = b"".join(base64.b64decode(poses) for _, poses in kept)
+            yield {
+                "geometry": json.loads(geometry),
+                "times_s": [time_s for time_s, _ in kept],
+                "poses": base64.b64encode(zlib.compress(poses)).decode(),
+            }
+
+
+def _lines(file: Path) -> Iterator[dict[str, Any]]:
+    """Whole lines of the file; a node that was killed may have left half of one."""
+    if file.is_file():
+        for line in file.read_text("utf-8").splitlines():
+            try:
+                yield json.loads(line)
+            except ValueError:
+                return
+
+
+def _page(title: str, scenes: list[dict[str, Any]]) -> str:
+    data = json.dumps(scenes).replace("</", "<\\/")  # which would end the script that holds it
+    scripts = {key: (_STATIC / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
+    page = Template(_WORLD_PAGE.read_text("utf-8"))
+    return page.substitute(scripts, title=escape(title), scenes=data)
