@@ -175,7 +175,7 @@ def _build_images(options: argparse.Namespace) -> int:
 
 def _list_images(options: argparse.Namespace) -> int:
     from neuros.backends.docker.engine import connect
-    from neuros.backends.docker.inventory import inventory
+    from neuros.backends.docker.images import inventory
     from neuros.backends.docker.recipes import names_in
 
     with closing(connect()) as engine:
@@ -197,7 +197,7 @@ def _list_images(options: argparse.Namespace) -> int:
 
 def _remove_images(options: argparse.Namespace) -> int:
     from neuros.backends.docker.engine import connect
-    from neuros.backends.docker.inventory import remove_images
+    from neuros.backends.docker.images import remove_images
 
     with closing(connect()) as engine:
         has_removed = False
