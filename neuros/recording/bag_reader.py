@@ -28,12 +28,13 @@ from neuros.recording.labelled import (
     Column,
     dataset_of,
     library,
+    segment_of,
     simulated_time_ns,
+    write_nwb,
 )
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.repair import needs_repair, repair
 from neuros.recording.run_file import read_run_file
-from neuros.recording.spike_trains import segment_of, write_nwb
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 _MOST_COLUMNS = 100
