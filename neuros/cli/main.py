@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -151,6 +152,11 @@ def main(arguments: Sequence[str]) -> int:
         # As in `neuros graph PROJECT | head`: Python must not try again to write, when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise
+        _complain(f"neuros: {error.filename} cannot be opened ({error.strerror})")
+        return EXIT_USAGE
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:

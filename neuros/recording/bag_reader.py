@@ -21,7 +21,7 @@ from rosbags.interfaces import Connection, QosDurability, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault
 from neuros.recording.labelled import (
     LOG_TIME,
     PUBLISH_TIME,
@@ -33,8 +33,7 @@ from neuros.recording.labelled import (
     write_nwb,
 )
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
-from neuros.recording.repair import needs_repair, repair
-from neuros.recording.run_file import read_run_file
+from neuros.recording.repair import needs_repair, recorded_counts, repair
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 _MOST_COLUMNS = 100
@@ -297,16 +296,7 @@ def open_bag(run: str | os.PathLike[str]) -> Bag:
     if needs_repair(folder, plan):
         _repair_if_possible(folder)
     connections = {topic.name: topic.connection for topic in plan.topics}
-    return Bag(folder / BAG_NAME, connections, _recorded(folder))
-
-
-def _recorded(run: Path) -> dict[str, int]:
-    """By topic, the packets that were in the bag when the run ended, as far as is known."""
-    try:
-        topics = read_run_file(run)["recording"]["topics"]
-        return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (UsageError, EnvironmentFault, KeyError):
-        return {}
+    return Bag(folder / BAG_NAME, connections, recorded_counts(folder))
 
 
 def _repair_if_possible(run: Path) -> None:

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.recorder import Recorder, has_spools
 from neuros.recording.recording_plan import (
     BAG_NAME,
@@ -19,10 +19,12 @@ from neuros.recording.recording_plan import (
     RecordingPlan,
     load_plan,
 )
+from neuros.recording.run_file import read_run_file
 from neuros.recording.spool import SpoolReader, listened_topics
 from neuros.recording.stored import is_whole, opened, stored_messages
 
 DAMAGED_NAME = "bag.damaged"
+KEPT_NAME = "bag.before_repair"
 
 
 @contextlib.contextmanager
@@ -67,6 +69,15 @@ def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | Non
         ) from error
 
 
+def recorded_counts(run: Path) -> dict[str, int]:
+    """By topic, the packets that were in the bag when the run ended, as far as is known."""
+    try:
+        topics = read_run_file(run)["recording"]["topics"]
+        return {name: int(topic["recorded"]) for name, topic in topics.items()}
+    except (UsageError, EnvironmentFault, KeyError):
+        return {}
+
+
 def counts_of(run: Path) -> dict[str, int]:
     """Packets in the bag of a run, by topic. Raises ``OSError`` if it cannot be read."""
     try:
@@ -99,9 +110,15 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
         shutil.rmtree(bag)
     topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     present: set[tuple[int, int]] = set()
+    faults: list[str] = []
+
+    def note(fault: str) -> None:
+        faults.append(fault)
+        complain(fault)
+
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        for message in stored_messages(damaged, complain):
+        for message in stored_messages(damaged, note):
             topic = topics.get(message.topic)
             number = None if topic is None else recorder.copy(topic, message)
             if number is not None:
@@ -110,8 +127,15 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
     except BaseException:
         recorder.abandon()
         raise
+    counts = recorder.counts()
+    is_less = any(counts.get(name, 0) < count for name, count in recorded_counts(run).items())
     # In this order: cut off in between, the next repair finds all that is not in the bag.
     if damaged.exists():
-        shutil.rmtree(damaged)
+        kept = run / KEPT_NAME
+        if (faults or is_less) and not kept.exists():
+            damaged.rename(kept)
+            complain(f"the damaged bag is kept in {kept}")
+        else:
+            shutil.rmtree(damaged)
     recorder.clean_up()
-    return recorder.counts()
+    return counts

@@ -191,6 +191,25 @@ def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Fou
                 complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
             file.seek(offset + len(whole))
             yield from _of_chunk(whole, offset, topics)
+        elif size > len(content) and (distance := _next_chunk(content)) is not None:
+            complain(f"{file.name} is damaged between bytes {offset} and {offset + distance}")
+            file.seek(offset + distance)
+
+
+def _next_chunk(content: bytes) -> int | None:
+    """Where a record after a damaged length is a whole chunk with the right checksum."""
+    at = content.find(CHUNK)
+    while at >= 0:
+        start = at + RECORD_HEAD.size
+        if start + CHUNK_HEAD.size > len(content):
+            return None
+        size = RECORD_HEAD.unpack_from(content, at)[1]
+        _, _, records, checksum = CHUNK_HEAD.unpack_from(content, start)
+        is_there = size == CHUNK_HEAD.size + 4 + 8 + records <= len(content) - start
+        if checksum and is_there and _is_as_written(content[start : start + size]):
+            return at
+        at = content.find(CHUNK, at + 1)
+    return None
 
 
 def _size_in(chunk: bytes) -> int:

@@ -32,6 +32,14 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
+@pytest.mark.parametrize("command", ["validate", "launch", "report", "logs", "bag info", "types"])
+def test_a_name_that_is_too_long_is_one_sentence(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command.split(), "a" * 5000]) == 2
+    assert "cannot be opened (File name too long)" in capsys.readouterr().err
+
+
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """Two connected nodes, ``a`` and ``b``."""

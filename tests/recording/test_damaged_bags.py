@@ -85,3 +85,32 @@ def test_a_length_that_is_wrong_takes_no_memory_and_costs_no_packet(
     assert main(["bag", "repair", str(run)]) == 0
     assert "is damaged between bytes" in capsys.readouterr().err
     assert values_in(neuros.bag.open(run)) == VALUES
+
+
+def test_a_wrong_length_of_the_first_record_costs_no_packet(whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    damage_header(run)
+    assert main(["bag", "info", str(run)]) == 0  # completes it
+    assert values_in(neuros.bag.open(run)) == VALUES
+
+
+def test_a_repair_keeps_the_damaged_bag(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    damaged = damage_header(run)
+    assert main(["bag", "repair", str(run)]) == 0
+    kept = run / "bag.before_repair"
+    assert f"the damaged bag is kept in {kept}" in capsys.readouterr().err
+    assert (kept / "bag.mcap").read_bytes() == damaged
+
+
+def damage_header(run: Path) -> bytes:
+    """Make the length of the first record of a bag greater than the file, as it is then."""
+    file = run / "bag" / "bag.mcap"
+    data = bytearray(file.read_bytes())
+    data[9:17] = (1 << 62).to_bytes(8, "little")
+    file.write_bytes(data)
+    return bytes(data)
