@@ -1,4 +1,4 @@
-"""What a process of nodes says and hears in the name of its launcher, which knows no ROS."""
+"""The link of a launcher with its peers, by the nodes of this process."""
 
 from __future__ import annotations
 
