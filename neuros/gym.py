@@ -277,8 +277,10 @@ class _Numbers:
             low, high = (
                 np.broadcast_to(np.asarray(bound, self._dtype), self._shape) for bound in bounds
             )
-        except ValueError as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise UsageError(f"range of {self.name}: {error}") from error
+        if not np.all(low <= high):  # nor is it with NaN
+            raise UsageError(f"range of {self.name}: the lowest value must be at most the highest")
         return spaces.Box(low, high, dtype=self._dtype.type)
 
     def read(self, message: Any) -> Any:
@@ -318,7 +320,10 @@ _CONVERT: Mapping[Sort, Callable[[float], Any]] = {
 
 
 def _listed(names: str | Sequence[str]) -> Sequence[str]:
-    return [names] if isinstance(names, str) else names
+    listed = [names] if isinstance(names, str) else names
+    if not isinstance(listed, Sequence) or not all(isinstance(each, str) for each in listed):
+        raise UsageError(f"action and observation are names, or lists of names, not {names!r}")
+    return listed
 
 
 def _space(numbers: Sequence[_Numbers], *, is_one: bool) -> spaces.Space[Any]:

@@ -225,7 +225,13 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         ({"observation": "robot"}, r"say node\.port, node\.port\.field or"),
         ({"action": "robot.imu"}, "the output is connected to no input"),
         ({"ranges": {"robot.imu": (0, 1)}}, "ranges: 'robot.imu' is none of robot.order, robot"),
+        ({"observation": 5}, "names, or lists of names, not 5"),
+        ({"action": ["robot.order", None]}, "names, or lists of names, not "),
         ({"ranges": {"robot.order": (0, [1, 2])}}, "range of robot.order: "),
+        ({"ranges": {"robot.order": (0, float("nan"))}}, "range of robot.order: the lowest"),
+        ({"ranges": {"robot.order": (1, -1)}}, "range of robot.order: the lowest value must be"),
+        ({"ranges": {"robot.order": 3}}, "range of robot.order: "),
+        ({"ranges": {"robot.flag": (0, 300)}, "action": "robot.flag"}, "range of robot.flag: "),
         ({"model": "nothing.xml"}, "nothing.xml"),
     ],
 )
