@@ -92,7 +92,7 @@ class Running:
         """Send a signal to the launcher alone."""
         self.process.send_signal(number)
 
-    def finish(self, timeout_s: float = 20.0) -> Finished:
+    def finish(self, timeout_s: float = 60.0) -> Finished:
         """Wait for the end; fails if it does not come in time, having ended everything."""
         deadline_s = time.monotonic() + timeout_s
         while self._read(deadline_s):
@@ -172,7 +172,7 @@ def launch(
     project: Path | str,
     *arguments: str,
     cwd: Path,
-    timeout_s: float = 20.0,
+    timeout_s: float = 60.0,
     **environment: str,
 ) -> Finished:
     """Run ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd`` to its end."""

@@ -67,6 +67,8 @@ class Surroundings:
     def has_taken_in(self) -> bool:
         return True
 
+    def give_way(self) -> None: ...
+
     def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet
 
