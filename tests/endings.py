@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 from pathlib import Path
 
-from neuros.backends.shared_memory import _dead_groups
+from neuros.backends.shared_memory import _holders
 
 GONE_WITHIN_S = 6.0
 RUNS = """
@@ -23,8 +23,8 @@ def dead_shared_memory(since_s: float) -> list[str]:
 
     Not LTTng's: there is one per user, which the nodes of other tests make and give up meanwhile.
     """
-    groups = _dead_groups(Path("/dev/shm"), since_s)
-    names = [name for group in groups for name, _ in group.files]
+    groups = _holders(Path("/dev/shm"), since_s)
+    names = [name for files, holders in groups.items() if not holders for name, _ in files]
     return [name for name in names if not name.startswith("lttng-")]
 
 

@@ -101,6 +101,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "executors.slurm": {"submitit"},
     "messages.package": {"catkin_pkg"},
     "messages.checking": {"rosidl_adapter"},
+    "messages.workspace": {"rosidl_adapter"},
     "messages.generation": GENERATORS,
     "messages.compilation": {"numpy"},
     "cli.main": {"argcomplete"},

@@ -37,6 +37,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 from neuros.backends.run_processes import RunProcesses
 
@@ -49,6 +50,9 @@ _LOCKS = ("_el", "_sl")
 _CLOCK_SLACK_S = 0.05
 _NAME = re.compile(r"neuros_(?P<run>[0-9a-f]{16})(?:_.*)?")
 _LOOK_AGAIN_S = 0.1
+_MOST_LOOKS = 20
+_UNSEEN = 0  # the holder of a lock in another container, or of another user
+_Files: TypeAlias = "tuple[tuple[str, int], ...]"  # names and inodes: they live and die together
 
 
 def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[str, ...]:
@@ -68,26 +72,34 @@ def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[st
 
 
 def sweep(
-    started_s: float, *, folder: Path = Path("/dev/shm"), look_again_s: float = 0.1
+    started_s: float, *, folder: Path = Path("/dev/shm"), look_again_s: float = _LOOK_AGAIN_S
 ) -> tuple[str, ...]:
     """Remove what dead nodes of this user left since ``started_s`` (Unix time, seconds).
 
-    Looks twice, ``look_again_s`` apart, and removes only what is dead both times: a node that is
-    just starting makes its files a moment before it locks them. Returns the names removed.
+    Looks every ``look_again_s``, and removes what nobody holds in two looks in a row: a node that
+    is just starting makes its files a moment before it locks them. What the same process holds
+    twice in a row is alive. A holder that changes is no owner: other sweeps, and Fast DDS in the
+    neighbours, open lock files for a moment to see whether they are locked. Returns the names
+    removed.
     """
-    first = set(_dead_groups(folder, started_s))
-    if not first:
-        return ()
-    time.sleep(look_again_s)
-    dead = [group for group in _dead_groups(folder, started_s) if group in first]
-    return tuple(name for group in dead for name in _remove(folder, group.files))
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Files that live and die together; ``files`` are (name, inode)."""
-
-    files: tuple[tuple[str, int], ...]
+    removed: list[str] = []
+    before = _holders(folder, started_s)
+    for _ in range(_MOST_LOOKS):
+        if not before:
+            break
+        time.sleep(look_again_s)
+        now = {
+            files: held for files, held in _holders(folder, started_s).items() if files in before
+        }
+        for files, held in now.items():
+            if not held and not before[files]:
+                removed += _remove(folder, files)
+        before = {
+            files: held
+            for files, held in now.items()
+            if held != before[files] and held.isdisjoint(before[files])
+        }
+    return tuple(removed)
 
 
 @dataclass
@@ -96,24 +108,24 @@ class _Found:
     locks: list[str] = field(default_factory=list)
 
 
-def _dead_groups(folder: Path, started_s: float) -> Iterator[_Group]:
-    found = _groups(folder)
-    fresh = {
-        base: group
-        for base, group in found.items()
+def _holders(folder: Path, started_s: float) -> dict[_Files, set[int]]:
+    """Who holds each group of files: process ids, :data:`_UNSEEN` for one that cannot be seen."""
+    fresh = [
+        group
+        for base, group in _groups(folder).items()
         if _is_ours(group.files.values(), started_s if not _LTTNG.fullmatch(base) else 0.0)
-    }
+    ]
     if not fresh:
-        return
-    used = _names_in_use(folder)
-    for group in fresh.values():
-        dead = (
-            not any(_is_locked(folder, name, used) for name in group.locks)
-            if group.locks
-            else used.isdisjoint(group.files)
-        )
-        if dead:
-            yield _Group(tuple(sorted((name, stat.st_ino) for name, stat in group.files.items())))
+        return {}
+    used = _users(folder)
+    held = {}
+    for group in fresh:
+        files = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
+        holders = set().union(*(used.get(name, ()) for name in group.locks or group.files))
+        if not holders and any(_is_locked(folder, name) for name in group.locks):
+            holders = {_UNSEEN}
+        held[files] = holders
+    return held
 
 
 def _groups(folder: Path) -> Mapping[str, _Found]:
@@ -139,29 +151,28 @@ def _is_ours(stats: Iterable[os.stat_result], started_s: float) -> bool:
     )
 
 
-def _names_in_use(folder: Path) -> set[str]:
-    """Names in ``folder`` that some process, as far as it can be seen, has mapped or open."""
+def _users(folder: Path) -> Mapping[str, set[int]]:
+    """The processes, as far as they can be seen, that have a name in ``folder`` mapped or open."""
     prefix = f"{folder}/"
-    names: set[str] = set()
-    for pid in filter(str.isdigit, os.listdir("/proc")):
+    users: dict[str, set[int]] = {}
+    for pid in map(int, filter(str.isdigit, os.listdir("/proc"))):
         # Processes end while we look, and those of other users do not let us in.
         with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
             for line in maps:
                 at = line.find(prefix.encode())
                 if at >= 0:
-                    names.add(os.fsdecode(line[at + len(prefix) :].rstrip(b"\n")))
+                    name = os.fsdecode(line[at + len(prefix) :].rstrip(b"\n"))
+                    users.setdefault(name, set()).add(pid)
         with contextlib.suppress(OSError):
             for descriptor in os.listdir(f"/proc/{pid}/fd"):
                 with contextlib.suppress(OSError):
                     target = os.readlink(f"/proc/{pid}/fd/{descriptor}")
                     if target.startswith(prefix):
-                        names.add(target[len(prefix) :])
-    return names
+                        users.setdefault(target[len(prefix) :], set()).add(pid)
+    return users
 
 
-def _is_locked(folder: Path, name: str, used: set[str]) -> bool:
-    if name in used:  # open: locked, or about to be; do not get in the way
-        return True
+def _is_locked(folder: Path, name: str) -> bool:
     try:
         descriptor = os.open(folder / name, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:

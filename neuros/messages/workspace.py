@@ -28,10 +28,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import Problem
 from neuros.messages.package import MANIFEST, Package, Ros, find_packages, problem_at
+from neuros.project.message_types import MessageField
 
 _FORMAT = b"1"  # of what is built; another one builds everything anew
 _ABI = Path(__file__).with_name("stable_abi.h")
@@ -109,11 +111,21 @@ class Workspaces:
         except CycleError:
             return None
 
-    def definition(self, package: str, name: str) -> Path | None:
-        """The ``.msg`` file of a message, ``None`` if it is not in a workspace."""
+    def fields(self, package: str, name: str) -> dict[str, MessageField] | None:
+        """The fields of a message, ``None`` if it is in no workspace, or its file is wrong."""
         if name not in (self.messages(package) or ()):
             return None
-        return self.packages[package].folder / "msg" / f"{name}.msg"
+        from rosidl_adapter.parser import InvalidSpecification, parse_message_file
+
+        try:
+            file = self.packages[package].folder / "msg" / f"{name}.msg"
+            message = parse_message_file(package, file)
+        except (OSError, ValueError, TypeError, AssertionError, InvalidSpecification):
+            return None  # the check of message packages says so
+        return {
+            each.name: MessageField(_type_name(each.type), is_array=each.type.is_array)
+            for each in message.fields
+        }
 
     def builds(self, names: Iterable[str]) -> list[Built]:
         """Packages and all that they depend on, built or not, as :meth:`closure` orders them."""
@@ -188,6 +200,12 @@ def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
     package = workspaces.packages[names[0]]
     text = f"found packages that need each other: {' -> '.join(names)}"
     return problem_at(package.folder / MANIFEST, text)
+
+
+def _type_name(declared: Any) -> str:
+    """Of a type of rosidl's parser: ``float64``, ``geometry_msgs/msg/Vector3``."""
+    own = str(declared.type)
+    return own if declared.pkg_name is None else f"{declared.pkg_name}/msg/{own}"
 
 
 def message_cache(environ: Mapping[str, str]) -> Path:

@@ -11,14 +11,42 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from neuros.project.suggest import did_you_mean
 
 _NOTATION = re.compile(r"([A-Za-z]\w*)(?:\.msg\.|/msg/)([A-Za-z]\w*)", re.ASCII)
+_TEXTS = ("string", "wstring", "byte", "octet", "wchar")
 _IMPORTED = re.compile(r"^\s*from\s+\S+\s+import\s+(\w+)", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class MessageField:
+    """A field, or an element of one.
+
+    Attributes:
+        type: of it, or of each of its elements: ``double``, ``geometry_msgs/msg/Vector3``.
+        is_array: whether it has elements.
+    """
+
+    type: str
+    is_array: bool
+
+    @property
+    def is_message(self) -> bool:
+        """Whether it is a message, which has fields of its own."""
+        return "/" in self.type and not self.is_array
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether it is a number, or an array of numbers; true and false are numbers, too."""
+        return "/" not in self.type and self.type not in _TEXTS
+
+    def __str__(self) -> str:
+        return f"an array of {self.type}" if self.is_array else self.type
 
 
 class MessagePackages(Protocol):
@@ -30,8 +58,8 @@ class MessagePackages(Protocol):
     def installed(self, package: str) -> Path | None:
         """The folder that it is, or will be, built into, ``None`` if there is no such package."""
 
-    def definition(self, package: str, name: str) -> Path | None:
-        """The ``.msg`` file of a message, ``None`` if there is none."""
+    def fields(self, package: str, name: str) -> Mapping[str, MessageField] | None:
+        """The fields of a message, ``None`` if there is none, or its file is wrong."""
 
 
 class NoPackages:
@@ -43,7 +71,7 @@ class NoPackages:
     def installed(self, package: str) -> None:
         return None
 
-    def definition(self, package: str, name: str) -> None:
+    def fields(self, package: str, name: str) -> None:
         return None
 
 
@@ -104,10 +132,15 @@ def _message_folder(package: str) -> Path | None:
 
 
 def _really_has(package: str, name: str) -> bool:
+    return imported(package, name) is not None
+
+
+def imported(package: str, name: str) -> Any:
+    """The class of an installed message, ``None`` if it cannot be used."""
     try:
-        return hasattr(importlib.import_module(f"{package}.msg"), name)
-    except Exception:  # a broken package raises anything: the message cannot be used
-        return False
+        return getattr(importlib.import_module(f"{package}.msg"), name, None)
+    except Exception:  # a broken package raises anything
+        return None
 
 
 def _similar_package(package: str) -> str:

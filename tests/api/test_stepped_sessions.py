@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -364,8 +365,8 @@ def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> 
 def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
     tmp_path: Path,
 ) -> None:
-    eye = {"name": "eye", "plugin": "eye.py", "container": "neuros_python"}
-    eye["outputs"] = [port("image", "std_msgs/msg/UInt8MultiArray")]  # type: ignore[assignment]
+    eye: dict[str, Any] = {"name": "eye", "plugin": "eye.py", "container": "neuros_python"}
+    eye["outputs"] = [port("image", "std_msgs/msg/UInt8MultiArray")]
     (tmp_path / "eye.py").write_text(EYE)
     (tmp_path / "project.json").write_text(json.dumps({"nodes": [eye]}))
     with neuros.Project.from_file(tmp_path).session(backend="in-process") as s:

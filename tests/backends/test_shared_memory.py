@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import mmap
 import os
@@ -66,6 +67,24 @@ def test_so_does_one_whose_readers_share_a_lock(folder: Path) -> None:
 def test_an_owner_that_is_about_to_lock_is_not_disturbed(folder: Path) -> None:
     with open(folder / PORT[1]):
         assert _sweep(folder) == ()
+
+
+def test_who_opens_the_lock_file_only_to_look_does_not_keep_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Another sweep does so, and Fast DDS in a neighbour, to see whether it is locked.
+    with open(folder / PORT[1]) as looking:
+        monkeypatch.setattr("time.sleep", lambda _: looking.close())
+        assert sorted(_sweep(folder)) == sorted(PORT)
+
+
+def test_an_owner_that_opens_its_lock_between_two_looks_is_not_disturbed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with contextlib.ExitStack() as owner:
+        monkeypatch.setattr("time.sleep", lambda _: owner.enter_context(open(folder / PORT[1])))
+        assert _sweep(folder) == ()
+    assert _names(folder) == set(PORT)
 
 
 def test_without_a_lock_file_it_counts_whether_somebody_maps_the_memory(folder: Path) -> None:

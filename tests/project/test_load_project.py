@@ -50,8 +50,8 @@ class ArmPackage:
     def installed(self, package: str) -> Path | None:
         return self.folder if package == "arm_msgs" else None
 
-    def definition(self, package: str, name: str) -> Path | None:
-        return self.folder / "msg" / f"{name}.msg" if package == "arm_msgs" else None
+    def fields(self, package: str, name: str) -> None:
+        return None
 
 
 @pytest.fixture
