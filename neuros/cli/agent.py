@@ -73,18 +73,24 @@ _KEPT_S = 7 * 24 * 3600.0
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
-    """The program takes no arguments; ``launch`` starts it on another machine."""
+    """``launch`` starts the program on another machine."""
+    agent.add_argument("--in-image", action="store_true")
     agent.set_defaults(command=_run_agent)
 
 
-def _run_agent(_: argparse.Namespace) -> int:
-    return Agent().run()
+def _run_agent(options: argparse.Namespace) -> int:
+    return Agent(is_in_image=options.in_image).run()
 
 
 class Agent:
-    """Runs nodes until the launcher has ended them, or has gone."""
+    """Runs nodes until the launcher has ended them, or has gone.
 
-    def __init__(self) -> None:
+    Args:
+        is_in_image: it is in a container, whose image has all that its nodes need.
+    """
+
+    def __init__(self, *, is_in_image: bool = False) -> None:
+        self._is_in_image = is_in_image
         read_from, write_to = os.dup(0), os.dup(1)
         with open(os.devnull, "rb") as nothing:
             os.dup2(nothing.fileno(), 0)
@@ -210,6 +216,9 @@ class Agent:
                 f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}: run"
                 " install.py there"
             )
+        if self._is_in_image:
+            self._pump.send(Prepared(()))
+            return
         files = node_files_from_json(nodes)
         folders, described = files[0].folders, [file.node for file in files]
         workspaces = Workspaces(folders.project / "workspace", folders.workspace, os.environ)
@@ -223,9 +232,10 @@ class Agent:
         self._pump.send(Prepared(tuple(map(str, messages.paths))))
 
     def _examine(self) -> None:
-        from neuros.doctor.checks import findings
+        from neuros.doctor.checks import findings, look_at_machine
 
-        found = findings(os.environ, proves=False)
+        look = look_at_machine(os.environ) if self._is_in_image else None
+        found = look or findings(os.environ, proves=False)
         self._pump.send(
             Examined(tuple((f.state.value, f.subject, f.text, f.remedy) for f in found))
         )

@@ -18,6 +18,7 @@ from neuros.project.validate import violations_in
 HERE = "here"
 """The machine of the launcher, which needs no entry."""
 TIMEOUT_S = 5.0
+_WAYS = ("ssh", "docker", "through")
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class Host:
 
     Attributes:
         ssh: its destination for ``ssh``, as ``pi@robot``.
+        docker: the address of its Docker engine, as in ``DOCKER_HOST``, in the place of ``ssh``:
+            nodes run in containers there.
         ssh_options: further arguments of ``ssh``.
         through: a command that executes there what follows it, in the place of ``ssh``.
         neuros: the command ``neuros`` there.
@@ -34,13 +37,19 @@ class Host:
 
     name: str
     ssh: str = ""
+    docker: str = ""
     ssh_options: tuple[str, ...] = ()
     through: tuple[str, ...] = ()
     neuros: str = "neuros"
     address: str = ""
 
+    @property
+    def way(self) -> str:
+        """How it is reached, in a word or a line."""
+        return self.ssh or self.docker or " ".join(self.through)
+
     def __str__(self) -> str:
-        return f"{self.name} ({self.ssh})" if self.ssh else self.name
+        return self.name if self.through else f"{self.name} ({self.way})"
 
 
 @dataclass(frozen=True)
@@ -106,16 +115,19 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
         known.add(name)
         if any(f"{each}/".startswith(f"{host.pointer}/") for each in wrong):
             continue
-        ways = [key for key in ("ssh", "through") if key in host.value]
+        ways = [key for key in _WAYS if key in host.value]
         if name == HERE and ways:
             text = f"'{HERE}' is the launching machine, which needs no '{ways[0]}'"
             hint = "give the other machine another name"
             found.append(host.value[ways[0]].key_problem(text, hint))
         elif name != HERE and len(ways) != 1:
-            text = "needs exactly one of 'ssh' and 'through', which say how to reach it"
+            text = "needs exactly one of 'ssh', 'docker' and 'through', which say how to reach it"
             found.append(host.problem(text, f"this machine is '{HERE}'"))
         elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
             found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))
+        elif "docker" in host.value and "neuros" in host.value:
+            text = "has no effect with 'docker': NeuROS comes into the containers by itself"
+            found.append(host.value["neuros"].key_problem(text, "leave it out"))
     names = None if project is None else [node.name for node in project.nodes]
     for node, host in _members(members.get("nodes")).items():
         if isinstance(host.value, str) and host.value not in known:

@@ -406,7 +406,7 @@ class TestCommand:
     """How an agent is started."""
 
     def test_by_ssh_which_must_not_ask(self) -> None:
-        host = Host("robot", "pi@robot", ("-p", "2222"), neuros="~/my robot/neuros")
+        host = Host("robot", "pi@robot", ssh_options=("-p", "2222"), neuros="~/my robot/neuros")
         command = agent_command(host)
         assert command[0] == "ssh"
         assert "BatchMode=yes" in command

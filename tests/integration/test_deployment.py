@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from launching import Finished, Running, launch, start
 
-from neuros.backends.machines.machine import Machine
+from neuros.backends.machines.machine import Machine, agent_command
 from neuros.backends.machines.trees import scan
 from neuros.control.link import encode
 from neuros.control.machines import Lacking
@@ -104,7 +104,7 @@ def test_ctrl_c_ends_the_sending_of_a_project(tmp_path: Path) -> None:
     agent = 'echo "$0"; head -c 100000 >/dev/null; touch "$1"; exec sleep 600'
     answer = encode(Lacking((file.digest,))).decode().strip()
     host = Host("robot", through=("sh", "-c", agent, answer, str(takes_no_more)))
-    machine = Machine(host, ENDED_S, lambda severity, text: None)
+    machine = Machine(host, ENDED_S, lambda severity, text: None, agent_command(host))
     closer = threading.Thread(target=machine.close)  # what Ctrl+C does
     with ThreadPoolExecutor(1) as threads:
         sending = threads.submit(machine.place, project)

@@ -38,7 +38,7 @@ def test_it_says_where_nodes_run_and_how_machines_are_reached(tmp_path: Path) ->
     robot = {**ROBOT, "ssh_options": ["-p", "2222"], "neuros": "/opt/neuros", "address": "10.0.0.7"}
     hosts = {"robot": robot, "unused": {"through": ["srun"]}, "here": {"address": "10.0.0.1"}}
     file = load(tmp_path, {"hosts": hosts, "nodes": {"eye": "robot", "brain": "here"}})
-    reached = Host("robot", "pi@robot", ("-p", "2222"), (), "/opt/neuros", "10.0.0.7")
+    reached = Host("robot", "pi@robot", "", ("-p", "2222"), (), "/opt/neuros", "10.0.0.7")
     assert file.used == [reached]
     assert file.places == {"eye": "robot"}
     assert file.here.address == "10.0.0.1"
@@ -72,7 +72,7 @@ def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
         "here": {"ssh": "me@here"},
     }
     nodes = {"eye": "robbot", "brian": "both"}
-    ways = "needs exactly one of 'ssh' and 'through', which say how to reach it"
+    ways = "needs exactly one of 'ssh', 'docker' and 'through', which say how to reach it"
     assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes}) == [
         f"/hosts/both: {ways}",
         "/hosts/here/ssh: 'here' is the launching machine, which needs no 'ssh'",
@@ -83,11 +83,35 @@ def test_all_mistakes_in_it_are_told_at_once(tmp_path: Path) -> None:
     ]
 
 
+def test_a_host_may_be_a_docker_engine(tmp_path: Path) -> None:
+    hosts = {"box": {"docker": "ssh://me@box", "ssh_options": ["-p", "2222"]}}
+    (host,) = load(tmp_path, {"hosts": hosts, "nodes": {"eye": "box"}}).used
+    assert (host.docker, host.way, str(host)) == ("ssh://me@box",) * 2 + ("box (ssh://me@box)",)
+
+
+def test_mistakes_about_docker_engines_are_told(tmp_path: Path) -> None:
+    hosts = {
+        "plain": {"docker": "box"},
+        "option": {"docker": "ssh://-oProxyCommand=x"},
+        "both": {"docker": "ssh://box", "ssh": "box"},
+        "installed": {"docker": "ssh://box", "neuros": "/opt/neuros"},
+    }
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": {}}) == [
+        "/hosts/both: needs exactly one of 'ssh', 'docker' and 'through', which say how to reach"
+        " it",
+        "/hosts/installed/neuros: has no effect with 'docker': NeuROS comes into the containers by"
+        " itself",
+        "/hosts/option/docker: 'ssh://-oProxyCommand=x' is not allowed as docker engine",
+        "/hosts/plain/docker: 'box' is not allowed as docker engine",
+    ]
+
+
 def test_mistakes_are_told_with_problems_of_form(tmp_path: Path) -> None:
     hosts = {"neither": {}, "robot": {"ssh": 5}, "none": 3}
     nodes = {"eye": "robbot", "brian": "robot", "brain": 7}
     assert problems_of(tmp_path, {"hosts": hosts, "nodes": nodes, "node": {}}) == [
-        "/hosts/neither: needs exactly one of 'ssh' and 'through', which say how to reach it",
+        "/hosts/neither: needs exactly one of 'ssh', 'docker' and 'through', which say how to"
+        " reach it",
         "/hosts/none: must be an object, but is a whole number",
         "/hosts/robot/ssh: must be a text, but is a whole number",
         "/node: unknown key 'node'",

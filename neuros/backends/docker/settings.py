@@ -32,7 +32,7 @@ from neuros.control import CONTROL_VARIABLE
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
-from neuros.project.model import NodeFile
+from neuros.project.model import Node, NodeFile
 
 # Discovery stays on this machine, so that nodes have to share its network. Large packets go through
 # shared memory where both ends see the same: the containers of one run do, and see nobody else's.
@@ -124,7 +124,7 @@ def container_settings(
         launcher_pid: said in a label.
         network: that of this machine, none, or that of another container.
     """
-    node, resources = file.node, file.node.resources
+    node = file.node
     run_id, cores = environment.get(RUN_ID, ""), program.cores.get(node.name)
     settings: dict[str, Any] = {
         "image": image.id,
@@ -144,16 +144,23 @@ def container_settings(
         "init": True,
         "network_mode": network,
         "ipc_mode": IPC_MODE,
-        "pids_limit": resources.pids or MOST_PIDS,
         "auto_remove": True,
+        **limits(node),
     }
+    if cores:
+        settings["cpuset_cpus"] = ",".join(map(str, cores))
+    return settings
+
+
+def limits(node: Node) -> dict[str, Any]:
+    """Arguments of ``docker.containers.create``: what a node may take, and its devices."""
+    resources = node.resources
+    settings: dict[str, Any] = {"pids_limit": resources.pids or MOST_PIDS}
     if resources.mem_bytes is not None:
         # Without swap: a node that pages is no better than one that has ended, and does not say so.
         settings |= {"mem_limit": resources.mem_bytes, "memswap_limit": resources.mem_bytes}
     if resources.cpus is not None:
         settings["nano_cpus"] = int(resources.cpus * 1e9)
-    if cores:
-        settings["cpuset_cpus"] = ",".join(map(str, cores))
     if node.access.devices:
         settings["devices"] = [f"{device}:{device}:rw" for device in node.access.devices]
     if node.access.gpus:

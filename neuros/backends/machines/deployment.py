@@ -14,10 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import connect
-from neuros.backends.machines.machine import Log, Machine
+from neuros.backends.machines.machine import Log, Machine, agent_command, ssh_command
 from neuros.control import CONTROL_VARIABLE
 from neuros.control.machines import Finished, Ready, Start
 from neuros.distribution import WORKSPACE
@@ -26,6 +26,9 @@ from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
 from neuros.project.deployment import DeploymentFile, Host
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_to_json, split, translated
+
+if TYPE_CHECKING:
+    from neuros.backends.docker.remote import AgentContainer, RemoteEngine
 
 _PEERS = "ROS_STATIC_PEERS"
 _ANY_PORT = 9
@@ -42,6 +45,7 @@ class Side:
         address: at which others reach it; ``here``: at which it reaches this machine.
         messages: folders of the message packages that were built there.
         sent: how many files it had to be sent.
+        container: which its node is in, where the machine is a Docker engine.
     """
 
     machine: Machine
@@ -52,6 +56,7 @@ class Side:
     messages: tuple[Path, ...] = ()
     sent: int = 0
     left: Finished | None = None
+    container: AgentContainer | None = None
 
     @property
     def host(self) -> Host:
@@ -61,7 +66,7 @@ class Side:
         """What is known of it, in a line."""
         ready, clock = self.ready, self.machine.clock
         return (
-            f"{self.host.ssh or ' '.join(self.host.through)}: {ready.machine}, Python"
+            f"{self.host.way}: {ready.machine}, Python"
             f" {ready.python}, NeuROS {ready.version}, at {self.address}; round trip"
             f" {1e3 * clock.round_trip_s:.1f} ms, clock {clock.unix_s:+.3f} s"
         )
@@ -87,6 +92,7 @@ class Machines(Deployment):
         self.file = file
         self.monitors_load = monitors_load
         self.sides: list[Side] = []
+        self._engines: list[RemoteEngine] = []
         self.project = project
         self.notices = inner.notices
         self._inner = inner
@@ -111,24 +117,25 @@ class Machines(Deployment):
             EnvironmentFault: with all that went wrong; none of them is held any more then.
         """
         hosts = self.file.used
-        held: list[Machine] = []
+        held: list[Machine | RemoteEngine] = []
         with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
-            work = [threads.submit(self._side, host, log, held) for host in hosts]
+            work = [threads.submit(self._sides_of, host, log, held) for host in hosts]
             try:
                 wait(work)
             except BaseException:  # Ctrl+C
-                for machine in tuple(held):
-                    machine.close()
+                for each in tuple(held):
+                    each.close()
                 raise
         faults = [fault for each in work if (fault := each.exception())]
-        self.sides = [each.result() for each in work if not each.exception()]
+        self.sides = [side for each in work if not each.exception() for side in each.result()]
         if faults:
             self.close()
             others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
             raise others[0] if others else EnvironmentFault("\n".join(map(str, faults)))
         for side in self.sides:
-            ahead_s = side.machine.clock.unix_s
-            if abs(ahead_s) > _MUCH_S:
+            clock = side.machine.clock
+            ahead_s = clock.unix_s
+            if abs(ahead_s) > _MUCH_S + clock.round_trip_s / 2:
                 log(
                     "WARN",
                     f"the clock of {side.host.name} is {abs(ahead_s):.1f} s"
@@ -141,6 +148,11 @@ class Machines(Deployment):
         for side in self.sides:
             side.machine.close()
         self.sides = []
+        self._leave_engines()
+
+    def _leave_engines(self) -> None:
+        while self._engines:
+            self._engines.pop().close()
 
     def launcher(self, program: NodeProgram) -> Launcher:
         return _Launcher(self, self._inner.launcher(program), program)
@@ -168,6 +180,7 @@ class Machines(Deployment):
         with ThreadPoolExecutor(len(self.sides), "neuros-machines") as threads:
             for found in threads.map(lambda side: _bring_home(side, is_enough), self.sides):
                 faults += found
+        self._leave_engines()
         return faults
 
     def node_there(self, file: NodeFile, side: Side) -> NodeFile:
@@ -193,14 +206,50 @@ class Machines(Deployment):
         node = translated(file.node, move)
         return replace(file, node=node, folders=there, messages=side.messages)
 
-    def _side(self, host: Host, log: Log, held: list[Machine]) -> Side:
-        machine = Machine(host, self.file.timeout_s, log)
+    def _sides_of(self, host: Host, log: Log, held: list[Machine | RemoteEngine]) -> Sequence[Side]:
+        """One for all nodes there; where they are in containers, one for each."""
+        names = tuple(node for node, place in self.places.items() if place == host.name)
+        if not host.docker:
+            return [self._side(host, names, log, held)]
+        # The Docker SDK is slow to import.
+        from neuros.backends.docker.remote import RemoteEngine
+
+        engine = RemoteEngine(host, ssh_command(host))
+        held.append(engine)
+        self._engines.append(engine)
+        sides: list[Side] = []
+        try:
+            for name in names:
+                node = self.project.node(name)
+                container = engine.container(node, self.project.folder, log)
+                own = host if len(names) == 1 else replace(host, name=f"{host.name}-{name}")
+                try:
+                    sides.append(self._side(own, (name,), log, held, engine, container))
+                except BaseException:
+                    container.close()
+                    raise
+        except BaseException:
+            for side in sides:
+                side.machine.close()
+            raise
+        return sides
+
+    def _side(
+        self,
+        host: Host,
+        names: tuple[str, ...],
+        log: Log,
+        held: list[Machine | RemoteEngine],
+        engine: RemoteEngine | None = None,
+        container: AgentContainer | None = None,
+    ) -> Side:
+        command = container.command if container else agent_command(host)
+        machine = Machine(host, self.file.timeout_s, log, command)
         held.append(machine)
         try:
             ready = machine.greet()
-            names = tuple(node for node, place in self.places.items() if place == host.name)
-            side = Side(machine, names, ready)
-            side.address = _address(host, ready)
+            side = Side(machine, names, ready, container=container)
+            side.address = _address(host, ready, engine.reached_at if engine else ready.reached_at)
             side.here = _own_address(self.file.here, side.address)
             side.sent = machine.place(self.project.folder)
             folders = Folders(self.project.folder, WORKSPACE, Path())
@@ -252,6 +301,8 @@ class _Launcher:
     def _begin(self, side: Side, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> None:
         run = nodes[0].folders.run
         files = [file for file in nodes if file.node.name in side.nodes]
+        if side.container:  # they are built by now
+            side.messages = side.container.put_messages(files[0].messages)
         others = [side.here, *(each.address for each in self._machines.sides if each is not side)]
         if self._program.reaper:
             self._program.reaper.watch(side.machine.pid)
@@ -333,7 +384,8 @@ def _record(side: Side) -> dict[str, Any]:
     clock = side.machine.clock
     load = None if side.left is None else side.left.load
     return {
-        "reached_by": side.host.ssh or " ".join(side.host.through),
+        "reached_by": side.host.way,
+        **({"container": side.container.description} if side.container else {}),
         "name": side.ready.name,
         "address": side.address,
         "nodes": list(side.nodes),
@@ -347,9 +399,9 @@ def _record(side: Side) -> dict[str, Any]:
     }
 
 
-def _address(host: Host, ready: Ready) -> str:
+def _address(host: Host, ready: Ready, reached_at: str) -> str:
     """The IPv4 address at which other machines reach one. Raises ``EnvironmentFault``."""
-    known = host.address or (ready.reached_at if host.ssh else "")
+    known = host.address or ("" if host.through else reached_at)
     for name in (known, ready.name):
         with contextlib.suppress(OSError):
             if name:
@@ -364,7 +416,7 @@ def _address(host: Host, ready: Ready) -> str:
 def _own_address(here: Host, address: str) -> str:
     """The IPv4 address of this machine, as one at that address sees it."""
     if here.address:
-        return _address(here, Ready("", "", "", ""))
+        return _address(here, Ready("", "", "", ""), "")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address, _ANY_PORT))  # sends nothing: the kernel chooses the way

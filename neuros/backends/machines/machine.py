@@ -78,13 +78,14 @@ class Machine:
         host: how it is reached.
         timeout_s: after so long without a sign of life it counts as gone.
         log: takes lines for the user, as ``(severity, text)``; in any thread.
+        command: starts the agent, as its child as far as this machine can tell.
 
     Attributes:
         lost: why it cannot be reached any more, empty while it can.
         clock: how far its clocks are off.
     """
 
-    def __init__(self, host: Host, timeout_s: float, log: Log) -> None:
+    def __init__(self, host: Host, timeout_s: float, log: Log, command: Sequence[str]) -> None:
         self.host = host
         self.lost = ""
         self.clock = ClockOffset()
@@ -98,7 +99,6 @@ class Machine:
         self._is_closed = False
         self._answers: list[Message] = []
         self._arrived = threading.Condition()
-        command = agent_command(host)
         try:
             self._process = subprocess.Popen(
                 command,
@@ -294,12 +294,12 @@ class Machine:
             self._process.kill()  # it would go on trying for minutes
         self._errors.join(_EXITS_S)
         said = self._errors.last
-        if code == _COMMAND_NOT_FOUND:
+        if code == _COMMAND_NOT_FOUND and not self.host.docker:
             said += f": name the command neuros there in /hosts/{self.host.name}/neuros"
         with self._arrived:
             self.lost = f"{reason} ({said})" if said else reason
             if self._run is not None:
-                where = f"{self.host.ssh or self.host.name}:{self.folders.run}"
+                where = f"{self.host.way}:{self.folders.run}"
                 self.lost += f"; files that were not copied are still in {where}"
             self._arrived.notify_all()
 
@@ -361,7 +361,12 @@ def agent_command(host: Host) -> list[str]:
     neuros = host.neuros
     home, rest = ("~/", neuros[2:]) if neuros.startswith("~/") else ("", neuros)
     remote = f"exec {home}{shlex.quote(rest)} agent"
-    return ["ssh", *_SSH, *host.ssh_options, "--", host.ssh, remote]
+    return [*ssh_command(host), "--", host.ssh, remote]
+
+
+def ssh_command(host: Host) -> list[str]:
+    """``ssh`` with the options for a machine, without its destination."""
+    return ["ssh", *_SSH, *host.ssh_options]
 
 
 class _LastWords(threading.Thread):

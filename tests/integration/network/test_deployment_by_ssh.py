@@ -20,11 +20,13 @@ from pathlib import Path
 
 import psutil
 import pytest
+from engines import OwnEngine, own_engine, require_engines
 from launching import EXAMPLES, Finished, Running
 from machines import APART_S, Machine, require_machines
 from ssh_server import SshServer, ssh_server
 from two_machines import ADDRESSES, TwoMachines
 
+from containers import wait_until
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import Session, sessions
@@ -115,6 +117,84 @@ def test_one_command_runs_a_project_on_two_machines(deployed: Deployed, server: 
     assert -1e3 * there["round_trip_s"] < latency["p50"] <= latency["max"] < 2e3 * UP_S
     assert finished.record["running_s"] < 2 * UP_S
     assert left_there(server) == []
+
+
+@pytest.fixture(scope="module")
+def engine(right: Machine) -> Iterator[OwnEngine]:
+    """The one of the machine on the right."""
+    require_engines()
+    with own_engine(right) as engine:
+        yield engine
+
+
+def in_containers(
+    folder: Path, engine: OwnEngine, server: SshServer, machines: TwoMachines, *arguments: str
+) -> Running:
+    """The stream, its sink in a container on the right."""
+    docker = engine.address.replace("unix://", f"ssh://root@{ADDRESSES['right']}")
+    host = {"docker": docker, "ssh_options": list(server.options)}
+    file = folder / "deployment.json"
+    content = {"hosts": {"box": host}, "nodes": {"sink": "box"}, "timeout_s": TIMEOUT_S}
+    file.write_text(json.dumps(content))
+    return machines.start("left", STREAM, "--deployment", str(file), *arguments, cwd=folder)
+
+
+def containers_there(engine: OwnEngine) -> list[str]:
+    with closing(engine.connect()) as client:
+        return [each.name for each in client.containers.list(all=True, ignore_removed=True)]
+
+
+def test_nodes_run_in_containers_of_an_engine_behind_ssh(
+    machines: TwoMachines, server: SshServer, engine: OwnEngine, tmp_path: Path
+) -> None:
+    with in_containers(tmp_path, engine, server, machines, "--record") as running:
+        finished = running.finish(2 * UP_S)
+    assert finished.exit_code == 0, finished.output
+    books = finished.connection(CONNECTION)
+    assert (books["sent"], books["received"], books["lost"]) == (100, 100, 0)
+    there = finished.record["machines"]["box"]
+    assert there["address"] == ADDRESSES["right"]
+    assert there["container"]["image"].startswith("neuros_python:")
+    wait_until(lambda: not containers_there(engine))
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("fault", ["cable", "ssh", "launcher"])
+def test_no_container_stays_there_when_it_is_cut_off(
+    machines: TwoMachines, server: SshServer, engine: OwnEngine, tmp_path: Path, fault: str
+) -> None:
+    try:
+        with in_containers(tmp_path, engine, server, machines, *ENDLESS) as running:
+            running.wait_for("the first image is here", UP_S)
+            if fault == "cable":
+                machines.unplug()
+            elif fault == "ssh":
+                children = psutil.Process(running.process.pid).children(recursive=True)
+                (tunnel,) = (each for each in children if each.name() == "ssh")
+                tunnel.kill()
+            else:
+                running.process.kill()
+            within_s = GONE_S + (TIMEOUT_S if fault == "cable" else 0) + SLACK_S
+            wait_until(lambda: not containers_there(engine), within_s)
+            if fault != "launcher":
+                finished = running.finish(within_s)
+                assert finished.exit_code == 4, finished.output
+                assert "box cannot be reached any more" in finished.output
+    finally:
+        machines.repair()
+
+
+@pytest.mark.acceptance
+def test_an_image_that_the_engine_lacks_is_sent_once(
+    machines: TwoMachines, right: Machine, server: SshServer, tmp_path: Path
+) -> None:
+    require_engines()
+    with own_engine(right, disk="4g", has_images=False) as engine:
+        for is_first in (True, False):
+            with in_containers(tmp_path, engine, server, machines) as running:
+                finished = running.finish(PATIENCE_S)
+            assert finished.exit_code == 0, finished.output
+            assert ("box gets the image neuros_python" in finished.output) is is_first
 
 
 # ------------------------------------------------------------------ faults

@@ -1,0 +1,294 @@
+"""Nodes in containers of an engine on another machine, which needs nothing but that engine.
+
+Each node has a container, and in it an agent (:mod:`neuros.cli.agent`), with which the launcher
+talks over the standard input and output of ``docker start --attach``. An engine behind ``ssh`` is
+reached through a tunnel to its socket. Where it lacks the image of a node, and the engine of this
+machine has it, the image is copied. NeuROS itself and built message packages are put into each
+container; project files that have come once are kept in a volume of the engine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import subprocess
+import tarfile
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import requests
+from docker import DockerClient
+from docker.errors import DockerException
+
+from neuros.backends.docker.engine import Abilities, connect, engine_faults
+from neuros.backends.docker.images import Image, image_for
+from neuros.backends.docker.layout import LIBRARY, MESSAGES, ROOT
+from neuros.backends.docker.settings import NETWORK_MODE, limits
+from neuros.backends.node_command import DEFAULTS, without_mark
+from neuros.distribution import PACKAGE
+from neuros.errors import EnvironmentFault
+from neuros.project.deployment import Host
+from neuros.project.model import Node
+from neuros.project.resources import memory_text
+
+AGENT_LABEL = "neuros.agent"
+"""The label of every container with an agent."""
+
+VOLUME = "neuros_agent"
+"""The volume in which agents keep files that have come."""
+
+_CACHE = ROOT / "cache"
+_USER = 1000  # as in the images of NeuROS
+_SOCKET = "/var/run/docker.sock"
+_FORWARDING = ("-o", "ExitOnForwardFailure=yes")
+_CONNECT_S = 30.0
+_LOOK_S = 0.02
+_NEVER_STARTED_S = 60.0
+
+Log = Callable[[str, str], None]
+
+
+class RemoteEngine:
+    """The engine of a host; :meth:`close` it.
+
+    Args:
+        ssh: the command ``ssh`` with the options that NeuROS gives it.
+
+    Attributes:
+        reached_at: the address of the machine, as far as the way to it tells; else empty.
+
+    Raises:
+        EnvironmentFault: if it cannot be reached.
+    """
+
+    def __init__(self, host: Host, ssh: Sequence[str]) -> None:
+        self.host = host
+        self.reached_at = ""
+        self._tunnel: subprocess.Popen[str] | None = None
+        self._folder: Path | None = None
+        try:
+            if shutil.which("docker") is None:
+                raise EnvironmentFault("there is no command docker here: apt-get install docker.io")
+            where = urlsplit(host.docker)
+            self.address = self._tunnelled(ssh) if where.scheme == "ssh" else host.docker
+            self.reached_at = self.reached_at or where.hostname or "127.0.0.1"
+            self._engine = connect({**os.environ, "DOCKER_HOST": self.address}, timeout_s=None)
+            with engine_faults("Docker"):
+                self._is_rootless = Abilities.of(self._engine.info()).is_rootless
+        except EnvironmentFault as fault:
+            self.close()
+            raise EnvironmentFault(f"{host}: {fault}") from fault
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that holds the way to it, if there is one."""
+        return None if self._tunnel is None else self._tunnel.pid
+
+    def container(self, node: Node, project: Path, log: Log) -> AgentContainer:
+        """Make the container of a node, and copy its image if need be.
+
+        Raises:
+            EnvironmentFault: if it has no image, or the engine refuses.
+        """
+        try:
+            image = self._image(node.container, project, log)
+            with engine_faults(f"the container of node '{node.name}'"):
+                self._remove_never_started()
+                return AgentContainer(
+                    self._engine, self.address, node, image, 0 if self._is_rootless else _USER
+                )
+        except EnvironmentFault as fault:
+            raise EnvironmentFault(f"{self.host}: {fault}") from fault
+
+    def close(self) -> None:
+        """Leave it. Any thread; a second call has no effect."""
+        engine = self.__dict__.pop("_engine", None)
+        if engine is not None:
+            engine.close()
+        if self._tunnel is not None:
+            assert self._tunnel.stdin is not None
+            with contextlib.suppress(OSError):
+                self._tunnel.stdin.close()
+            self._tunnel.kill()
+            self._tunnel.wait()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _tunnelled(self, ssh: Sequence[str]) -> str:
+        """The address of a socket here that leads to the engine's there."""
+        where = urlsplit(self.host.docker)
+        self._folder = Path(tempfile.mkdtemp(prefix="neuros-docker-"))  # short: a socket's path is
+        socket = self._folder / "socket"
+        destination = f"ssh://{where.netloc}"
+        forward = f"{socket}:{where.path.rstrip('/') or _SOCKET}"
+        # It ends with its standard input, and so with this process, come what may.
+        remote = "echo ${SSH_CONNECTION:-}; exec cat >/dev/null"
+        errors = self._folder / "errors"
+        with open(errors, "w") as log:
+            try:
+                self._tunnel = subprocess.Popen(
+                    [*ssh, *_FORWARDING, "-L", forward, "--", destination, remote],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    env=without_mark(os.environ),
+                    start_new_session=True,
+                    text=True,
+                )
+            except OSError as error:
+                raise EnvironmentFault(f"ssh cannot be started ({error.strerror})") from error
+        assert self._tunnel.stdout is not None
+        said = self._tunnel.stdout.readline()
+        end_s = time.monotonic() + _CONNECT_S
+        while said and not socket.is_socket() and time.monotonic() < end_s:
+            time.sleep(_LOOK_S)
+        if not said or not socket.is_socket():
+            last = (errors.read_text().strip().splitlines() or ["it does not say why"])[-1].strip()
+            raise EnvironmentFault(f"ssh has no connection ({last})")
+        self.reached_at = (said.split() or [""] * 4)[2]
+        return f"unix://{socket}"
+
+    def _image(self, container: str, project: Path, log: Log) -> Image:
+        """The image of a container there; one of this machine is sent if it is the better one."""
+        there: Image | None = None
+        try:
+            there = image_for(container, project, self._engine)
+            if not there.notice:
+                return there
+        except EnvironmentFault as fault:
+            why = fault
+        try:
+            with contextlib.closing(connect(timeout_s=None)) as engine:
+                here = image_for(container, project, engine)
+                if there is not None and here.notice:
+                    return there
+                self._send(engine, here, log)
+                return here
+        except EnvironmentFault:
+            if there is not None:
+                return there
+        raise EnvironmentFault(f"{why}, here, or there with DOCKER_HOST={self.host.docker}")
+
+    def _send(self, engine: DockerClient, image: Image, log: Log) -> None:
+        with engine_faults(f"the image {image.name}"):
+            found = engine.images.get(image.id)
+            size = memory_text(int(found.attrs["Size"]))
+            log("INFO", f"{self.host.name} gets the image {image.name} ({size}), once")
+            self._engine.images.load(_Stream(found.save(named=True)))
+
+    def _remove_never_started(self) -> None:
+        """Containers whose launcher was killed between two requests."""
+        wanted = {"label": AGENT_LABEL, "status": "created"}
+        for container in self._engine.containers.list(all=True, filters=wanted):
+            made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
+            if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
+                container.remove(force=True)
+
+
+class AgentContainer:
+    """A container that was made and is not started yet: :attr:`command` does that.
+
+    Attributes:
+        command: starts it, with its standard streams; it is removed when it has ended.
+        description: its image and engine, ready for JSON.
+    """
+
+    def __init__(
+        self, engine: DockerClient, address: str, node: Node, image: Image, user: int
+    ) -> None:
+        self._container = engine.containers.create(
+            image.id,
+            name=f"neuros-{node.name}-{os.urandom(4).hex()}",
+            entrypoint=[*image.start, "-m", "neuros.cli", "agent", "--in-image"],
+            command=[],
+            environment={
+                **DEFAULTS,
+                "HOME": "/tmp",
+                "USER": "neuros",
+                "XDG_CACHE_HOME": str(_CACHE),
+                "PYTHONPATH": str(LIBRARY),
+            },
+            working_dir="/tmp",
+            labels={AGENT_LABEL: node.name},
+            mounts=[{"Type": "volume", "Source": VOLUME, "Target": str(_CACHE)}],
+            user=f"{user}:{user}",
+            cap_drop=["ALL"],
+            security_opt=["no-new-privileges"],
+            init=True,
+            network_mode=NETWORK_MODE,
+            auto_remove=True,
+            stdin_open=True,
+            **limits(node),
+        )
+        try:
+            self._put({LIBRARY / PACKAGE.name: PACKAGE}, {_CACHE: user})
+        except BaseException:
+            self.close()
+            raise
+        self.command = ["docker", "--host", address, "start", "--attach", "--interactive"]
+        self.command.append(self._container.id)
+        self.description: Mapping[str, str] = {"image": image.name, "id": image.id}
+
+    def put_messages(self, paths: Iterable[Path]) -> tuple[Path, ...]:
+        """Have built message packages there; returns where Python finds them.
+
+        Args:
+            paths: where Python finds them here, ``<package>-<key>/python``.
+        """
+        found = {MESSAGES / path.parent.name: path.parent for path in paths}
+        if found:
+            with engine_faults("message packages"):
+                self._put(found)
+        return tuple(folder / "python" for folder in found)
+
+    def close(self) -> None:
+        """Remove it, if it is still there."""
+        with contextlib.suppress(DockerException, requests.RequestException):
+            self._container.remove(force=True)
+
+    def _put(self, trees: Mapping[Path, Path], owned: Mapping[Path, int] | None = None) -> None:
+        """Copy folders into it; make others, each with its owner."""
+        archive = io.BytesIO()
+        with tarfile.open(fileobj=archive, mode="w") as tar:
+            for folder, user in (owned or {}).items():
+                entry = tarfile.TarInfo(str(folder.relative_to("/")))
+                entry.type, entry.mode, entry.uid, entry.gid = tarfile.DIRTYPE, 0o700, user, user
+                tar.addfile(entry)
+            for there, here in trees.items():
+                tar.add(here, str(there.relative_to("/")), filter=_for_all)
+        self._container.put_archive("/", archive.getvalue())
+
+
+class _Stream(io.RawIOBase):
+    """What the engine of this machine sends, to be read by the other one."""
+
+    def __init__(self, parts: Any) -> None:
+        self._parts, self._rest = iter(parts), b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self._rest = self._rest or next(self._parts, b"")
+        taken = self._rest[: len(buffer)]
+        buffer[: len(taken)], self._rest = taken, self._rest[len(taken) :]
+        return len(taken)
+
+
+def _for_all(entry: tarfile.TarInfo) -> tarfile.TarInfo | None:
+    """Files that anybody may read and nobody change; without what Python has compiled."""
+    if entry.name.endswith("__pycache__"):
+        return None
+    entry.uid = entry.gid = 0
+    entry.mode = 0o755 if entry.isdir() or entry.mode & 0o100 else 0o644
+    return entry
