@@ -79,8 +79,7 @@ def sweep(
     Looks every ``look_again_s``, and removes what nobody holds in two looks in a row: a node that
     is just starting makes its files a moment before it locks them. What the same process holds
     twice in a row is alive. A holder that changes is no owner: other sweeps, and Fast DDS in the
-    neighbours, open lock files for a moment to see whether they are locked. Returns the names
-    removed.
+    neighbours, lock files for a moment to see whether they can. Returns the names removed.
     """
     removed: list[str] = []
     before = _holders(folder, started_s)
@@ -115,15 +114,17 @@ def _holders(folder: Path, started_s: float) -> dict[_Files, set[int]]:
         for base, group in _groups(folder).items()
         if _is_ours(group.files.values(), started_s if not _LTTNG.fullmatch(base) else 0.0)
     ]
-    if not fresh:
-        return {}
-    used = _users(folder)
+    used = _users(folder) if any(not group.locks for group in fresh) else {}
+    owners = _lock_owners() if any(group.locks for group in fresh) else {}
     held = {}
     for group in fresh:
         files = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
-        holders = set().union(*(used.get(name, ()) for name in group.locks or group.files))
-        if not holders and any(_is_locked(folder, name) for name in group.locks):
-            holders = {_UNSEEN}
+        if group.locks:
+            holders = set().union(*(owners.get(_lock(group.files[n]), ()) for n in group.locks))
+            if not holders and any(_is_locked(folder, name) for name in group.locks):
+                holders = {_UNSEEN}
+        else:
+            holders = set().union(*(used.get(name, ()) for name in group.files))
         held[files] = holders
     return held
 
@@ -151,8 +152,24 @@ def _is_ours(stats: Iterable[os.stat_result], started_s: float) -> bool:
     )
 
 
+def _lock(stat: os.stat_result) -> str:
+    """A file as ``/proc/locks`` names it."""
+    return f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
+
+
+def _lock_owners() -> Mapping[str, set[int]]:
+    """The processes, as far as they can be seen, that have a file locked with ``flock``."""
+    owners: dict[str, set[int]] = {}
+    with contextlib.suppress(OSError), open("/proc/locks", encoding="ascii") as locks:
+        for line in locks:  # 1: FLOCK  ADVISORY  WRITE 5301 00:1b:77 0 EOF; "1: -> ..." waits
+            fields = line.split()
+            if fields[1] == "FLOCK":
+                owners.setdefault(fields[5], set()).add(int(fields[4]))
+    return owners
+
+
 def _users(folder: Path) -> Mapping[str, set[int]]:
-    """The processes, as far as they can be seen, that have a name in ``folder`` mapped or open."""
+    """The processes, as far as they can be seen, that have a name in ``folder`` mapped."""
     prefix = f"{folder}/"
     users: dict[str, set[int]] = {}
     for pid in map(int, filter(str.isdigit, os.listdir("/proc"))):
@@ -163,12 +180,6 @@ def _users(folder: Path) -> Mapping[str, set[int]]:
                 if at >= 0:
                     name = os.fsdecode(line[at + len(prefix) :].rstrip(b"\n"))
                     users.setdefault(name, set()).add(pid)
-        with contextlib.suppress(OSError):
-            for descriptor in os.listdir(f"/proc/{pid}/fd"):
-                with contextlib.suppress(OSError):
-                    target = os.readlink(f"/proc/{pid}/fd/{descriptor}")
-                    if target.startswith(prefix):
-                        users.setdefault(target[len(prefix) :], set()).add(pid)
     return users
 
 

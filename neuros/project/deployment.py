@@ -123,9 +123,9 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
         elif name != HERE and len(ways) != 1:
             text = "needs exactly one of 'ssh', 'docker' and 'through', which say how to reach it"
             found.append(host.problem(text, f"this machine is '{HERE}'"))
-        elif "ssh" in host.value and host.value["ssh"].value.startswith("-"):
-            found.append(host.value["ssh"].problem("is an option, not a destination: user@host"))
-        elif "docker" in host.value and "neuros" in host.value:
+        elif (ssh := host.value.get("ssh")) is not None and ssh.value.startswith("-"):
+            found.append(ssh.problem("is an option, not a destination: user@host"))
+        elif host.value.get("docker") is not None and "neuros" in host.value:
             text = "has no effect with 'docker': NeuROS comes into the containers by itself"
             found.append(host.value["neuros"].key_problem(text, "leave it out"))
     names = None if project is None else [node.name for node in project.nodes]

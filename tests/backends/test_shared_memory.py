@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import mmap
 import os
@@ -64,27 +63,38 @@ def test_so_does_one_whose_readers_share_a_lock(folder: Path) -> None:
         assert _sweep(folder) == ()
 
 
-def test_an_owner_that_is_about_to_lock_is_not_disturbed(folder: Path) -> None:
+def test_who_has_only_opened_the_lock_file_does_not_keep_it(folder: Path) -> None:
     with open(folder / PORT[1]):
-        assert _sweep(folder) == ()
+        assert sorted(_sweep(folder)) == sorted(PORT)
 
 
-def test_who_opens_the_lock_file_only_to_look_does_not_keep_it(
+def test_who_locks_only_to_look_does_not_keep_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Another sweep does so, and Fast DDS in a neighbour, to see whether it is locked.
     with open(folder / PORT[1]) as looking:
+        fcntl.flock(looking, fcntl.LOCK_EX)
         monkeypatch.setattr("time.sleep", lambda _: looking.close())
         assert sorted(_sweep(folder)) == sorted(PORT)
 
 
-def test_an_owner_that_opens_its_lock_between_two_looks_is_not_disturbed(
+def test_an_owner_that_locks_between_two_looks_is_not_disturbed(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with contextlib.ExitStack() as owner:
-        monkeypatch.setattr("time.sleep", lambda _: owner.enter_context(open(folder / PORT[1])))
+    with open(folder / PORT[1]) as lock:
+        monkeypatch.setattr("time.sleep", lambda _: fcntl.flock(lock, fcntl.LOCK_EX))
         assert _sweep(folder) == ()
     assert _names(folder) == set(PORT)
+
+
+def test_an_owner_that_cannot_be_seen_is_not_disturbed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A container lists the locks of its own processes only.
+    monkeypatch.setattr("neuros.backends.shared_memory._lock_owners", dict)
+    with open(folder / PORT[1]) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert _sweep(folder) == ()
 
 
 def test_without_a_lock_file_it_counts_whether_somebody_maps_the_memory(folder: Path) -> None:

@@ -76,7 +76,7 @@ class Outcome:
         took_s: from when the end was due to the end of the launcher, and of what it leaves behind.
         bag: ``complete``, ``repaired``, ``none``, or what is wrong with it.
         problems: where that is not what must be.
-        is_late: it took longer than it may, or the machine was too busy: the tests try once more.
+        is_late: it took longer than it may, or the machine was too busy.
     """
 
     place: Place

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tests.tables import update_rows
 
-from .running import BACKENDS, Load, run
+from .running import BACKENDS, Load, latency_problems, run
 from .shapes import LARGEST_BYTES, SHAPES
 
 _HEAD = (
@@ -34,6 +34,7 @@ def main() -> int:
                     largest=options.largest,
                     busy=options.busy,
                 )
+            load.problems += latency_problems(load.latency_ms)
             failed += bool(load.problems)
             print(_row(load), flush=True)
             if options.table:

@@ -38,7 +38,7 @@ class Load:
     Attributes:
         lossless: packets that arrived on lossless connections.
         latency_ms: of packets of 8 bytes, from hook to hook: median of the first and of the last
-            tenth, and the 99th percentile of all.
+            tenth, and the 99th percentile of all. Whether it grew, a long run tells.
         memory_mb: private memory of all processes: median of the first tenth, behind the start, and
             of the last one.
         problems: what is not as it must be.
@@ -100,7 +100,7 @@ def run(
         for source, destination, limit, _ in shape.ends
         if limit == 0
     )
-    judge_latency(load, [each["ages_ms"] for each in told.values() if "ages_ms" in each])
+    load.latency_ms = latency([each["ages_ms"] for each in told.values() if "ages_ms" in each])
     judge_memory(load, while_all_live(memory))
     return load
 
@@ -161,18 +161,22 @@ def count_problems(
                 yield f"{name}: {by_name[name]['lost']} lost"
 
 
-def judge_latency(load: Load, ages_ms: Sequence[Sequence[float]]) -> None:
-    """Note the latency, and whether it grew."""
+def latency(ages_ms: Sequence[Sequence[float]]) -> tuple[float, float, float]:
+    """Median of the first and of the last tenth, and 99th percentile, of all that was measured."""
     tenths = [(each[: len(each) // 10], each[-(len(each) // 10) :]) for each in ages_ms]
     first = [age for begin, _ in tenths for age in begin]
     last = [age for _, end in tenths for age in end]
     if len(first) < _FEWEST_SAMPLES:
-        return
-    before_ms, after_ms = statistics.median(first), statistics.median(last)
+        return (0.0, 0.0, 0.0)
     every = sorted(age for each in ages_ms for age in each)
-    load.latency_ms = (before_ms, after_ms, every[int(0.99 * len(every))])
+    return (statistics.median(first), statistics.median(last), every[int(0.99 * len(every))])
+
+
+def latency_problems(latency_ms: tuple[float, float, float]) -> Iterator[str]:
+    """Whether it grew; a run of some seconds shows just what else the machine did."""
+    before_ms, after_ms, _ = latency_ms
     if after_ms > _SLOWER * before_ms + _SLOWER_MS:
-        load.problems.append(f"latency grew from {before_ms:.2f} to {after_ms:.2f} ms")
+        yield f"latency grew from {before_ms:.2f} to {after_ms:.2f} ms"
 
 
 def judge_memory(load: Load, samples: Sequence[int]) -> None:

@@ -17,8 +17,9 @@ from .running import (
     BACKENDS,
     Load,
     count_problems,
-    judge_latency,
     judge_memory,
+    latency,
+    latency_problems,
     run,
     while_all_live,
 )
@@ -66,14 +67,14 @@ def test_what_is_lost_or_changed_is_noticed() -> None:
 
 
 def test_what_grows_is_noticed() -> None:
-    flat, slower, larger = Load("ring", "process"), Load("ring", "process"), Load("ring", "process")
-    judge_latency(flat, [[1.0] * 500])
-    judge_latency(slower, [[1.0] * 250 + [5.0] * 250])
+    flat, larger = Load("ring", "process"), Load("ring", "process")
     judge_memory(flat, [10_000_000] * 200)
     judge_memory(larger, [10_000_000 + 200_000 * n for n in range(200)])
     assert flat.problems == []
-    assert slower.problems == ["latency grew from 1.00 to 5.00 ms"]
     assert larger.problems[0].startswith("memory grew from ")
+    assert list(latency_problems(latency([[1.0] * 500]))) == []
+    slower = latency([[1.0] * 250 + [5.0] * 250])
+    assert list(latency_problems(slower)) == ["latency grew from 1.00 to 5.00 ms"]
 
 
 def test_memory_is_that_of_moments_at_which_all_nodes_live() -> None:

@@ -25,7 +25,7 @@ _USUAL_ADDRESS = f"unix://{_USUAL_SOCKET}"
 _TIMEOUT_S = 60.0
 # Attributes of a node's resources, and how `docker info` calls the ability to keep to them.
 _LIMITS = {"mem_bytes": "MemoryLimit", "cpus": "CpuCfsQuota", "pids": "PidsLimit"}
-_WITHOUT = "or run without containers: --backend process"
+OR_WITHOUT = "or run without containers: --backend process"
 
 
 def connect(
@@ -55,7 +55,7 @@ def connect(
         engine.close()
         raise EnvironmentFault(
             f"the Docker engine at {where} is too old (API {engine.api.api_version}): install"
-            f" Docker {OLDEST_ENGINE} or newer, {_WITHOUT}"
+            f" Docker {OLDEST_ENGINE} or newer, {OR_WITHOUT}"
         )
     return engine
 
@@ -159,14 +159,14 @@ def _explain(error: BaseException, where: str) -> str:
         return (
             f"this user may not use the Docker engine at {where}: sudo usermod -aG docker"
             f" {os.environ.get('USER', '$USER')}, then log in again (or install rootless Docker),"
-            f" {_WITHOUT}"
+            f" {OR_WITHOUT}"
         )
     if isinstance(cause, OSError):
         return (
             f"no Docker engine answers at {where} ({cause.strerror or cause}): install and start"
-            f" it (sudo apt-get install docker.io; sudo systemctl start docker), {_WITHOUT}"
+            f" it (sudo apt-get install docker.io; sudo systemctl start docker), {OR_WITHOUT}"
         )
-    return f"the Docker engine at {where} cannot be used ({error}): see DOCKER_HOST, {_WITHOUT}"
+    return f"the Docker engine at {where} cannot be used ({error}): see DOCKER_HOST, {OR_WITHOUT}"
 
 
 def _cause(error: BaseException) -> OSError | None:

@@ -27,7 +27,13 @@ import requests
 from docker import DockerClient
 from docker.errors import DockerException
 
-from neuros.backends.docker.engine import Abilities, connect, engine_faults
+from neuros.backends.docker.engine import (
+    OR_WITHOUT,
+    Abilities,
+    connect,
+    engine_faults,
+    engine_socket,
+)
 from neuros.backends.docker.images import Image, image_for
 from neuros.backends.docker.layout import LIBRARY, MESSAGES, ROOT
 from neuros.backends.docker.settings import NETWORK_MODE, limits
@@ -71,28 +77,27 @@ class RemoteEngine:
     def __init__(self, host: Host, ssh: Sequence[str]) -> None:
         self.host = host
         self.reached_at = ""
-        self._tunnel: subprocess.Popen[str] | None = None
-        self._folder: Path | None = None
+        self._held = contextlib.ExitStack()
         try:
             if shutil.which("docker") is None:
                 raise EnvironmentFault("there is no command docker here: apt-get install docker.io")
             where = urlsplit(host.docker)
-            self.address = self._tunnelled(ssh) if where.scheme == "ssh" else host.docker
+            self._address = self._tunnelled(ssh) if where.scheme == "ssh" else host.docker
             self.reached_at = self.reached_at or where.hostname or "127.0.0.1"
-            self._engine = connect({**os.environ, "DOCKER_HOST": self.address}, timeout_s=None)
+            found = {**os.environ, "DOCKER_HOST": self._address}
+            self._engine = connect(found, timeout_s=None)
+            self._held.callback(self._engine.close)
+            if where.scheme == "unix":  # of a rootless engine it is not the usual one
+                self._address = f"unix://{engine_socket(self._engine)}"
             with engine_faults("Docker"):
                 self._is_rootless = Abilities.of(self._engine.info()).is_rootless
         except EnvironmentFault as fault:
             self.close()
-            raise EnvironmentFault(f"{host}: {fault}") from fault
+            why = str(fault).removesuffix(f", {OR_WITHOUT}")  # which it cannot do without
+            raise EnvironmentFault(f"{host}: {why}") from fault
         except BaseException:
             self.close()
             raise
-
-    @property
-    def pid(self) -> int | None:
-        """Of the process that holds the way to it, if there is one."""
-        return None if self._tunnel is None else self._tunnel.pid
 
     def container(self, node: Node, project: Path, log: Log) -> AgentContainer:
         """Make the container of a node, and copy its image if need be.
@@ -105,38 +110,28 @@ class RemoteEngine:
             with engine_faults(f"the container of node '{node.name}'"):
                 self._remove_never_started()
                 return AgentContainer(
-                    self._engine, self.address, node, image, 0 if self._is_rootless else _USER
+                    self._engine, self._address, node, image, 0 if self._is_rootless else _USER
                 )
         except EnvironmentFault as fault:
             raise EnvironmentFault(f"{self.host}: {fault}") from fault
 
     def close(self) -> None:
         """Leave it. Any thread; a second call has no effect."""
-        engine = self.__dict__.pop("_engine", None)
-        if engine is not None:
-            engine.close()
-        if self._tunnel is not None:
-            assert self._tunnel.stdin is not None
-            with contextlib.suppress(OSError):
-                self._tunnel.stdin.close()
-            self._tunnel.kill()
-            self._tunnel.wait()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        self._held.close()
 
     def _tunnelled(self, ssh: Sequence[str]) -> str:
         """The address of a socket here that leads to the engine's there."""
         where = urlsplit(self.host.docker)
-        self._folder = Path(tempfile.mkdtemp(prefix="neuros-docker-"))  # short: a socket's path is
-        socket = self._folder / "socket"
+        folder = Path(tempfile.mkdtemp(prefix="neuros-docker-"))  # short, as names of sockets are
+        self._held.callback(shutil.rmtree, folder, ignore_errors=True)
+        socket, errors = folder / "socket", folder / "errors"
         destination = f"ssh://{where.netloc}"
         forward = f"{socket}:{where.path.rstrip('/') or _SOCKET}"
         # It ends with its standard input, and so with this process, come what may.
         remote = "echo ${SSH_CONNECTION:-}; exec cat >/dev/null"
-        errors = self._folder / "errors"
         with open(errors, "w") as log:
             try:
-                self._tunnel = subprocess.Popen(
+                tunnel = subprocess.Popen(
                     [*ssh, *_FORWARDING, "-L", forward, "--", destination, remote],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
@@ -147,8 +142,9 @@ class RemoteEngine:
                 )
             except OSError as error:
                 raise EnvironmentFault(f"ssh cannot be started ({error.strerror})") from error
-        assert self._tunnel.stdout is not None
-        said = self._tunnel.stdout.readline()
+        self._held.callback(_end, tunnel)
+        assert tunnel.stdout is not None
+        said = tunnel.stdout.readline()
         end_s = time.monotonic() + _CONNECT_S
         while said and not socket.is_socket() and time.monotonic() < end_s:
             time.sleep(_LOOK_S)
@@ -267,6 +263,11 @@ class AgentContainer:
             for there, here in trees.items():
                 tar.add(here, str(there.relative_to("/")), filter=_for_all)
         self._container.put_archive("/", archive.getvalue())
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
 
 
 class _Stream(io.RawIOBase):

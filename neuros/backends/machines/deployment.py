@@ -295,7 +295,11 @@ class _Launcher:
         elsewhere = [file.node.name for file in nodes if file.node.name in places]
         return [
             *self._inner.describe(here),
-            *(f"process {name} on {hosts[places[name]]}" for name in elsewhere),
+            *(
+                f"{'container' if hosts[places[name]].docker else 'process'} {name} on"
+                f" {hosts[places[name]]}"
+                for name in elsewhere
+            ),
         ]
 
     def _begin(self, side: Side, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> None:
