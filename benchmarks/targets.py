@@ -217,7 +217,7 @@ TARGETS = (
         ),
     ),
     Target(
-        "speed of WhiskEye strict, in process, with its books, as a share of that without",
+        "speed of WhiskEye strict, in process, with metrics, as a share of that without",
         "WhiskEye with its books",
         "",
         "ledger",
