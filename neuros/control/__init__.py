@@ -293,7 +293,7 @@ class Explain(Message):
 
 @dataclass(frozen=True)
 class Drain(Message):
-    """Stop the hooks that send unasked; ``last_round``: hooks that may start once more, by index."""
+    """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
 
