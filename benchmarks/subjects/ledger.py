@@ -39,7 +39,7 @@ def subject(is_quick: bool) -> Subject:
     }
     cases = tuple(
         Case(
-            f"whiskeye strict, {name}, with metrics: share of the speed without",
+            f"whiskeye strict, {name}, with metrics: share of the speed without metrics",
             "",
             Figure(name, figure),
             bound=bound,
