@@ -103,7 +103,7 @@ def _report(results: Results, is_whole: bool) -> str:
     loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
     parts.append(f"busy with other things before: {loads}")
     if results.is_quick:
-        parts.append("A quick run: it shows that everything works, and no figures to quote.")
+        parts.append("A quick run: it shows that everything works; its figures mean nothing.")
     return "\n\n".join(parts)
 
 

@@ -69,4 +69,4 @@ def _about(results: Results) -> str:
         f" {machine['system']}; {others}. Others kept this share of the cores busy in the second"
         f" before each subject: {loads}."
     )
-    return f"A quick run: no figures to quote. {text}" if results.is_quick else text
+    return f"A quick run: its figures mean nothing. {text}" if results.is_quick else text

@@ -26,8 +26,9 @@ ROW_HEADERS = [
 TARGET_HEADERS = ["target", "against", "figure (95 %)", "at most / least", "met", "measured by"]
 
 LEGEND = (
-    "Medians with the 95 % interval of the median. Met: yes, the whole interval reaches the target;"
-    " within, the interval contains it; NO; in parentheses with fewer than 10 rounds; ?, too few."
+    "Medians, with the 95 % interval of the median. Met: yes: the whole interval reaches the"
+    " target; within: the interval contains the target; NO: no part reaches it; in parentheses:"
+    " fewer than 10 rounds; ?: too few rounds."
 )
 
 

@@ -17,7 +17,7 @@ SIMULATED_S = 60.0
 ROWS = {
     NEUROS: "NeuROS, share of the speed of one loop",
     HAND: "its hooks called by hand, share of the speed of one loop",
-    APART: "by hand, each in its node's surroundings, share of the speed of one loop",
+    APART: "its hooks called by hand, each in its node's context, share of the speed of one loop",
     "around hooks": "NeuROS, share of the speed of its hooks called by hand",
 }
 

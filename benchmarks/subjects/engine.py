@@ -21,7 +21,7 @@ from neuros.hooks import hook_specs_of, neuros_function
 from neuros.project.model import Connection, Node, Port
 
 RELAY = "engine alone, packet and acknowledgement"
-JOURNALLED = f"{RELAY}, with the journal of recorded runs"
+LOGGED = f"{RELAY}, with the event log of recorded runs"
 
 
 def subject(is_quick: bool) -> Subject:
@@ -30,7 +30,7 @@ def subject(is_quick: bool) -> Subject:
     candidates = {
         "engine alone, loop-back": functools.partial(loop_back_us, count),
         RELAY: functools.partial(relay_us, count),
-        JOURNALLED: functools.partial(relay_us, count, LoggedEngine),
+        LOGGED: functools.partial(relay_us, count, LoggedEngine),
         "in process": functools.partial(real_run_us, "in-process", count),
         "process": functools.partial(real_run_us, "process", count),
     }
@@ -39,7 +39,7 @@ def subject(is_quick: bool) -> Subject:
             f"execution of a hook, {name}",
             "us",
             Figure(name),
-            *((Figure(RELAY), "without journal") if name == JOURNALLED else ()),
+            *((Figure(RELAY), "without event log") if name == LOGGED else ()),
             # The free-running hook as users have it; the engine alone is the profile of it.
             bound="hook" if name == "process" else None,
         )

@@ -1,7 +1,8 @@
-"""What the books of a run cost it: times and digests of packets, accounts, the timeline.
+"""Cost of the metrics of a run: times and digests of packets, the time budget, the timeline.
 
-Each run is measured with them and without in turn (:mod:`benchmarks.in_turn`). WhiskEye, strict; in
-process one thread does all, so its processor time tells more than the wall clock of a busy machine.
+WhiskEye, strict. Each run is measured with metrics and without, in turn
+(:mod:`benchmarks.in_turn`). In process one thread does all work, so its processor time says more
+than the wall clock of a busy machine.
 """
 
 from __future__ import annotations
@@ -38,11 +39,11 @@ def subject(is_quick: bool) -> Subject:
     }
     cases = tuple(
         Case(
-            f"whiskeye strict, {name}, with its books: share of the speed without",
+            f"whiskeye strict, {name}, with metrics: share of the speed without metrics",
             "",
             Figure(name, figure),
             bound=bound,
         )
         for name, (_, _, figure, bound) in RUNS.items()
     )
-    return Subject("what the books of a run cost it", (Group(candidates, cases),))
+    return Subject("cost of the metrics of a run", (Group(candidates, cases),))

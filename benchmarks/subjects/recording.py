@@ -54,7 +54,7 @@ def _whiskeye(share: float) -> Group:
             )
             cases.append(
                 Case(
-                    f"whiskeye {recorded_run}, recorded: share of the speed without",
+                    f"whiskeye {recorded_run}, recorded: share of the speed without recording",
                     "",
                     Figure(recorded_run, "speed"),
                     bound=f"recorded-{name}" if backend == "process" else None,
@@ -71,7 +71,7 @@ def _recorder(share: float) -> Group:
     candidates["live"] = functools.partial(live, IMU_BYTES, 4.0 * share)
     cases = (
         Case(
-            "recorder, IMU packets of 4 nodes that go on",
+            "recorder, IMU packets of 4 nodes, live",
             "1/s",
             Figure("live", "rate"),
             bound="recorder-live",

@@ -48,9 +48,9 @@ def _ring_of(nodes: int) -> Group:
         name = f"launch of {nodes} node{'s' if nodes > 1 else ''}, {label}"
         point = Point("start-up", label, nodes)
         cases.append(
-            Case(f"{name}, first hook of the last", "s", Figure(label, "last"), point=point)
+            Case(f"{name}, first hook of the last node", "s", Figure(label, "last"), point=point)
         )
-        cases.append(Case(f"{name}, first hook of any", "s", Figure(label, "any")))
+        cases.append(Case(f"{name}, first hook of any node", "s", Figure(label, "any")))
     return Group(candidates, tuple(cases), ROUNDS[nodes])
 
 

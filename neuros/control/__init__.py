@@ -1,6 +1,6 @@
 """The control channel of a run: typed messages between supervisor, node processes and observers.
 
-It is no part of the data path: nodes report once per second, on a change of state and at the end;
+It is not part of the data path: nodes report once per second, on a change of state and at the end;
 the supervisor answers rarely. Observers (the dashboard) get no more than they ask for. Every
 message is a dataclass of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`
 and :data:`TO_OBSERVERS` say who sends which.
@@ -174,7 +174,7 @@ class Probed(Report):
 
 @dataclass(frozen=True)
 class Hooks(Message):
-    """The hooks that a plugin declares, once it is loaded; finalise hooks by name."""
+    """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
 
     node: str
     hooks: tuple[HookDeclaration, ...]
@@ -190,7 +190,7 @@ class FirstHook(Message):
 
 @dataclass(frozen=True)
 class Finalising(Message):
-    """A node starts a finalise hook; ``""``: it closes what it holds; ``None``: it has."""
+    """A node starts a finalise hook; ``""``: it closes its resources; ``None``: they are closed."""
 
     node: str
     hook: str | None
@@ -223,7 +223,7 @@ class Explanation(Message):
 
 @dataclass(frozen=True)
 class Heard(Message):
-    """State that another launcher publishes by its node; ``None``: that node is gone."""
+    """State of another launcher, received from its node; ``None``: that node is gone."""
 
     node: str
     text: str | None
@@ -257,7 +257,7 @@ class AtRest(Message):
         sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
         received: by connection from another process, likewise.
         sim_times: of nodes that own simulated time, in seconds.
-        packets: by output (``robot.imu``), what is newer than the number that was asked with.
+        packets: by output (``robot.imu``), the packet, if it is newer than the known number.
     """
 
     nodes: tuple[str, ...]
@@ -271,7 +271,7 @@ class AtRest(Message):
 
 @dataclass(frozen=True)
 class WasReset(Message):
-    """In answer to ``reset``; ``why_not``: why the run has to be started anew in its place."""
+    """Answer to ``reset``; ``why_not``: why a new run has to be started instead."""
 
     why_not: str
 
@@ -293,7 +293,7 @@ class Explain(Message):
 
 @dataclass(frozen=True)
 class Drain(Message):
-    """Stop the hooks that send unasked; some, by node and place, may start once more."""
+    """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
 
@@ -312,7 +312,7 @@ class Say(Message):
 
 @dataclass(frozen=True)
 class Leave(Message):
-    """Peers have heard and said all: a node at its end may go."""
+    """Peers have exchanged all their states: a node that has ended may leave."""
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,7 @@ class Resume(Message):
 
 @dataclass(frozen=True)
 class Step(Message):
-    """While paused, go on by so many steps; ``is_driven``: some hooks start with no packet."""
+    """While paused, run ``count`` steps; ``is_driven``: some hooks start without a packet."""
 
     count: int
     is_driven: bool
@@ -343,7 +343,7 @@ class Look(Message):
 
 @dataclass(frozen=True)
 class Settle(Message):
-    """While paused, answer once nothing moves; ``known``: outputs to show, and what is known."""
+    """While paused, answer once nothing moves; ``known``: newest known packet number, by output."""
 
     number: int
     known: Mapping[str, int]
@@ -351,7 +351,7 @@ class Settle(Message):
 
 @dataclass(frozen=True)
 class Reset(Message):
-    """While nothing moves, be as after the start; ``variables``: of environments, by node."""
+    """While nothing moves, return to the start; ``variables``: of the environments, by node."""
 
     variables: Mapping[str, Mapping[str, str]]
 
@@ -370,7 +370,7 @@ class Deliver(Message):
 
 @dataclass(frozen=True)
 class Advance(Message):
-    """While paused, take packets, go on by so many steps, then answer ``at_rest`` and pause.
+    """While paused, take packets and run ``count`` steps; then answer ``at_rest``, and pause.
 
     A session sends it to the process that holds all nodes, past the supervisor.
     """
@@ -391,14 +391,14 @@ class Watch(Message):
 
 @dataclass(frozen=True)
 class LookAll(Message):
-    """Have every node show its status once; ``wanted``: what to sample, by node and port."""
+    """Ask every node for its status once; ``wanted``: what to sample, by node and port."""
 
     wanted: Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class StepAll(Message):
-    """While the run is paused, let it go on by so many steps."""
+    """While the run is paused, run ``count`` steps."""
 
     count: int
 
