@@ -73,6 +73,10 @@ class Transport(Protocol):
     def foreign(self) -> Mapping[str, int]:
         """By connection, messages on its topics from others than its two nodes."""
 
+    @property
+    def compressed(self) -> Mapping[str, tuple[int, int]]:
+        """By connection on which this node compresses: bytes before and after."""
+
     def note_execution(self) -> None:
         """A hook has ended: what has reached the node meanwhile comes before the next one."""
 

@@ -61,6 +61,7 @@ def run_record(
     sim_times = [r.sim_time for r in ended.reports.values() if r.sim_time is not None]
     sim_s, running_s = max(sim_times, default=None), ended.running_s
     foreign = sum((Counter(r.foreign) for r in ended.reports.values()), Counter[str]())
+    compressed = {name: n for r in ended.reports.values() for name, n in r.compressed.items()}
     all_metrics = {**ended.elsewhere, **{n: r.metrics or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -77,7 +78,12 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            _connection(c, all_metrics, running_s, run_folder, _cut_off(ended), foreign[str(c)])
+            {
+                **_connection(
+                    c, all_metrics, running_s, run_folder, _cut_off(ended), foreign[str(c)]
+                ),
+                **_compressed(compressed.get(str(c))),
+            }
             for c in sorted({c for file in files for c in file.connections}, key=lambda c: c.index)
         ],
         "nodes": {
@@ -113,6 +119,12 @@ def run_table(record: Mapping[str, Any]) -> str:
         from neuros.recording.system_load import load_table  # images of nodes have no psutil
 
         parts.append(load_table(record["system_load"]))
+    parts += [
+        f"{c['connection']}: {c['bytes'] / 1e6:.3g} MB compressed to"
+        f" {c['compressed_bytes'] / 1e6:.3g} MB"
+        for c in record["connections"]
+        if "bytes" in c
+    ]
     return "\n\n".join([*parts, _times(record)])
 
 
@@ -162,6 +174,10 @@ def _connection(
     }
     packets = read_packets(run_folder, connection)
     return figures | packet_figures(packets, may_lose=may_have_lost(figures))
+
+
+def _compressed(counted: Sequence[int] | None) -> dict[str, int]:
+    return {} if counted is None else {"bytes": counted[0], "compressed_bytes": counted[1]}
 
 
 def _cut_off(ended: Ended) -> list[str]:

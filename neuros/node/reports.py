@@ -87,6 +87,7 @@ class NodeReports:
             "stack": self._stack(metrics),
             "fault": None if self._packet_log is None else self._packet_log.failure,
             "foreign": {name: n for name, n in self._transport.foreign.items() if n},
+            "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
         }
 

@@ -25,6 +25,7 @@ NETWORK = "NETWORK"
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
+_KEYS_OF_TRANSPORT = frozenset({"compression"})
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
@@ -134,6 +135,7 @@ class Connection:
         queue_size: unread packets that the receiver holds, K.
         index: its place in the project file, from 0; the order of the packets of an ``All`` input.
         namespace: that of the project, empty or as in ``/left``.
+        compression: of packets that leave the machine; ``None``: there is none.
     """
 
     source_node: str
@@ -144,6 +146,7 @@ class Connection:
     queue_size: int = 1
     index: int = 0
     namespace: str = ""
+    compression: str | None = None
 
     @property
     def is_reliable(self) -> bool:
@@ -167,14 +170,17 @@ class Connection:
     def of(cls, keys: Mapping[str, Any], **more: Any) -> Connection:
         """The connection that valid keys describe; JSON may write a whole number as ``2.0``."""
         whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in keys.items()}
-        return cls(**whole, **more)
+        transport = whole.pop("transport", {})
+        return cls(**whole, **transport, **more)
 
     @property
     def keys(self) -> dict[str, Any]:
         """As a project file has it."""
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
-        return {key: value for key, (value, default) in values.items() if value != default}
+        keys = {key: value for key, (value, default) in values.items() if value != default}
+        transport = {key: keys.pop(key) for key in _KEYS_OF_TRANSPORT & keys.keys()}
+        return {**keys, "transport": transport} if transport else keys
 
     def __hash__(self) -> int:
         # Looked up for every packet; the place in the project tells most connections apart.

@@ -21,12 +21,12 @@ import hashlib
 import hmac
 import struct
 
-from neuros.transport.large_packets import PARCEL_MARK
+from neuros.transport.codecs import COMPRESSED_MARK, PARCEL_MARK
 
 _BLOCK = 512
 _LITTLE_ENDIAN = b"\0\1"
 _PLAIN = b"\0\1\0\0"
-_IS_FREE = (b"\0\0", PARCEL_MARK)
+_IS_FREE = (b"\0\0", PARCEL_MARK, COMPRESSED_MARK)
 # The header; no dimensions, no offset, two items, and a gap before them; position and tag.
 _POSITION = struct.Struct("<4s3I4xQ8s")
 _BIG_ENDIAN_POSITION = struct.Struct(">4s3I4xQ8s")

@@ -39,6 +39,12 @@ class WrongBytes(ProtocolError):
         super().__init__(f"{len(data)} bytes are not a {name}: {why}")
 
 
+PARCEL_MARK = b"NR"
+"""Option bytes of the encapsulation header of a parcel (:mod:`neuros.transport.large_packets`)."""
+COMPRESSED_MARK = b"NZ"
+"""Those of a compressed packet (:mod:`neuros.transport.compression`)."""
+
+
 class Encoder(Protocol):
     """The sender's half of a codec; connections of one output share it where they can."""
 

@@ -27,7 +27,7 @@ from weakref import ReferenceType, ref
 
 from neuros.errors import ProtocolError
 from neuros.project.model import Connection, NodeFile
-from neuros.transport.codecs import Decoder, Encoder, message_codec
+from neuros.transport.codecs import PARCEL_MARK, Decoder, Encoder, message_codec
 from neuros.transport.message_buffers import MessageBuffers, message_buffers
 from neuros.transport.messages import message_class
 from neuros.transport.packet_segment import (
@@ -42,8 +42,6 @@ from neuros.transport.packet_segment import (
 LARGE_BYTES = 64 * 1024
 """Buffers of together this size or more leave the message: below, DDS is as fast."""
 
-PARCEL_MARK = b"NR"
-"""Option bytes of a parcel."""
 _OPTIONS = slice(2, 4)
 # Behind the message, and read from its end: lengths of the buffers, the name of the segment, and
 # generation, size of a slot, slot, length of the message, number of buffers, length of the name.
@@ -201,7 +199,7 @@ class LargeCodecs:
 
     def note(self, connection: Connection) -> str:
         """The note from the receiver of a connection to its sender; empty: no parcels."""
-        return machine_token() if connection in self.inputs else ""
+        return machine_token() if connection in self.inputs or connection.compression else ""
 
     def encoder(
         self, connection: Connection, note: str, count_readers: Callable[[], int]

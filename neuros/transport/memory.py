@@ -105,6 +105,7 @@ class MemoryTransport:
         self.watched = self._given.watched
         self._digest = digest
         self.foreign: dict[str, int] = {}  # nobody else can put anything in
+        self.compressed: dict[str, tuple[int, int]] = {}  # nothing leaves the machine
         self.digests: dict[Connection, array[int]] = {}
         for c in file.connections:
             if c.source_node != c.destination_node and digest is not None and digests_of(c):

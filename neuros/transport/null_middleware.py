@@ -72,6 +72,7 @@ class _NullTransport:
 
     digests: Mapping[Connection, array[int]] = {}
     foreign: Mapping[str, int] = {}
+    compressed: Mapping[str, tuple[int, int]] = {}
 
     def open(self, inbox: Inbox) -> None: ...
     def send_external(self, port: Port, packet: Any) -> None: ...

@@ -31,8 +31,9 @@ from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import Decoder, Encoder, message_codec
+from neuros.transport.compression import Compressor, Traffic, compressing, decompressing
 from neuros.transport.digests import Digest, digest_for, make_digests
-from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel
+from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
 from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos
 from neuros.transport.ros_loop import RosLoop
@@ -136,6 +137,8 @@ class RosTransport:
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
         self.foreign = {str(connection): 0 for connection in file.connections}
+        self._traffic: dict[str, Traffic] = {}
+        self._compressors: dict[str, Compressor] = {}
         self._unnamed: list[tuple[Connection, str]] = []
         self._naming: Timer | None = None
         self._registrations: list[Registration] = []
@@ -199,6 +202,10 @@ class RosTransport:
                 acknowledge(position)
 
         return acknowledge_if_open
+
+    @property
+    def compressed(self) -> Mapping[str, tuple[int, int]]:
+        return {name: (each.bytes, each.compressed_bytes) for name, each in self._traffic.items()}
 
     def note_execution(self) -> None:
         self._loop.note_execution()
@@ -280,8 +287,10 @@ class RosTransport:
             link.publish_position = lambda position: publish(encode(position))
             publishers.append(acknowledge)
         receive: Callable[..., None] = link.receive
+        if connection.compression:
+            receive = decompressing(receive)
         if key is not None:
-            receive = self._checking(connection, DataTags(key), link.receive)
+            receive = self._checking(connection, DataTags(key), receive)
         data = self._subscribe(
             kind, f"{connection.topic}/data", data_qos(connection, is_reader=True), receive
         )
@@ -303,6 +312,14 @@ class RosTransport:
         """The receiver of a connection is there, and lets us know ``note`` of itself."""
         link = self._sending[connection]
         link.codec = self._large.encoder(connection, note, link.count_readers) or link.codec
+        if connection.compression and (not note or note != machine_token()):
+            output = connection.source_output
+            link.publish = compressing(
+                self._compressors.setdefault(output, Compressor()),
+                self._traffic.setdefault(str(connection), Traffic()),
+                link.count_readers,
+                link.publish,
+            )
         inbox.on_registered(connection)
 
     def _subscribe(

@@ -7,8 +7,8 @@ import struct
 import pytest
 
 from neuros.transport.authentication import DataTags, Positions, signed, verified
-from neuros.transport.codecs import message_codec
-from neuros.transport.large_packets import PARCEL_MARK, is_parcel
+from neuros.transport.codecs import PARCEL_MARK, message_codec
+from neuros.transport.large_packets import is_parcel
 from neuros.transport.messages import decode, message_class
 
 Int32 = message_class("std_msgs/msg/Int32")
