@@ -128,7 +128,7 @@ THIRD_PARTY: dict[str, set[str]] = {
         "backports",
         "compression",
     },
-    "analysis": {"matplotlib", "tabulate", "numpy", "xxhash", "backports", "compression"},
+    "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
     "visualise.figures": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.bag_reader": {"rosbags", "numpy"},
