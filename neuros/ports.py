@@ -102,8 +102,8 @@ class Packets(Protocol):
     def make(self, type_name: str) -> Packet:
         """A new message with default values, for a type in ROS notation."""
 
-    def checker(self, kind: type) -> Callable[[Packet], Packet]:
-        """A check for packets of a class before they are sent.
+    def checker(self, kind: type, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
+        """A check for packets of a class before they are sent, also as JPEG.
 
         It returns the packet, with the values that its receivers see; raises ``WrongValue``.
         """

@@ -88,6 +88,7 @@ THIRD_PARTY: dict[str, set[str]] = {
         "xxhash",
         "backports",
         "compression",
+        "PIL",
     }
     | MESSAGES,
     "transport.memory": set(),
@@ -127,6 +128,7 @@ THIRD_PARTY: dict[str, set[str]] = {
         "xxhash",
         "backports",
         "compression",
+        "PIL",
     },
     "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
     "visualise.figures": {"numpy"},

@@ -345,7 +345,9 @@ class NodeRuntime:
     def _packet_type(self, port: Port) -> PacketType:
         packets = self._middleware.packets
         kind = packets.message_class(port.type)
-        return PacketType(kind, packets.checker(kind))
+        own = [c for c in self.file.connections if c.source_node == self.file.node.name]
+        for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
+        return PacketType(kind, packets.checker(kind, for_jpeg=for_jpeg))
 
     def _watched(self, spec: HookSpec) -> HookSpec:
         return replace(spec, function=self._transport.watched(spec.function))

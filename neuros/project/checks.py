@@ -29,6 +29,7 @@ from neuros.project.validate import MOST_PROBLEMS
 Side = Literal["inputs", "outputs"]
 _SIDES: tuple[Side, ...] = ("inputs", "outputs")
 _LONGEST_PART = len("/data")
+_IMAGE = "sensor_msgs/msg/Image"
 _INT64 = 1 << 63
 # ROS declares these itself, and passes over what is neither true nor false.
 _TRUTH_VALUES = ("use_sim_time", "start_type_description_service")
@@ -161,6 +162,7 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
             elif end is not None:
                 yield connection.value[port_key].problem(*end)
         yield from _different_types(connection, found)
+        yield from _compression(connection, found)
 
 
 _Ports: TypeAlias = "Callable[[str, str], Mapping[str | None, Element]]"
@@ -190,6 +192,26 @@ def _different_types(connection: Element, ends: list[Element]) -> Iterator[Probl
         yield connection.problem(
             f"the output sends {types[0]}, the input takes {types[1]}",
             f"{_where(source, 'type')} and {_where(destination, 'type').removeprefix('see ')}",
+        )
+
+
+def _compression(connection: Element, ends: list[Element]) -> Iterator[Problem]:
+    transport = connection.member("transport")
+    if transport is None or not isinstance(transport.value, dict):
+        return
+    compression, quality = transport.member("compression"), transport.member("quality")
+    if compression is None or compression.value != "jpeg":
+        if quality is not None:
+            yield quality.key_problem("'quality' is that of JPEG", 'add "compression": "jpeg"')
+        return
+    for port in ends:
+        found = normalised(port.string("type") or "")
+        if found not in (None, _IMAGE):
+            yield compression.problem(f"JPEG is for {_IMAGE}, not {found}", "zstd takes any type")
+            return
+    if connection.string(ENDS[0]) == connection.string(ENDS[2]):
+        yield compression.problem(
+            "packets of a node to itself are not sent, so they cannot be encoded", "leave it out"
         )
 
 

@@ -25,7 +25,7 @@ NETWORK = "NETWORK"
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
-_KEYS_OF_TRANSPORT = frozenset({"compression"})
+_KEYS_OF_TRANSPORT = frozenset({"compression", "quality"})
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
@@ -135,7 +135,8 @@ class Connection:
         queue_size: unread packets that the receiver holds, K.
         index: its place in the project file, from 0; the order of the packets of an ``All`` input.
         namespace: that of the project, empty or as in ``/left``.
-        compression: of packets that leave the machine; ``None``: there is none.
+        compression: ``zstd`` for packets that leave the machine, ``jpeg``; ``None``: there is none.
+        quality: of JPEG, 1 to 100.
     """
 
     source_node: str
@@ -147,11 +148,22 @@ class Connection:
     index: int = 0
     namespace: str = ""
     compression: str | None = None
+    quality: int = 95
 
     @property
     def is_reliable(self) -> bool:
         """Whether it has a discard limit, and so acknowledgements."""
         return self.discard_limit is not None
+
+    @property
+    def is_zstd(self) -> bool:
+        """Whether packets that leave the machine are compressed with Zstandard."""
+        return self.compression == "zstd"
+
+    @property
+    def is_jpeg(self) -> bool:
+        """Whether its packets are images that are encoded as JPEG."""
+        return self.compression == "jpeg"
 
     @property
     def window(self) -> int:
@@ -169,9 +181,10 @@ class Connection:
     @classmethod
     def of(cls, keys: Mapping[str, Any], **more: Any) -> Connection:
         """The connection that valid keys describe; JSON may write a whole number as ``2.0``."""
-        whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in keys.items()}
-        transport = whole.pop("transport", {})
-        return cls(**whole, **transport, **more)
+        flat = {**keys, **keys.get("transport", {})}
+        flat.pop("transport", None)
+        whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in flat.items()}
+        return cls(**whole, **more)
 
     @property
     def keys(self) -> dict[str, Any]:

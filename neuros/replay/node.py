@@ -208,7 +208,13 @@ class ReplayedNode:
             )
             self._is_cut_off = True
             raise ReplayOver
-        return decode((message_class(self._types[str(key)]), data))
+        packet = decode((message_class(self._types[str(key)]), data))
+        if isinstance(key, Connection) and key.is_jpeg:
+            from neuros.transport.jpeg import jpeg_codec
+
+            codec = jpeg_codec(key.quality)
+            return codec.decode(codec.encode(packet))
+        return packet
 
     def offer(self) -> None:
         """Wait for packets from the plugin's thread, and offer them to the engine."""

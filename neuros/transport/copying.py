@@ -35,7 +35,11 @@ class RosPackets:
     def make(self, type_name: str) -> Any:
         return make_packet(type_name)
 
-    def checker(self, kind: type) -> Copy:
+    def checker(self, kind: type, *, for_jpeg: bool = False) -> Copy:
+        if for_jpeg:
+            from neuros.transport.jpeg import jpeg_checker
+
+            return jpeg_checker()
         return checker(kind)
 
     def copy(self, packet: Any) -> Any:

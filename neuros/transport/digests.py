@@ -41,7 +41,7 @@ def digest_for(kind: type) -> Digest:
     """The digest function of a message class."""
     buffers = message_buffers(kind)
     if buffers is None:
-        return lambda packet, data: _whole(data)
+        return lambda packet, data: digest_of_bytes(data)
     return _LargeDigest(kind, buffers)
 
 
@@ -51,7 +51,7 @@ def digest_of(packet: Any) -> int:
     buffers = message_buffers(kind)
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
         return _digest(message_codec(kind).encode(buffers.leave_out(packet)), buffers, packet)
-    return _whole(message_codec(kind).encode(packet))
+    return digest_of_bytes(message_codec(kind).encode(packet))
 
 
 class TriedDigest:
@@ -110,13 +110,13 @@ class _LargeDigest:
         if is_parcel(data):
             return _digest(message_of(data), self._buffers, packet)
         if len(data) < LARGE_BYTES or _size(self._buffers.views(packet)) < LARGE_BYTES:
-            return _whole(data)
+            return digest_of_bytes(data)
         rest = self._plain.encode(self._buffers.leave_out(packet))
         return _digest(rest, self._buffers, packet)
 
 
-def _whole(data: bytes) -> int:
-    """Of a whole message, padded to four bytes, as it arrives in any case (RTPS, 9.4.1)."""
+def digest_of_bytes(data: bytes) -> int:
+    """The digest of a whole message, padded to four bytes, as it arrives (RTPS, 9.4.1)."""
     missing = -len(data) % 4
     return int(xxh3_64_intdigest(data + bytes(missing) if missing else data))
 

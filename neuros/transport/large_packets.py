@@ -199,7 +199,7 @@ class LargeCodecs:
 
     def note(self, connection: Connection) -> str:
         """The note from the receiver of a connection to its sender; empty: no parcels."""
-        return machine_token() if connection in self.inputs or connection.compression else ""
+        return machine_token() if connection in self.inputs or connection.is_zstd else ""
 
     def encoder(
         self, connection: Connection, note: str, count_readers: Callable[[], int]

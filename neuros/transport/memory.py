@@ -121,6 +121,8 @@ class MemoryTransport:
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
         """Return what gives each receiver a copy, but the last one the packet if it is unshared."""
+        if any(c.is_jpeg for c in connections):
+            return self._sender_with_jpeg(connections)
         links = [self._hub.link(c) for c in connections]
         digested = [link for link in links if link.connection in self.digests]
         others, last = links[:-1], links[-1]
@@ -135,6 +137,31 @@ class MemoryTransport:
             last.send(packet if take(packet) else copy(packet), digest)
             if bridge.heard:
                 bridge.show(connections, packet)
+
+        return send
+
+    def _sender_with_jpeg(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
+        from neuros.transport.jpeg import jpeg_codec, jpeg_digest
+
+        encoded = [c for c in connections if c.is_jpeg]
+        links = [(self._hub.link(c), jpeg_codec(c.quality)) for c in encoded]
+        others = [c for c in connections if not c.is_jpeg]
+        send_to_others = self.sender(others) if others else None
+        bridge = self._bridge
+
+        def send(packet: Any) -> None:
+            if not self._is_open:
+                return
+            for link, codec in links:
+                data, digest = codec.encode(packet), None
+                if link.connection in self.digests and self._digest is not None:
+                    digest = jpeg_digest(packet, data)
+                    link.sent.append(digest)
+                link.send(codec.decode(data), digest)
+            if bridge.heard:
+                bridge.show(encoded, packet)
+            if send_to_others is not None:
+                send_to_others(packet)
 
         return send
 

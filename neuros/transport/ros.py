@@ -30,7 +30,7 @@ from std_msgs.msg import String, UInt64MultiArray
 from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.authentication import DataTags, Positions, signed, verified
-from neuros.transport.codecs import Decoder, Encoder, message_codec
+from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
 from neuros.transport.compression import Compressor, Traffic, compressing, decompressing
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
@@ -51,6 +51,7 @@ class SendingLink:
         publish: publishes what the codec makes, with the tag of the packet.
         count_readers: returns the number of all subscriptions to the data topic.
         digests: of the packets sent.
+        carries_message: whether the codec makes the packet as ROS serialises it.
     """
 
     publish: Callable[[bytes], None]
@@ -58,6 +59,7 @@ class SendingLink:
     digest: Digest
     count_readers: Callable[[], int]
     digests: array[int]
+    carries_message: bool
 
 
 class ReceivingLink:
@@ -94,6 +96,16 @@ class ReceivingLink:
         if self._settle is not None:
             self._settle(position)
         self.publish_position(position)
+
+
+def _way(connection: Connection, port: Port) -> tuple[type, Codec, Digest]:
+    """Class of the messages on the data topic of a connection, codec and digest of its packets."""
+    if connection.is_jpeg:
+        from neuros.transport import jpeg  # brings all messages of cameras along
+
+        return jpeg.KIND, jpeg.jpeg_codec(connection.quality), jpeg.jpeg_digest
+    kind = message_class(port.type)
+    return kind, message_codec(kind), digest_for(kind)
 
 
 def _tagging(tags: DataTags, publish: Callable[[bytes], None]) -> Callable[[bytes], None]:
@@ -181,7 +193,7 @@ class RosTransport:
                 if found is None:
                     data = link.codec.encode(packet)
                     found = encoded[link.codec] = (data, link.digest(packet, data))
-                    if not is_parcel(data):
+                    if link.carries_message and not is_parcel(data):
                         whole = data
                 link.publish(found[0])
                 link.digests.append(found[1])
@@ -227,7 +239,7 @@ class RosTransport:
         self._large.close()
 
     def _open_sender(self, connection: Connection, inbox: Inbox) -> None:
-        kind = message_class(self._node.output(connection.source_output).type)
+        kind, codec, digest = _way(connection, self._node.output(connection.source_output))
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
@@ -235,10 +247,11 @@ class RosTransport:
         publish = data.handle.publish_raw
         self._sending[connection] = SendingLink(
             publish if key is None else _tagging(DataTags(key), publish),
-            message_codec(kind),
-            digest_for(kind),
+            codec,
+            digest,
             data.get_subscription_count,
             self.digests[connection],
+            carries_message=not connection.is_jpeg,
         )
         subscriptions = []
         if connection.is_reliable:
@@ -270,10 +283,10 @@ class RosTransport:
         )
 
     def _open_receiver(self, connection: Connection, inbox: Inbox) -> None:
-        kind = message_class(self._node.input(connection.destination_input).type)
+        kind, codec, digest = _way(connection, self._node.input(connection.destination_input))
         link = self._receiving[connection] = ReceivingLink(
-            self._large.decoder(connection),
-            digest_for(kind),
+            codec if connection.is_jpeg else self._large.decoder(connection),
+            digest,
             partial(inbox.on_packet, connection),
             self.digests[connection],
         )
@@ -287,7 +300,7 @@ class RosTransport:
             link.publish_position = lambda position: publish(encode(position))
             publishers.append(acknowledge)
         receive: Callable[..., None] = link.receive
-        if connection.compression:
+        if connection.is_zstd:
             receive = decompressing(receive)
         if key is not None:
             receive = self._checking(connection, DataTags(key), receive)
@@ -311,8 +324,11 @@ class RosTransport:
     def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
         """The receiver of a connection is there, and lets us know ``note`` of itself."""
         link = self._sending[connection]
+        if connection.is_jpeg:
+            inbox.on_registered(connection)
+            return
         link.codec = self._large.encoder(connection, note, link.count_readers) or link.codec
-        if connection.compression and (not note or note != machine_token()):
+        if connection.is_zstd and (not note or note != machine_token()):
             output = connection.source_output
             link.publish = compressing(
                 self._compressors.setdefault(output, Compressor()),

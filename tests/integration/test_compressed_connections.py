@@ -1,9 +1,10 @@
-"""Connections that compress: over real topics, and between two machines within this one."""
+"""Connections that compress: over real topics, between machines, and as JPEG on every back end."""
 
 from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -136,3 +137,118 @@ def test_between_machines_packets_are_compressed_and_the_same(tmp_path: Path) ->
 def test_within_a_machine_nothing_is_compressed(tmp_path: Path) -> None:
     finished = run(tmp_path / "here", compression="zstd", is_elsewhere=False)
     assert "compressed_bytes" not in finished.connection(CONNECTION)
+
+
+# ---------------------------------------------------------------------------- JPEG
+
+CAMERA = """
+from array import array
+from neuros.hooks import neuros_tick
+
+number = 0
+
+@neuros_tick(seconds=0.01, outputs="image")
+def send(node):
+    global number
+    number += 1
+    if number == 5:
+        node.shutdown("all sent")
+    image = node.make_packet("image")
+    image.width, image.height, image.encoding, image.step = 64, 48, "ENCODING", 192
+    image.data = array("B", bytes((x * y + number) % 251 for y in range(48) for x in range(192)))
+    return image
+"""
+VIEWER = """
+from zlib import crc32
+from neuros.hooks import neuros_finalise, neuros_function
+
+seen = {}
+
+@neuros_function(inputs="image", outputs="sum")
+def take(node, image):
+    assert (image.width, image.height, image.encoding, image.step) == (64, 48, "rgb8", 192)
+    seen.setdefault("image", []).append(crc32(image.data))
+    made = node.make_packet("sum")
+    made.data = seen["image"][-1]
+    return made
+
+@neuros_function(inputs="whole")
+def take_whole(node, image):
+    seen.setdefault("whole", []).append(crc32(image.data))
+
+@neuros_finalise()
+def tell(node):
+    node.set_result("seen", seen)
+"""
+LISTENER = """
+from neuros.hooks import neuros_function
+
+@neuros_function(inputs="sum")
+def take(node, sum): pass
+"""
+
+
+def camera(folder: Path, encoding: str = "rgb8") -> Path:
+    """A camera that sends its images to an input as they are, and to another one as JPEG."""
+    folder.mkdir()
+    image = {"type": "sensor_msgs/msg/Image"}
+    total = {"name": "sum", "type": "std_msgs/msg/UInt32"}
+    ports: dict[str, Any] = {
+        "eye": {"outputs": [{"name": "image", **image}]},
+        "viewer": {
+            "inputs": [{"name": "image", **image}, {"name": "whole", **image}],
+            "outputs": [total],
+        },
+        "listener": {"inputs": [total]},
+    }
+    lines = {
+        "eye.image -> viewer.whole": {},
+        "eye.image -> viewer.image": {"transport": {"compression": "jpeg", "quality": 80}},
+        "viewer.sum -> listener.sum": {},
+    }
+    project = {
+        "nodes": [
+            {"name": name, "container": "neuros_python", "plugin": f"{name}.py", **own}
+            for name, own in ports.items()
+        ],
+        "connections": [{**wire(line, 0).keys, **more} for line, more in lines.items()],
+    }
+    (folder / "project.json").write_text(json.dumps(project))
+    (folder / "eye.py").write_text(CAMERA.replace("ENCODING", encoding))
+    (folder / "viewer.py").write_text(VIEWER)
+    (folder / "listener.py").write_text(LISTENER)
+    return folder
+
+
+def test_images_as_jpeg_are_the_same_on_every_back_end_and_in_a_replay(tmp_path: Path) -> None:
+    project = camera(tmp_path / "camera")
+    seen, digests = [], []
+    for backend in ("in-process", "process"):
+        finished = launch(
+            project, "--backend", backend, "--record", "--digests", cwd=tmp_path, timeout_s=ENDED_S
+        )
+        assert finished.exit_code == 0, finished.output
+        assert [each["lost"] for each in finished.record["connections"]] == [0, 0, 0]
+        seen.append(finished.record["nodes"]["viewer"]["results"]["seen"])
+        digests.append([each["digests"] for each in finished.record["connections"]])
+        replayed = subprocess.run(
+            [NEUROS, "replay", str(finished.run_folder), "--node", "viewer"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+        assert "identical: 5 packets" in replayed.stdout, replayed.stdout
+    assert seen[0] == seen[1]
+    assert digests[0] == digests[1]
+    assert len(seen[0]["image"]) == 5
+    assert seen[0]["image"] != seen[0]["whole"]
+
+
+def test_an_image_that_jpeg_cannot_hold_ends_the_run_with_hook_and_field(tmp_path: Path) -> None:
+    project = camera(tmp_path / "camera", "16UC3")
+    finished = launch(project, "--backend", "in-process", cwd=tmp_path, timeout_s=ENDED_S)
+    assert finished.exit_code == 1
+    assert "Traceback" not in finished.output
+    assert "field 'encoding' must be one of rgb8, bgr8, mono8" in finished.output
+    assert "eye.py" in finished.output
