@@ -69,6 +69,8 @@ def guarantee(connection: Connection) -> str:
         words = "lossless"
     else:
         words = f"discards <= {connection.discard_limit}"
+    if connection.compression is not None:
+        words += f", {connection.compression}"
     return words + (f", queue {connection.queue_size}" if connection.queue_size > 1 else "")
 
 

@@ -23,6 +23,7 @@ from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.debugging import is_quit
+from neuros.transport.compression import Traffic
 from neuros.transport.messages import decode, message_class
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
@@ -210,9 +211,9 @@ class ReplayedNode:
             raise ReplayOver
         packet = decode((message_class(self._types[str(key)]), data))
         if isinstance(key, Connection) and key.is_jpeg:
-            from neuros.transport.jpeg import jpeg_codec
+            from neuros.transport.jpeg import JpegCodec
 
-            codec = jpeg_codec(key.quality)
+            codec = JpegCodec(key.quality, Traffic())
             return codec.decode(codec.encode(packet))
         return packet
 

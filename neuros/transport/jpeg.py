@@ -18,6 +18,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.transport.codecs import WrongBytes, message_codec
+from neuros.transport.compression import Traffic
 from neuros.transport.digests import digest_of_bytes
 from neuros.transport.values import checker
 
@@ -35,12 +36,13 @@ class JpegCodec:
 
     Args:
         quality: of libjpeg, 1 to 100.
+        traffic: counts what is encoded.
 
     Raises:
         EnvironmentFault: if Pillow is not installed.
     """
 
-    def __init__(self, quality: int) -> None:
+    def __init__(self, quality: int, traffic: Traffic) -> None:
         try:
             import PIL.Image
         except ImportError as error:
@@ -49,6 +51,7 @@ class JpegCodec:
             ) from None
         self._pillow = PIL.Image
         self._quality = quality
+        self._traffic = traffic
         self._plain = message_codec(CompressedImage)
 
     def encode(self, packet: Any) -> bytes:
@@ -64,7 +67,10 @@ class JpegCodec:
             format=f"{packet.encoding}; jpeg compressed {colours}",
             data=array("B", made.getvalue()),
         )
-        return self._plain.encode(message)
+        encoded = self._plain.encode(message)
+        self._traffic.bytes += len(packet.data)
+        self._traffic.compressed_bytes += len(encoded)
+        return encoded
 
     def decode(self, data: bytes) -> Any:
         """The decoded ``Image``, without padding in its rows.
@@ -91,12 +97,6 @@ class JpegCodec:
             step=len(pixels) // height,
             data=array("B", pixels),
         )
-
-
-@cache
-def jpeg_codec(quality: int) -> JpegCodec:
-    """The codec of all connections with this quality."""
-    return JpegCodec(quality)
 
 
 def jpeg_digest(packet: Any, data: bytes) -> int:

@@ -141,10 +141,11 @@ class MemoryTransport:
         return send
 
     def _sender_with_jpeg(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
-        from neuros.transport.jpeg import jpeg_codec, jpeg_digest
+        from neuros.transport.compression import Traffic
+        from neuros.transport.jpeg import JpegCodec, jpeg_digest
 
         encoded = [c for c in connections if c.is_jpeg]
-        links = [(self._hub.link(c), jpeg_codec(c.quality)) for c in encoded]
+        links = [(self._hub.link(c), JpegCodec(c.quality, Traffic())) for c in encoded]
         others = [c for c in connections if not c.is_jpeg]
         send_to_others = self.sender(others) if others else None
         bridge = self._bridge

@@ -98,12 +98,12 @@ class ReceivingLink:
         self.publish_position(position)
 
 
-def _way(connection: Connection, port: Port) -> tuple[type, Codec, Digest]:
+def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Codec, Digest]:
     """Class of the messages on the data topic of a connection, codec and digest of its packets."""
     if connection.is_jpeg:
         from neuros.transport import jpeg  # brings all messages of cameras along
 
-        return jpeg.KIND, jpeg.jpeg_codec(connection.quality), jpeg.jpeg_digest
+        return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), jpeg.jpeg_digest
     kind = message_class(port.type)
     return kind, message_codec(kind), digest_for(kind)
 
@@ -239,7 +239,12 @@ class RosTransport:
         self._large.close()
 
     def _open_sender(self, connection: Connection, inbox: Inbox) -> None:
-        kind, codec, digest = _way(connection, self._node.output(connection.source_output))
+        traffic, port = Traffic(), self._node.output(connection.source_output)
+        kind, codec, digest = _way(connection, port, traffic)
+        if connection.is_jpeg:
+            self._traffic[str(connection)] = traffic
+        elif connection.is_zstd:
+            self._compressors.setdefault(connection.source_output, Compressor())
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
@@ -283,7 +288,8 @@ class RosTransport:
         )
 
     def _open_receiver(self, connection: Connection, inbox: Inbox) -> None:
-        kind, codec, digest = _way(connection, self._node.input(connection.destination_input))
+        port = self._node.input(connection.destination_input)
+        kind, codec, digest = _way(connection, port, Traffic())
         link = self._receiving[connection] = ReceivingLink(
             codec if connection.is_jpeg else self._large.decoder(connection),
             digest,
@@ -329,9 +335,8 @@ class RosTransport:
             return
         link.codec = self._large.encoder(connection, note, link.count_readers) or link.codec
         if connection.is_zstd and (not note or note != machine_token()):
-            output = connection.source_output
             link.publish = compressing(
-                self._compressors.setdefault(output, Compressor()),
+                self._compressors[connection.source_output],
                 self._traffic.setdefault(str(connection), Traffic()),
                 link.count_readers,
                 link.publish,

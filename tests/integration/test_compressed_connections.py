@@ -239,6 +239,7 @@ def test_images_as_jpeg_are_the_same_on_every_back_end_and_in_a_replay(tmp_path:
         )
         assert replayed.returncode == 0, replayed.stdout + replayed.stderr
         assert "identical: 5 packets" in replayed.stdout, replayed.stdout
+    assert "eye.image -> viewer.image: 0.0461 MB compressed to " in finished.output
     assert seen[0] == seen[1]
     assert digests[0] == digests[1]
     assert len(seen[0]["image"]) == 5

@@ -23,7 +23,7 @@ PROJECT = Project(
         ),
     ),
     (
-        Connection("robot", "imu", "snn", "imu", discard_limit=0, queue_size=8),
+        Connection("robot", "imu", "snn", "imu", discard_limit=0, queue_size=8, compression="zstd"),
         Connection("robot", "pose", "end", "truth"),
         Connection("robot", "pose", "end", "other", discard_limit=5),
     ),
@@ -43,7 +43,7 @@ robot  (neuros_mujoco, robot.py)
   in  cmd     std_msgs/msg/Float64
       <- topic /cmd
   out imu     sensor_msgs/msg/Imu
-      -> snn.imu   lossless, queue 8
+      -> snn.imu   lossless, zstd, queue 8
   out pose    std_msgs/msg/Float64
       -> end.truth   best effort
       -> end.other   discards <= 5
@@ -71,7 +71,7 @@ flowchart LR
     n0["robot<br/>neuros_mujoco"]
     n1["snn<br/>neuros_nest"]
     n2["end<br/>neuros_python"]
-    n0 ==>|"imu<br/>lossless, queue 8"| n1
+    n0 ==>|"imu<br/>lossless, zstd, queue 8"| n1
     n0 -.->|"pose → truth<br/>best effort"| n2
     n0 -->|"pose → other<br/>discards <= 5"| n2
     t0(["/cmd"])

@@ -12,6 +12,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.transport.codecs import WrongBytes, message_codec
+from neuros.transport.compression import Traffic
 from neuros.transport.jpeg import JpegCodec, jpeg_checker
 
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
@@ -39,7 +40,7 @@ def pixels(message: Image) -> Any:
 @pytest.mark.parametrize("encoding", CHANNELS)
 def test_an_image_is_nearly_what_it_was(encoding: str, padding: int) -> None:
     sent = image(encoding, padding=padding)
-    codec = JpegCodec(95)
+    codec = JpegCodec(95, Traffic())
     received = codec.decode(codec.encode(sent))
     assert received.header == sent.header
     assert (received.width, received.height, received.encoding) == (64, 48, encoding)
@@ -49,11 +50,19 @@ def test_an_image_is_nearly_what_it_was(encoding: str, padding: int) -> None:
 
 
 def test_a_lower_quality_takes_fewer_bytes() -> None:
-    assert len(JpegCodec(30).encode(image())) < len(JpegCodec(95).encode(image()))
+    assert len(JpegCodec(30, Traffic()).encode(image())) < len(
+        JpegCodec(95, Traffic()).encode(image())
+    )
+
+
+def test_bytes_are_counted_before_and_after() -> None:
+    traffic = Traffic()
+    sent = JpegCodec(95, traffic).encode(image())
+    assert traffic == Traffic(64 * 48 * 3, len(sent))
 
 
 def test_it_travels_as_the_message_that_ros_tools_show() -> None:
-    message = message_codec(CompressedImage).decode(JpegCodec(95).encode(image("rgb8")))
+    message = message_codec(CompressedImage).decode(JpegCodec(95, Traffic()).encode(image("rgb8")))
     assert message.format == "rgb8; jpeg compressed bgr8"
     assert message.header.frame_id == "eye"
     assert bytes(message.data[:2]) == b"\xff\xd8"
@@ -80,7 +89,7 @@ def test_what_jpeg_cannot_hold_is_refused(changes: dict[str, Any], says: str) ->
 
 def test_what_is_no_jpeg_is_refused() -> None:
     plain = message_codec(CompressedImage)
-    grey = message_codec(CompressedImage).decode(JpegCodec(95).encode(image("mono8")))
+    grey = message_codec(CompressedImage).decode(JpegCodec(95, Traffic()).encode(image("mono8")))
     for form, data in (
         ("rgb8; jpeg", b"no image"),
         ("rgb8; jpeg", bytes(grey.data)),
@@ -89,10 +98,10 @@ def test_what_is_no_jpeg_is_refused() -> None:
     ):
         message = CompressedImage(format=form, data=array("B", data))
         with pytest.raises(WrongBytes):
-            JpegCodec(95).decode(plain.encode(message))
+            JpegCodec(95, Traffic()).decode(plain.encode(message))
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(EnvironmentFault, match="pip install pillow"):
-        JpegCodec(95)
+        JpegCodec(95, Traffic())
