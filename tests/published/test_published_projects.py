@@ -9,14 +9,25 @@ from __future__ import annotations
 
 import re
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from launching import BACKENDS, Finished, launch, start
 
+from neuros.backends.domain import choose_domain
+
 HERE = Path(__file__).resolve().parent
 
 pytestmark = pytest.mark.parametrize("backend", BACKENDS)
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """External topics would take each project to domain 0, where others run beside it."""
+    with choose_domain(None, {}, False) as lock:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(lock.id))
+        yield
 
 
 def run_until(name: str, text: str, backend: str, cwd: Path) -> Finished:
