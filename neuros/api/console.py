@@ -100,6 +100,11 @@ class Console:
         self._is_finishing = False
         self._patience_s: float | None = None
 
+    @property
+    def failure(self) -> OSError | None:
+        """Why text was lost, if not because its reader has gone."""
+        return self._writer.failure
+
     def write(self, text: str) -> None:
         """Write as it is, but for the names of paths."""
         self._writer.write(self._line.around(self._translate(text)))

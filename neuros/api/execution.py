@@ -114,6 +114,11 @@ class Execution:
             logs["recorder"] = log_of(self.folder)
         return logs
 
+    @property
+    def output_failure(self) -> OSError | None:
+        """Why a part of what was to be shown was lost."""
+        return self._console.failure
+
     def run(self) -> dict[str, Any]:
         """Start, supervise, clean up, report; returns the content of ``run.json``.
 

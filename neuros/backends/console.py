@@ -7,6 +7,7 @@ a node, and the logs are complete even if the launcher is killed.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import select
@@ -38,6 +39,7 @@ _READ_BYTES = 1 << 16
 _LONGEST_LINE_BYTES = 1 << 16
 _MOST_BEHIND_BYTES = 1 << 22
 # A pipe that is ready takes this much without blocking (PIPE_BUF, pipe(7)).
+_READER_IS_GONE = (errno.EPIPE, errno.EIO)  # of a pipe, of a terminal
 _CHUNK_BYTES = 4096
 _LOOK_MS = 50
 
@@ -263,6 +265,9 @@ class NonBlockingWriter:
 
     A reader that has gone is no error: the run goes on, and its logs are on disk. A stream without
     a file descriptor (in tests) is written to directly.
+
+    Attributes:
+        failure: why text was lost, if not because its reader has gone: the disk is full, say.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -270,6 +275,7 @@ class NonBlockingWriter:
         self._encoding = "utf-8" if stream is None else stream.encoding or "utf-8"
         self._descriptor = _descriptor(stream)
         self._is_gone = stream is None
+        self.failure: OSError | None = None
         self._unwritten = bytearray()
         self._poll = select.poll()
         if self._descriptor is not None:
@@ -300,7 +306,9 @@ class NonBlockingWriter:
                 del self._unwritten[:written]
         except BlockingIOError:  # the descriptor is non-blocking already
             return
-        except OSError:
+        except OSError as error:
+            if error.errno not in _READER_IS_GONE:
+                self.failure = error
             self._give_up()
 
     def finish(self, is_enough: Callable[[], bool], patience_s: float | None = None) -> None:

@@ -118,7 +118,13 @@ def _launch(parsed: argparse.Namespace) -> int:
         if options.isolate and not plan.back_end.has_own_network:
             _enter_own_network()
         run = Execution(plan, sys.stdout, signals, waker, views=views)
-        return int(run.run()["exit_code"])
+        exit_code = int(run.run()["exit_code"])
+        if run.output_failure is not None and not exit_code:
+            raise EnvironmentFault(
+                f"the run went well, but its output could not be written"
+                f" ({run.output_failure.strerror}): {run.folder}/run.json has the table"
+            )
+        return exit_code
 
 
 def _enter_own_network() -> None:

@@ -20,6 +20,7 @@ from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.project.suggest import did_you_mean
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
 
@@ -109,6 +110,13 @@ class _Parser(argparse.ArgumentParser):
             self.error(f"{unknown_text} ({hint})" if hint else unknown_text)
         return options, unknown
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """As argparse does, but a help that cannot be written is an error."""
+        if message and file is not None and file is sys.stdout:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
+
 
 def console_script() -> None:
     """Run the command that the process was started with, and end the process."""
@@ -125,12 +133,15 @@ def main(arguments: Sequence[str]) -> int:
         return EXIT_USAGE
     try:
         command = _command_in(arguments)
-        options = parser(command).parse_args(arguments)
+        try:
+            options = parser(command).parse_args(arguments)
+        except SystemExit:  # after a help or a version
+            _flush()
+            raise
         if command != "launch":  # that has Ctrl+C wait until it can heed it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
-        if sys.stdout is not None:
-            sys.stdout.flush()  # so that a reader that has gone is noticed here
+        _flush()
         return code
     except ProjectError as error:
         _complain(str(error))
@@ -149,10 +160,14 @@ def main(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # As in `neuros graph PROJECT | head`: Python must not try again to write, when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _give_up_output()  # as in `neuros graph PROJECT | head`
         return 0
     except OSError as error:
+        if error.errno in _NO_ROOM:
+            _give_up_output()
+            what = error.filename or "the output, or a file,"
+            _complain(f"neuros: {what} could not be written ({error.strerror})")
+            return EXIT_ENVIRONMENT
         if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
             raise
         _complain(f"neuros: {error.filename} cannot be opened ({error.strerror})")
@@ -193,6 +208,17 @@ def _complete(line: str) -> None:
         )
     hidden = [name for name, command in COMMANDS.items() if not command.help]
     argcomplete.autocomplete(completed, exclude=hidden)
+
+
+def _flush() -> None:
+    """Have it noticed here if the output cannot be written, or nobody reads it any more."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+
+
+def _give_up_output() -> None:
+    """Python must not try again to write when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _complain(text: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import io
 import os
@@ -331,6 +332,8 @@ def test_a_full_disk_is_no_reason_to_lose_the_run() -> None:
         writer = NonBlockingWriter(full)
         writer.write("hello\n")
         assert not writer.is_behind
+        assert writer.failure is not None
+        assert writer.failure.errno == errno.ENOSPC
 
 
 def test_no_output_at_all_is_fine() -> None:

@@ -355,6 +355,26 @@ def test_where_the_disk_is_full_a_node_prints_into_the_void(
     assert is_full or Path(log).read_text() == "said on stdout\nsaid on stderr\n"
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", ["--version", "ps --help", "ps", "graph PROJECT"])
+def test_output_that_has_no_room_is_an_error_without_a_traceback(
+    words: str, unbuffered: str
+) -> None:
+    project = str(Path(__file__).parents[2] / "examples/1_tick/clock")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "neuros.cli", *words.replace("PROJECT", project).split()],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            check=False,
+        )
+    assert done.returncode == 4
+    (line,) = done.stderr.splitlines()
+    assert line == ("neuros: the output, or a file, could not be written (No space left on device)")
+
+
 def test_ctrl_c_after_a_run_is_over_changes_nothing() -> None:
     heeded = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers = [signal.getsignal(number) for number in heeded]

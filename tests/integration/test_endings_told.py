@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -139,3 +141,37 @@ def test_a_loop_in_lockstep_ends_after_one_more_round(bench: Bench) -> None:
     assert there["unread"] + back["unread"] == 1, "the one packet of the loop"
     assert aside["unread"] == 0
     assert last_line(finished) == "0.5 s are over"
+
+
+# ------------------------------------------------------------------ output without room
+
+
+def test_a_run_whose_output_has_no_room_goes_on_and_its_command_says_so(tmp_path: Path) -> None:
+    clock = Path(__file__).parents[2] / "examples/1_tick/clock"
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "neuros.cli", "launch", str(clock), "-o", str(run)]
+        sys.executable,
+        "-m",
+        "neuros.cli",
+        "launch",
+        str(clock),
+        "-o",
+        str(tmp_path / "run"),
+    ]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*command, "--backend", "in-process", "--duration", "1"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.returncode == 4
+    assert done.stderr.splitlines()[-1] == (
+        "neuros: the run went well, but its output could not be written (No space left on device):"
+        f" {tmp_path}/run/run.json has the table"
+    )
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["exit_code"] == 0
+    assert record["connections"][0]["received"] > 0
