@@ -150,14 +150,6 @@ def test_a_run_whose_output_has_no_room_goes_on_and_its_command_says_so(tmp_path
     clock = Path(__file__).parents[2] / "examples/1_tick/clock"
     run = tmp_path / "run"
     command = [sys.executable, "-m", "neuros.cli", "launch", str(clock), "-o", str(run)]
-        sys.executable,
-        "-m",
-        "neuros.cli",
-        "launch",
-        str(clock),
-        "-o",
-        str(tmp_path / "run"),
-    ]
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [*command, "--backend", "in-process", "--duration", "1"],
