@@ -81,7 +81,7 @@ def _digests(bag: Bag | None) -> dict[str, tuple[Numbers, bool]]:
     times: dict[str, array[int]] = {}
     digests: dict[str, array[int]] = {}
     large: set[str] = set()
-    for topic, log_ns, _, data in stored_messages(bag.folder, bag.refuse) if bag else ():
+    for topic, log_ns, _, data, _ in stored_messages(bag.folder, bag.refuse) if bag else ():
         times.setdefault(topic, array("q")).append(log_ns)
         padded = data + bytes(-len(data) % 4)
         digests.setdefault(topic, array("Q")).append(xxh3_64_intdigest(padded))

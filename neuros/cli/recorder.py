@@ -42,7 +42,8 @@ def _run_recorder(options: argparse.Namespace) -> int:
     counts: dict[str, int] = {}
     try:
         if (run / BAG_NAME).exists():
-            counts = repair(run, problems.add) or counts_of(run)
+            repaired = repair(run, problems.add)
+            counts = counts_of(run) if repaired is None else repaired.counts
         else:
             counts = _record(run, load_plan(run), problems.add)
     except (NeurosError, OSError) as error:

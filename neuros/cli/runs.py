@@ -406,6 +406,11 @@ def add_bag(bag: argparse.ArgumentParser) -> None:
         description="Add the packets that had not reached the bag, and complete its files.",
     )
     repair.add_argument("run", metavar="RUN", help="the run folder")
+    repair.add_argument(
+        "--keep-changed",
+        action="store_true",
+        help="keep packets that may have changed, since a checksum is wrong",
+    )
     repair.set_defaults(command=_repair)
 
 
@@ -426,11 +431,19 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _repair(options: argparse.Namespace) -> int:
-    from neuros.recording.repair import repair
+    from neuros.recording.repair import KEPT_NAME, repair
 
-    counts = repair(Path(options.run), lambda text: print(f"neuros: {text}", file=sys.stderr))
-    if counts is None:
+    def complain(text: str) -> None:
+        print(f"neuros: {text}", file=sys.stderr)
+
+    repaired = repair(Path(options.run), complain, keeps_changed=options.keep_changed)
+    if repaired is None:
         print(f"{options.run}: the bag is complete")
-    else:
-        print(f"{options.run}: completed, {sum(counts.values())} packets on {len(counts)} topics")
-    return 0
+        return 0
+    counts = repaired.counts
+    print(f"{options.run}: completed, {sum(counts.values())} packets on {len(counts)} topics")
+    if not repaired.changed:
+        return 0
+    what = "kept" if options.keep_changed else f"left out: {KEPT_NAME} has them"
+    complain(f"{repaired.changed} packets, any of which may have changed, are {what}")
+    return EXIT_DAMAGED

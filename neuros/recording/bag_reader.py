@@ -265,7 +265,7 @@ class Bag:
         if name not in self._packets:
             packets = [
                 RawPacket(log_ns, publish_ns, data)
-                for _, log_ns, publish_ns, data in self._stored.messages(name)
+                for _, log_ns, publish_ns, data, _ in self._stored.messages(name)
             ]
             count = self.topics[name].count
             if len(packets) < count:

@@ -8,6 +8,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault, UsageError
@@ -48,8 +49,27 @@ def needs_repair(run: Path, plan: RecordingPlan) -> bool:
     return (run / DAMAGED_NAME).exists() or not is_whole(bag) or has_spools(run, [*plan.streams])
 
 
-def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | None:
-    """Complete the bag of a run; ``None`` if it is complete, else its packets by topic.
+@dataclass(frozen=True)
+class Repaired:
+    """What came of a repair.
+
+    Attributes:
+        counts: by topic, the packets in the bag.
+        changed: how many packets may have changed, since the checksum of their part was wrong.
+    """
+
+    counts: dict[str, int]
+    changed: int
+
+
+def repair(
+    run: Path, complain: Callable[[str], object], *, keeps_changed: bool = False
+) -> Repaired | None:
+    """Complete the bag of a run; ``None`` if it is complete.
+
+    Args:
+        complain: told in one sentence of each part that is damaged.
+        keeps_changed: keep packets that may have changed; else they are left out.
 
     Raises:
         UsageError: if the run was not recorded, or by another version.
@@ -61,7 +81,9 @@ def repair(run: Path, complain: Callable[[str], object]) -> dict[str, int] | Non
             if not is_alone or _is_fed(run, plan):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
             is_to_be_rebuilt = needs_repair(run, plan) or _has_damage(run / BAG_NAME)
-            return _rebuild(run, plan, complain) if is_to_be_rebuilt else None
+            if not is_to_be_rebuilt:
+                return None
+            return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:
         raise EnvironmentFault(
             f"the bag of {run} cannot be completed: {error.strerror}; what is there was left as it"
@@ -101,7 +123,9 @@ def _is_fed(run: Path, plan: RecordingPlan) -> bool:
     return any(SpoolReader(run / name).is_fed for name in (*plan.streams, LISTENER))
 
 
-def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -> dict[str, int]:
+def _rebuild(
+    run: Path, plan: RecordingPlan, complain: Callable[[str], object], *, keeps_changed: bool
+) -> Repaired:
     bag, damaged = run / BAG_NAME, run / DAMAGED_NAME
     if not damaged.exists():
         if bag.exists():
@@ -111,6 +135,7 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
     topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     present: set[tuple[int, int]] = set()
     faults: list[str] = []
+    changed = 0
 
     def note(fault: str) -> None:
         faults.append(fault)
@@ -119,6 +144,10 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
         for message in stored_messages(damaged, note):
+            if message.may_have_changed:
+                changed += 1
+                if not keeps_changed:
+                    continue
             topic = topics.get(message.topic)
             number = None if topic is None else recorder.copy(topic, message)
             if number is not None:
@@ -138,4 +167,4 @@ def _rebuild(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) 
         else:
             shutil.rmtree(damaged)
     recorder.clean_up()
-    return counts
+    return Repaired(counts, changed)

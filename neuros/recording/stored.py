@@ -35,12 +35,16 @@ from neuros.recording.bag_files import (
 
 
 class Stored(NamedTuple):
-    """A message of a bag; times in nanoseconds."""
+    """A message of a bag; times in nanoseconds.
+
+    ``may_have_changed``: the checksum of its part of the file is wrong.
+    """
 
     topic: str
     log_ns: int
     publish_ns: int
     data: bytes
+    may_have_changed: bool = False
 
 
 def stored_messages(
@@ -56,8 +60,8 @@ def stored_messages(
     """
     for path in sorted(folder.glob("*.mcap")):
         with open(path, "rb") as file:
-            for topic, log_ns, publish_ns, _, data in _of_mcap(file, complain):
-                yield Stored(topic, log_ns, publish_ns, bytes(data))
+            for topic, log_ns, publish_ns, _, data, is_right in _of_mcap(file, complain):
+                yield Stored(topic, log_ns, publish_ns, bytes(data), not is_right)
     for path in sorted(folder.glob("*.db3")):
         yield from _of_sqlite(path)
 
@@ -161,13 +165,14 @@ def _check_summaries(folder: Path) -> None:
 def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
     """By topic, four numbers for each message: both times, offset in the file, and length."""
     places: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-    for topic, log_ns, publish_ns, offset, data in _of_mcap(file, complain):
+    for topic, log_ns, publish_ns, offset, data, _ in _of_mcap(file, complain):
         places[topic].extend((log_ns, publish_ns, offset, len(data)))
     return places
 
 
-_Found = tuple[str, int, int, int, memoryview]
-"""Topic, log time, publish time, where in the file the data begin, and the data."""
+_Found = tuple[str, int, int, int, memoryview, bool]
+"""Topic, log time, publish time, where in the file the data begin, the data, and whether the
+checksum of the part that they are in is right."""
 
 
 def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
@@ -187,10 +192,11 @@ def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Fou
         content = file.read(min(size, file_size - offset))
         if kind == CHUNK:
             whole = content[: CHUNK_HEAD.size + 4 + 8 + _size_in(content)]
-            if not _is_as_written(whole) or len(whole) < len(content):
+            is_right = _is_as_written(whole)
+            if not is_right or len(whole) < len(content):
                 complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
             file.seek(offset + len(whole))
-            yield from _of_chunk(whole, offset, topics)
+            yield from _of_chunk(whole, offset, topics, is_right)
         elif size > len(content) and (distance := _next_chunk(content)) is not None:
             complain(f"{file.name} is damaged between bytes {offset} and {offset + distance}")
             file.seek(offset + distance)
@@ -226,7 +232,9 @@ def _is_as_written(chunk: bytes) -> bool:
     return not checksum or crc32(memoryview(chunk)[at:]) == checksum
 
 
-def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_Found]:
+def _of_chunk(
+    content: bytes, offset: int, topics: dict[int, str], is_right: bool
+) -> Iterator[_Found]:
     """The messages of a chunk without compression; ``topics`` grows by its channels."""
     at = CHUNK_HEAD.size
     if len(content) < at + 4:
@@ -249,7 +257,8 @@ def _of_chunk(content: bytes, offset: int, topics: dict[int, str]) -> Iterator[_
             number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content, at)
             start = at + MESSAGE_HEAD.size
             if number in topics and max(log_ns, publish_ns) < 1 << 63:
-                yield topics[number], log_ns, publish_ns, offset + start, view[start:end]
+                data = view[start:end]
+                yield topics[number], log_ns, publish_ns, offset + start, data, is_right
         at = end
 
 

@@ -64,9 +64,40 @@ def test_packets_that_are_not_as_they_were_written_are_not_taken_for_it(
         values_in(neuros.bag.open(run))
     assert main(["bag", "info", str(run)]) == 4
     assert "is damaged between bytes" in capsys.readouterr().err
-    assert main(["bag", "repair", str(run)]) == 0
-    assert "is damaged between bytes" in capsys.readouterr().err
-    assert values_in(neuros.bag.open(run)) == [999 if value == 100 else value for value in VALUES]
+    kept = tmp_path / "kept"
+    shutil.copytree(run, kept)
+    assert main(["bag", "repair", str(run)]) == 4
+    said = capsys.readouterr().err
+    assert "is damaged between bytes" in said
+    assert f"{2 * len(VALUES)} packets, any of which may have changed, are left out" in said
+    assert values_in(neuros.bag.open(run)) == []
+    assert (run / "bag.before_repair/bag.mcap").exists()
+
+    assert main(["bag", "repair", str(kept), "--keep-changed"]) == 4
+    assert "any of which may have changed, are kept" in capsys.readouterr().err
+    assert values_in(neuros.bag.open(kept)) == [999 if value == 100 else value for value in VALUES]
+
+
+def test_only_packets_of_the_part_that_has_changed_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    plan().save(run)
+    values = [*range(1, 100_001)]
+    values[50_000] = 123_456_789
+    spool(run, "a", [(at, None, number(value)) for at, value in enumerate(values, 1)])
+    neuros.bag.open(run).close()
+    file = run / "bag" / "bag.mcap"
+    data = file.read_bytes()
+    assert data.count(number(123_456_789)) == 2, "the output has two connections"
+    file.write_bytes(data.replace(number(123_456_789), number(-1)))
+    assert main(["bag", "repair", str(run)]) == 4
+    assert "any of which may have changed, are left out" in capsys.readouterr().err
+    left = values_in(neuros.bag.open(run))
+    assert set(left) < {*values} - {123_456_789}
+    assert len(left) > 50_000
+    assert left == sorted(left)
 
 
 def test_a_length_that_is_wrong_takes_no_memory_and_costs_no_packet(
