@@ -10,6 +10,7 @@
     observation, action = ["cart.joints.position", "cart.joints.velocity"], "policy.force"
     steps = neuros.datasets.steps(runs[0], observation, action)         # NumPy
     neuros.datasets.minari(runs, "cartpole/expert-v0", observation, action)
+    neuros.datasets.lerobot(runs, "datasets/cartpole", observation, action, task="balance the pole")
 
 Each run is an episode. Each packet of the first observation begins a step.
 """
@@ -43,6 +44,7 @@ Run: TypeAlias = "str | os.PathLike[str]"
 Names: TypeAlias = "str | Sequence[str]"
 
 _NEVER = np.iinfo(np.int64).max
+_MOST_JITTER = 0.5  # of the time between two steps
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,60 @@ def minari(
     )
 
 
+def lerobot(
+    runs: Run | Sequence[Run],
+    folder: Run,
+    observation: Names,
+    action: Names,
+    *,
+    task: str,
+    fps: int | None = None,
+    repo_id: str = "neuros/recorded",
+    **options: Any,
+) -> Any:
+    """Write recorded runs as a dataset of LeRobot, an episode each, and return it.
+
+    The observed numbers are joined as ``observation.state``, the actions as ``action``, both
+    float32; an image is ``observation.images.NODE_OUTPUT``. Source of the format: R. Cadene et al.,
+    "LeRobot", 2024; the library writes it.
+
+    Args:
+        folder: for the dataset; must not exist.
+        observation, action: as for :func:`steps`.
+        task: what the robot was to do, in a sentence.
+        fps: steps per second; if left out, the rate of the first observation in the first run.
+        repo_id: name of the dataset, ``user/name``.
+        options: those of ``LeRobotDataset.create``: ``robot_type``, ``use_videos`` (false if left
+            out: images are stored without loss), ...
+
+    Raises:
+        EnvironmentFault: if LeRobot is not installed.
+        UsageError: as :func:`steps`; if the folder exists; for images that have not 8 bits; if
+            ``fps`` is left out and the steps have no steady, whole rate.
+    """
+    library("lerobot", "steps()")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    if os.path.lexists(folder):
+        raise UsageError(f"{os.fspath(folder)} exists already")
+    episodes = [steps(run, observation, action) for run in _listed_runs(runs)]
+    frames = [_lerobot_frames(found) for found in episodes]
+    options = {"use_videos": False, **options}
+    made = LeRobotDataset.create(
+        repo_id,
+        fps or _whole_rate(episodes[0]),
+        _lerobot_features(frames[0], episodes[0], options["use_videos"]),
+        root=folder,
+        **options,
+    )
+    for found, columns in zip(episodes, frames, strict=True):
+        for place in range(len(found)):
+            made.add_frame({**{key: c[place] for key, c in columns.items()}, "task": task})
+        made.save_episode()
+    made.finalize()
+    return made
+
+
 class _Signal:
     """A part of what an output has sent: a row per packet."""
 
@@ -177,6 +233,8 @@ class _Signal:
         columns = topic.columns()
         self.name = name
         self.sent_ns: npt.NDArray[np.int64] = columns[LOG_TIME]
+        if not len(self.sent_ns):
+            raise UsageError(f"'{name}': no packets were recorded")
         owns_time = has_simulated_time(columns)
         self.time_s = (
             columns[PUBLISH_TIME] / 1e9 if owns_time else (self.sent_ns - self.sent_ns[:1]) / 1e9
@@ -275,6 +333,59 @@ def _space(episodes: Sequence[dict[str, Column]], names: Names) -> Any:
         low, high = (-np.inf, np.inf) if kind.kind == "f" else _bounds(kind)
         boxes[name] = spaces.Box(low, high, shape, kind.type)
     return boxes[names] if isinstance(names, str) else spaces.Dict(boxes)
+
+
+def _lerobot_frames(found: Steps) -> dict[str, Column]:
+    """By feature, a row per step; every image has three colours."""
+    frames, numbers = {}, []
+    for name, column in found.observation.items():
+        if column.ndim == 2:
+            numbers.append(column)
+            continue
+        if column.dtype != np.uint8:
+            raise UsageError(f"'{name}': LeRobot takes images of 8 bits, not {column.dtype}")
+        colours = column[..., None].repeat(3, axis=-1) if column.ndim == 3 else column[..., :3]
+        frames[f"observation.images.{name.removesuffix('.data').replace('.', '_')}"] = colours
+    if numbers:
+        frames["observation.state"] = np.concatenate(numbers, axis=1).astype(np.float32)
+    flat = [column.reshape(len(column), -1) for column in found.action.values()]
+    return {**frames, "action": np.concatenate(flat, axis=1).astype(np.float32)}
+
+
+def _lerobot_features(
+    frames: Mapping[str, Column], found: Steps, use_videos: bool
+) -> dict[str, Any]:
+    features: dict[str, Any] = {}
+    for key, column in frames.items():
+        shape = column.shape[1:]
+        if len(shape) == 3:
+            kind = "video" if use_videos else "image"
+            features[key] = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
+            continue
+        parts = found.action if key == "action" else found.observation
+        sizes = {n: c[0].size for n, c in parts.items() if key == "action" or c.ndim == 2}
+        names = [
+            f"{name}[{place}]" if size > 1 else name
+            for name, size in sizes.items()
+            for place in range(size)
+        ]
+        features[key] = {"dtype": "float32", "shape": shape, "names": names}
+    return features
+
+
+def _whole_rate(found: Steps) -> int:
+    """Steps per second. Raises ``UsageError`` unless they are steady and a whole number."""
+    between_s = np.diff(found.time_s)
+    if not len(between_s) or between_s.min() <= 0:
+        raise UsageError("the steps have no rate: give fps")
+    rate_hz = float(1 / np.median(between_s))
+    is_steady = np.max(np.abs(between_s * rate_hz - 1)) <= _MOST_JITTER
+    if not is_steady or round(rate_hz) < 1 or abs(rate_hz - round(rate_hz)) > 0.02 * rate_hz:
+        raise UsageError(
+            f"the steps have no steady, whole rate (median {rate_hz:.4g} per second, from"
+            f" {1 / between_s.max():.4g} to {1 / between_s.min():.4g}): give fps"
+        )
+    return round(rate_hz)
 
 
 def _bounds(kind: np.dtype[Any]) -> tuple[int, int]:

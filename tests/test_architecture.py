@@ -105,7 +105,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "api.export": {"yaml"},
     "pytest_plugin": {"pytest"},
     "gym": {"gymnasium", "mujoco", "numpy"},
-    "datasets": {"gymnasium", "minari", "numpy"},
+    "datasets": {"gymnasium", "minari", "lerobot", "numpy"},
     "api.sweep": {"tabulate"},
     "executors.pools": {"distributed"},
     "executors.slurm": {"submitit"},

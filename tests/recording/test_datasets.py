@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 import neuros
 import neuros.datasets
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 
 ROBOT = """
 from neuros.hooks import neuros_function, neuros_initialise
@@ -195,3 +196,100 @@ def test_minari_opens_a_dataset_with_an_episode_for_each_run(run: Path, minari: 
 def test_a_dataset_needs_a_run(minari: Any) -> None:
     with pytest.raises(UsageError, match="a dataset needs a run"):
         neuros.datasets.minari([], "neuros/none-v0", POSE, COMMAND)
+
+
+# ------------------------------------------------------------------ LeRobot
+
+
+class Written:
+    """Stands for ``LeRobotDataset``, which needs PyTorch, and keeps what it is given."""
+
+    def __init__(self, repo_id: str, fps: int, features: dict[str, Any], **options: Any) -> None:
+        self.repo_id, self.fps, self.features, self.options = repo_id, fps, features, options
+        self.frames: list[dict[str, Any]] = []
+        self.episodes: list[int] = []
+        self.is_final = False
+
+    @classmethod
+    def create(cls, *arguments: Any, **options: Any) -> Written:
+        return cls(*arguments, **options)
+
+    def add_frame(self, frame: dict[str, Any]) -> None:
+        assert frame.keys() == {*self.features, "task"}
+        for key, feature in self.features.items():
+            assert frame[key].shape == tuple(feature["shape"])
+            assert str(frame[key].dtype) == {"image": "uint8"}.get(feature["dtype"], "float32")
+        self.frames.append(frame)
+
+    def save_episode(self) -> None:
+        self.episodes.append(len(self.frames))
+
+    def finalize(self) -> None:
+        self.is_final = True
+
+
+@pytest.fixture
+def lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
+    module: Any = ModuleType("lerobot.datasets.lerobot_dataset")
+    module.LeRobotDataset = Written
+    for name in ("lerobot", "lerobot.datasets"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def written(runs: Any, folder: Path, *names: Any, **more: Any) -> Any:
+    return neuros.datasets.lerobot(runs, folder, *names, task="move", **more)
+
+
+@pytest.mark.usefixtures("lerobot")
+def test_lerobot_gets_an_episode_for_each_run(run: Path, tmp_path: Path) -> None:
+    made = written([run, run], tmp_path / "new", [POSE, CAMERA], COMMAND, fps=20, robot_type="toy")
+    expected = neuros.datasets.steps(run, [POSE, CAMERA], COMMAND)
+    count = len(expected)
+    assert made.is_final
+    assert (made.fps, made.repo_id) == (20, "neuros/recorded")
+    options = {"root": tmp_path / "new", "use_videos": False, "robot_type": "toy"}
+    assert made.options == options
+    assert made.episodes == [count, 2 * count]
+    names = [f"{POSE}[{place}]" for place in range(3)]
+    assert made.features["observation.state"] == {
+        "dtype": "float32", "shape": (3,), "names": names
+    }  # fmt: skip
+    assert made.features["action"]["names"] == [COMMAND]
+    assert made.features["observation.images.robot_camera"]["shape"] == (2, 1, 3)
+    for frame, pose in zip(made.frames, [*expected.observation[POSE]] * 2, strict=True):
+        assert frame["observation.state"].tolist() == pose.tolist()
+        assert frame["action"].tolist() == [10 * pose[0]]
+        assert frame["observation.images.robot_camera"][0, 0].tolist() == [255, 0, pose[0]]
+        assert frame["task"] == "move"
+
+
+@pytest.mark.usefixtures("lerobot")
+def test_lerobot_is_not_given_what_it_would_break_at(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="exists already"):
+        written(run, tmp_path, POSE, COMMAND, fps=20)
+    with pytest.raises(UsageError, match="give fps"):
+        written(run, tmp_path / "new", POSE, COMMAND)
+    assert not (tmp_path / "new").exists()
+
+
+def test_without_lerobot_it_is_named(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "lerobot", None)
+    with pytest.raises(EnvironmentFault, match="pip install lerobot"):
+        written(run, tmp_path / "new", POSE, COMMAND, fps=20)
+
+
+@pytest.mark.parametrize(
+    ("times_s", "rate"),
+    [([0, 0.05, 0.1, 0.15], 20), ([0, 1.0, 2.2, 3.2], 1), ([0, 0.05, 0.3], None), ([0], None),
+     ([0, 0.0133, 0.0266], 75), ([0, 3, 6], None)],
+)  # fmt: skip
+def test_a_rate_is_that_of_steady_steps(times_s: list[float], rate: int | None) -> None:
+    steps = neuros.datasets.Steps({}, {}, np.array(times_s))
+    if rate is None:
+        with pytest.raises(UsageError, match="give fps"):
+            neuros.datasets._whole_rate(steps)
+    else:
+        assert neuros.datasets._whole_rate(steps) == rate
