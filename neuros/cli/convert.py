@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 exit codes:
-  0    done; what was not taken over is listed
+  0    done; elements that were not converted are listed
   2    wrong usage
   3    the description is wrong: every problem is listed with its file and line
   4    the file cannot be written, or MuJoCo is not installed
@@ -73,7 +73,7 @@ def _convert(options: argparse.Namespace) -> int:
     if converted.not_taken:
         count = sum(note.count for note in converted.not_taken)
         things = "1 thing was" if count == 1 else f"{count} things were"
-        text = f"warning: {things} not taken over, or not as in the file: see the table"
+        text = f"warning: {things} not converted, or converted differently: see the table"
         print(text, file=sys.stderr)
     return 0
 
@@ -117,5 +117,5 @@ def _table(notes: Sequence[NotTaken]) -> str:
         [note.place, note.path, f"{note.count} x" if note.count > 1 else "", note.why]
         for note in notes
     ]
-    headers = ["where", "what", "", "why it was not taken over, or how it is"]
+    headers = ["where", "what", "", "reason, or what is different"]
     return str(tabulate(rows, headers=headers, disable_numparse=True))

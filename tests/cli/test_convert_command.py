@@ -44,7 +44,7 @@ def test_the_file_stands_beside_the_description_and_says_what_it_lacks(robot, ca
     said = capsys.readouterr()
     assert "robot/model.sdf:7  model[robot]/plugin[p]" in said.out
     assert "robot/model.xml: bodies: 1, joints: 1" in said.out
-    assert said.err.startswith("warning: 1 thing was not taken over")
+    assert said.err.startswith("warning: 1 thing was not converted")
     comment = (robot / "model.xml").read_text("utf-8").partition("-->")[0]
     assert "made by `neuros convert` from model.sdf" in comment
     assert "model[robot]/plugin[p]: code that runs inside Gazebo" in comment

@@ -79,7 +79,7 @@ def test_a_robot_of_any_format_is_driven_and_measured_from_the_node_file(
 def test_what_is_not_taken_over_is_one_warning(tmp_path: Path, name: str, text: str) -> None:
     _, node = simulated(tmp_path, name, text)
     (warning,) = node.log.warnings
-    assert warning.startswith(f"{name}: 1 thing is not taken over")
+    assert warning.startswith(f"{name}: 1 thing is not converted")
     assert f"{name}:" in warning.splitlines()[1]
 
 

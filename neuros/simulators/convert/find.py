@@ -230,7 +230,7 @@ def _merged(model: Element, owner: Element) -> list[Element]:
                     end.text = proxy
     for tag in ("static", "self_collide"):
         for element in model.each(tag):
-            element.note("the model that a merged include becomes part of decides this")
+            element.note("not used in a merged include: the model around it decides")
     left_out = {"pose", "placement_frame", "static", "self_collide"}
     return [frame, *(child for child in model.children if child.tag not in left_out)]
 

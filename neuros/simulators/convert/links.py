@@ -211,7 +211,7 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
     if contact is None:
         return
     if contact.is_true("collide_without_contact"):
-        contact.remark("it pushes what it touches: MuJoCo's contacts are felt by their force")
+        contact.remark("MuJoCo cannot detect a contact without a force: the element collides")
     mask = contact.child("collide_bitmask")
     if mask is not None:
         try:
@@ -339,7 +339,7 @@ def _add_camera(building: Building, link: Link, element: Element, pose: Pose) ->
         settings.problem(f"an image has at most {_MOST_PIXELS} pixels a side")
         return
     if across >= math.pi:
-        settings.problem(f"a field of view is below pi, not {across:g}")
+        settings.problem(f"the field of view must be below pi, not {across:g}")
         return
     camera = building.body(link).add_camera(resolution=[int(width), int(height)])
     camera.name = building.name("camera", f"{link.name}/{element.name}", element)
@@ -383,7 +383,7 @@ def _angles(settings: Element, way: str) -> tuple[int, list[float]]:
     (least,) = scan.vector("min_angle", (0.0,))
     (most,) = scan.vector("max_angle", (0.0,))
     if scan.number("resolution", 1.0) != 1:
-        scan.remark("as many rays as samples; none between them")
+        scan.remark("there is one ray for each sample, and no interpolation between them")
     if samples > _MOST_RAYS:
         return samples, []
     return samples, [float(angle) for angle in np.linspace(least, most, max(samples, 0))]

@@ -76,7 +76,7 @@ def _read(root: Element) -> Scope:
     """The world in a file; a model without one stands in an empty world."""
     worlds = root.each("world")
     for other in worlds[1:]:
-        other.note("a file becomes one model: the first world counts")
+        other.note("only the first world of a file is converted")
     element = worlds[0] if worlds else root
     if worlds and not worlds[0].name:
         worlds[0].problem("the <world> has no name")
@@ -96,9 +96,9 @@ def _grow(scope: Scope) -> Tree:
         if not is_known(joint) or element.name not in inner.frames:
             continue
         if all(end is None or end.is_static for end in ends):
-            element.note("between things that never move")
+            element.note("left out: neither of its ends can move")
         elif ends[0] is ends[1]:
-            element.problem("joins a link to itself, or nothing that there is")
+            element.problem("joins a link to itself, or to a link that does not exist")
         else:
             joints.append(joint)
     return grow(links, joints)
@@ -169,7 +169,7 @@ def _exclude_contacts(building: Building, scope: Scope) -> None:
         if len(names) > _MOST_LINKS:
             outer.element.problem(
                 f"more than {_MOST_LINKS} links of one model collide with other things",
-                "<self_collide> needs no list of their pairs",
+                "set <self_collide>: then no list of pairs is needed",
             )
             return
     for names in groups.values():
@@ -186,7 +186,7 @@ def _compiled(building: Building, root: Element) -> Any:
     except (ValueError, mujoco.FatalError) as error:
         building.meshes.blame()
         root.report.raise_any()
-        root.problem(f"MuJoCo cannot compile what became of it: {said_by(error)}")
+        root.problem(f"MuJoCo cannot compile the converted model: {said_by(error)}")
         root.report.raise_any()
         raise
     why = {geom.name: str(slab) for geom, slab in boxed}
@@ -243,6 +243,6 @@ def _read_world(building: Building, scope: Scope) -> None:
     option.magnetic = world.vector("magnetic_field", _MAGNETIC_FIELD_T)
     engines = world.each("physics")
     for unused in engines[1:]:
-        unused.note("the first <physics> counts")
+        unused.note("only the first <physics> is used")
     engine = engines[0] if engines else world.made("physics")
     option.timestep = engine.number("max_step_size", 0.001, positive=True)

@@ -342,7 +342,7 @@ def _from_file(node: NodeContext, path: Path) -> Any:
         rows = "".join(f"\n  {note}" for note in described.not_taken)
         things = "1 thing is" if count == 1 else f"{count} things are"
         node.get_logger().warning(
-            f"{path.name}: {things} not taken over, or not as in the file:{rows}"
+            f"{path.name}: {things} not converted, or converted differently:{rows}"
         )
     return described.spec
 
