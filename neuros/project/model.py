@@ -25,7 +25,7 @@ NETWORK = "NETWORK"
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
-_KEYS_OF_TRANSPORT = frozenset({"compression", "quality"})
+_KEYS_OF_TRANSPORT = ("compression", "quality")
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
@@ -192,7 +192,7 @@ class Connection:
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
         keys = {key: value for key, (value, default) in values.items() if value != default}
-        transport = {key: keys.pop(key) for key in _KEYS_OF_TRANSPORT & keys.keys()}
+        transport = {key: keys.pop(key) for key in _KEYS_OF_TRANSPORT if key in keys}
         return {**keys, "transport": transport} if transport else keys
 
     def __hash__(self) -> int:

@@ -120,6 +120,8 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             queue_size=draw(st.integers(1, 3)),
             index=index,
             namespace=project_names.namespace,
+            compression=draw(st.sampled_from([None, "zstd", "jpeg"])),
+            quality=draw(st.sampled_from([95, 80])),
         )
         for index, ends in enumerate(chosen)
     )
