@@ -120,8 +120,7 @@ def projects(draw: st.DrawFn, root: Path = ROOT) -> Project:
             queue_size=draw(st.integers(1, 3)),
             index=index,
             namespace=project_names.namespace,
-            compression=draw(st.sampled_from([None, "zstd", "jpeg"])),
-            quality=draw(st.sampled_from([95, 80])),
+            compression=draw(st.sampled_from([None, "zstd"])),
         )
         for index, ends in enumerate(chosen)
     )
@@ -233,3 +232,13 @@ def test_a_connection_from_a_node_to_itself_is_there_once() -> None:
 def test_anything_else_is_no_node_file() -> None:
     with pytest.raises(KeyError):
         node_file_from_json({"nodes": []})
+
+
+def test_the_transport_of_a_connection_is_one_key() -> None:
+    ends = Connection("eye", "image", "brain", "image").keys
+    keys = {**ends, "transport": {"compression": "jpeg", "quality": 80.0}}
+    connection = Connection.of(keys, index=2)
+    assert (connection.compression, connection.quality, connection.index) == ("jpeg", 80, 2)
+    assert connection.keys == keys
+    assert list(connection.keys["transport"]) == ["compression", "quality"]
+    assert Connection.of(ends).keys == ends
