@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.snn import derive_seed, threads_of_node
-from neuros.snn.stepper import StepGrid, nanoseconds, nanoseconds_of_ms
+from neuros.snn.nest import StepGrid, nanoseconds, nanoseconds_of_ms
 
 GRID = StepGrid(resolution_ns=100_000, min_delay_ns=1_000_000)
 WEEKS_NS = 30 * 24 * 3600 * 10**9

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neuros.snn import PopulationVector, Spikes
-from neuros.snn.spikes import Floats, Indices
+from neuros.snn.coding import Floats, Indices
 
 NEURONS_PER_RING = 120
 CAPACITANCE_PF = 250.0

@@ -17,8 +17,8 @@ from nengo.builder import Model
 from nengo.cache import NoDecoderCache
 
 from neuros.snn import Spikes
-from neuros.snn.spikes import Floats
-from neuros.snn.stepper import StepGrid, nanoseconds, nanoseconds_of_ms
+from neuros.snn.coding import Floats
+from neuros.snn.nest import StepGrid, nanoseconds, nanoseconds_of_ms
 
 DRIVE_PA_PER_RAD_S = 29.5
 """Tuned: the bump follows a turn at its own speed. With NEST's 29.9 it turns 1.4 % too far."""
