@@ -56,7 +56,7 @@ def add_legend(figure: Any, columns: int, **options: Any) -> None:
 
 
 def _stacked_bars(names: Sequence[str], parts: Mapping[str, tuple[str, Any]]) -> tuple[Any, Any]:
-    """A bar per name, from the top down, of coloured parts; the figure and its axes."""
+    """A bar per name, from the bottom up, of coloured parts; the figure and its axes."""
     figure = new_figure(0.42 * len(names) + 1.2)
     axes = plain(figure.add_subplot())
     lefts = np.zeros(len(names))
@@ -73,18 +73,14 @@ def time_budget_figure(run: PastRun) -> Any | None:
     if not budgets:
         return None
     names = list(budgets)[::-1]
-    shares = {
-        state: np.array([100 * budgets[name].shares[state] for name in names]) for state in _STATES
+    parts = {
+        state: (shade, np.array([100 * budgets[name].shares[state] for name in names]))
+        for state, shade in _STATES.items()
     }
-    parts = {state: (shade, shares[state]) for state, shade in _STATES.items()}
     figure, axes = _stacked_bars(names, parts)
-    lefts = np.zeros(len(names))
-    for lengths in shares.values():
-        for row, share in enumerate(lengths):
-            if share >= 6:
-                where = lefts[row] + share / 2
-                axes.text(where, row, f"{share:.0f}", ha="center", va="center", fontsize=8)
-        lefts += lengths
+    for bars, (_, shares) in zip(axes.containers, parts.values(), strict=True):
+        texts = [f"{share:.0f}" if share >= 6 else "" for share in shares]
+        axes.bar_label(bars, texts, label_type="center", fontsize=8)
     axes.set(xlabel="share of the time in which all nodes ran / %", xlim=(0, 100))
     return figure
 
@@ -95,13 +91,15 @@ def counts_figure(run: PastRun) -> Any | None:
     if not names:
         return None
     figures = [run.connections[name] for name in names]
-    counts = {fate: np.array([each.get(fate) or 0 for each in figures], float) for fate in _FATES}
-    figure, axes = _stacked_bars(names, {f: (shade, counts[f]) for f, shade in _FATES.items()})
-    ends = np.sum([*counts.values()], axis=0)
-    for row, (end, each) in enumerate(zip(ends, figures, strict=True)):
-        axes.text(end, row, f" {_count(each.get('sent'))} sent", va="center", fontsize=8)
-    axes.set_xlim(0, max(float(ends.max()), 1.0) * 1.18)
-    axes.set_xlabel("packets")
+    parts = {
+        fate: (shade, np.array([each.get(fate) or 0 for each in figures], float))
+        for fate, shade in _FATES.items()
+    }
+    figure, axes = _stacked_bars(names, parts)
+    texts = [f" {_count(each.get('sent'))} sent" for each in figures]
+    axes.bar_label(axes.containers[-1], texts, fontsize=8)
+    longest = max(np.sum([counts for _, counts in parts.values()], axis=0))
+    axes.set(xlabel="packets", xlim=(0, max(longest, 1.0) * 1.18))
     return figure
 
 

@@ -1,14 +1,26 @@
-"""Comparison of runs: a table and a figure with a column for each."""
+"""Comparison of runs: of their figures, side by side, and of two runs' packets, one by one.
+
+Packets are compared by the lists of nodes, and where nodes have kept no digests, from bags.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
-from neuros.analysis.charts import add_legend, colour, new_figure, plain
+from neuros.analysis.packets import Numbers, Packets, read_packets
 from neuros.analysis.run_record import PastRun, consumed_percent
+from neuros.errors import NeurosError
+from neuros.project.model import Connection
+from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
+from neuros.recording.recording_plan import PLAN_NAME
+from neuros.recording.stored import stored_messages
 
 _Figures = dict[tuple[str, int], float | None]
 """Values by their name and the digits after the point."""
@@ -100,6 +112,8 @@ def _figures(run: PastRun) -> tuple[_Figures, _Figures, _Figures]:
 
 def comparison_figure(runs: Sequence[PastRun]) -> Any | None:
     """Real-time factor, consumed packets, latency, executing share; ``None`` if no run has any."""
+    from neuros.analysis.charts import add_legend, colour, new_figure, plain
+
     found = {name: values for (name, _), values in _side_by_side(runs).items()}
     nothing: list[float | None] = [None for _ in runs]
     connections = dict.fromkeys(name for run in runs for name in run.connections)
@@ -124,12 +138,11 @@ def comparison_figure(runs: Sequence[PastRun]) -> Any | None:
         places = np.arange(len(rows))[::-1]
         for number, label in enumerate(labels_of(runs)):
             values = [found.get(key, nothing)[number] for key in rows.values()]
-            lengths = [0.0 if value is None else value for value in values]
             offsets = places + 0.4 - bar * (number + 0.5)
-            axes.barh(offsets, lengths, height=bar * 0.92, color=colour(number), label=label)
-            for y, value in zip(offsets, values, strict=True):
-                text = " ?" if value is None else f" {value:.3g}"
-                axes.text(value or 0.0, y, text, va="center", fontsize=7)
+            lengths, height = [value or 0.0 for value in values], bar * 0.92
+            bars = axes.barh(offsets, lengths, height, color=colour(number), label=label)
+            texts = [" ?" if value is None else f" {value:.3g}" for value in values]
+            axes.bar_label(bars, texts, fontsize=7)
         plain(axes).set_yticks(places, [*rows], fontsize=8)
         if [*rows] == [""]:
             axes.tick_params(axis="y", length=0)
@@ -139,3 +152,282 @@ def comparison_figure(runs: Sequence[PastRun]) -> Any | None:
     handles, labels = all_axes[0].get_legend_handles_labels()
     add_legend(figure, 4, handles=handles, labels=labels)
     return figure
+
+
+_LARGE_BYTES = 64 * 1024
+"""The buffers of larger messages travel beside them, and nodes digest them apart."""
+
+
+class RecordedPackets:
+    """Bags of runs.
+
+    Attributes:
+        remarks: why a bag could not be read, a sentence each.
+    """
+
+    def __init__(self) -> None:
+        self.remarks: list[str] = []
+        self._bags: dict[Path, Bag | None] = {}
+        self._digests: dict[Path, Mapping[str, tuple[Numbers, bool]]] = {}
+
+    def message(self, run: Path, connection: str, number: int) -> Any:
+        """A packet of a connection by its number, from 1; ``None`` if it was not recorded."""
+        topic = self._topic(run, connection)
+        return topic.message(number - 1) if topic and number <= topic.count else None
+
+    def digests(self, run: Path, connection: str) -> Numbers | None:
+        """A digest of each packet that was sent; ``None`` if the connection was not recorded."""
+        found = self._digests_of(run, connection)
+        return None if found is None else found[0]
+
+    def are_as_of_nodes(self, run: Path, connection: str) -> bool:
+        """Whether nodes digest them alike: small messages, which travel whole."""
+        found = self._digests_of(run, connection)
+        return found is not None and found[1]
+
+    def _digests_of(self, run: Path, connection: str) -> tuple[Numbers, bool] | None:
+        topic = self._topic(run, connection)
+        if topic is None:
+            return None
+        if run not in self._digests:
+            self._digests[run] = _digests(self._bags[run])
+        nothing = np.array([], np.uint64), True
+        return self._digests[run].get(topic.name, nothing)
+
+    def _topic(self, run: Path, connection: str) -> RecordedTopic | None:
+        if run not in self._bags:
+            self._bags[run] = self._open(run)
+        bag = self._bags[run]
+        topics = () if bag is None else bag.topics.values()
+        return next((topic for topic in topics if topic.connection == connection), None)
+
+    def _open(self, run: Path) -> Bag | None:
+        if not (run / PLAN_NAME).exists():
+            return None
+        try:
+            return open_bag(run)
+        except NeurosError as error:
+            self.remarks.append(str(error))
+            return None
+
+
+def _digests(bag: Bag | None) -> dict[str, tuple[Numbers, bool]]:
+    """By topic, digests in the order in which packets were sent, and whether all are small."""
+    times: dict[str, array[int]] = {}
+    digests: dict[str, array[int]] = {}
+    large: set[str] = set()
+    for topic, log_ns, _, data, _ in stored_messages(bag.folder, bag.refuse) if bag else ():
+        times.setdefault(topic, array("q")).append(log_ns)
+        padded = data + bytes(-len(data) % 4)
+        digests.setdefault(topic, array("Q")).append(xxh3_64_intdigest(padded))
+        if len(data) >= _LARGE_BYTES:
+            large.add(topic)
+    found = {}
+    for topic, at_ns in times.items():
+        order = np.argsort(np.frombuffer(at_ns, np.int64), kind="stable")
+        found[topic] = np.frombuffer(digests[topic], np.uint64)[order], topic not in large
+    return found
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a comparison.
+
+    Attributes:
+        difference: where the runs parted first, in a sentence; ``None`` if they are identical.
+        remarks: what differs and may, and what could not be compared.
+        compared: packets that were found equal.
+    """
+
+    difference: str | None
+    remarks: tuple[str, ...]
+    compared: int
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """One connection on which they part; ``at_ns`` (in run A) tells which was the first.
+
+    ``packet``: the connection and the number of the first packet that differs, from 1.
+    """
+
+    at_ns: float
+    text: str
+    packet: tuple[str, int] | None = None
+
+
+def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
+    """Compare what was sent on every connection, and what hooks took on those that lose nothing.
+
+    Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
+    that may lose packets it depends on the moment which ones hooks get: that is told as a remark.
+    """
+    found: list[_Difference] = []
+    remarks: list[str] = []
+    compared = 0
+    names = [*a.connections, *(name for name in b.connections if name not in a.connections)]
+    for name in names:
+        if name not in a.connections or name not in b.connections:
+            only = "A" if name in a.connections else "B"
+            found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
+            continue
+        compared += _compare_connection(name, (a, b), recorded, found, remarks)
+    first = min(found, key=lambda difference: difference.at_ns, default=None)
+    others = len(found) - 1
+    if others > 0:
+        differ = "connections differ" if others > 1 else "connection differs"
+        remarks.append(f"{others} more {differ}, from a later moment on")
+    text = None if first is None else first.text
+    if first is not None and first.packet is not None:  # a bag is read for the first one only
+        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
+    return Verdict(text, tuple(remarks), compared)
+
+
+def _compare_connection(
+    name: str,
+    runs: tuple[PastRun, PastRun],
+    recorded: RecordedPackets,
+    found: list[_Difference],
+    remarks: list[str],
+) -> int:
+    """Returns how many packets were found equal."""
+    a, b = runs
+    in_a, in_b = _packets(name, runs, recorded)
+    sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
+    lacking = [_lacks_digests(*each) for each in sent]
+    if any(lacking):
+        folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
+        remarks.append(
+            f"{name}: not compared, since {' and '.join(dict.fromkeys(map(str, folders)))} has"
+            " neither digests nor a recording of it (the in-process back end keeps digests with"
+            " --digests; packets from a node to itself never have any: record them with -r)"
+        )
+        return 0
+    compared = _first_difference(in_a.sent, in_b.sent)
+    cut_off = [len(packets.sent) for count, packets in sent if (count or 0) > len(packets.sent)]
+    if cut_off:
+        listed = min(cut_off)
+        in_a, in_b = (replace(packets, sent=packets.sent[:listed]) for packets in (in_a, in_b))
+        remarks.append(f"{name}: compared up to packet {listed}; later packets have no digests")
+        taken = None
+    else:
+        taken = _taken(name, in_a, in_b)
+    difference = _sent(name, in_a, in_b)
+    if difference is not None:
+        found.append(difference)
+    elif taken is not None and a.connections[name]["discard_limit"] == 0:
+        found.append(taken)
+    elif taken is not None:
+        remarks.append(f"{taken.text}: allowed, since this connection may lose packets")
+    return compared
+
+
+def _packets(
+    name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
+) -> tuple[Packets, Packets]:
+    """The lists of both runs, with digests from their bags where nodes have kept none.
+
+    If one run has digests of its nodes and the other only a bag, both are taken from bags, where
+    both have one; a bag stands beside digests of nodes only where both digest packets alike.
+    """
+    packets = [read_packets(run.folder, run.ends[name]) for run in runs]
+    lacks = [
+        _lacks_digests(run.connections[name]["sent"], listed)
+        for run, listed in zip(runs, packets, strict=True)
+    ]
+    if not any(lacks):
+        return packets[0], packets[1]
+    connection = runs[0].ends[name]
+    bags = [recorded.digests(run.folder, name) for run in runs]
+    if bags[0] is not None and bags[1] is not None:
+        return (
+            _recorded(packets[0], bags[0], connection),
+            _recorded(packets[1], bags[1], connection),
+        )
+    for place, run in enumerate(runs):
+        bag = bags[place]
+        if lacks[place] and bag is not None and recorded.are_as_of_nodes(run.folder, name):
+            packets[place] = _recorded(packets[place], bag, connection)
+    return packets[0], packets[1]
+
+
+def _recorded(packets: Packets, digests: Numbers, connection: Connection) -> Packets:
+    """With the digests of what was recorded; on a reliable connection all of that arrives."""
+    received = digests if connection.is_reliable else packets.received
+    return replace(packets, sent=digests, received=received)
+
+
+def _lacks_digests(sent: int | None, packets: Packets) -> bool:
+    """Whether packets have passed, or may have, of which nothing is known here."""
+    if sent is None:  # by a node of another launcher, or one that never reported
+        return not len(packets.sent) and not len(packets.received)
+    return sent > 0 and not len(packets.sent)
+
+
+def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+    place = _first_difference(in_a.sent, in_b.sent)
+    if place == len(in_a.sent) == len(in_b.sent):
+        return None
+    at_ns = float(in_a.sent_ns[place]) if place < len(in_a.sent_ns) else np.inf
+    if place == len(in_a.sent) or place == len(in_b.sent):
+        shorter, longer = ("A", "B") if len(in_a.sent) < len(in_b.sent) else ("B", "A")
+        text = f"{name}: run {shorter} ends after packet {place}, run {longer} has more"
+        return _Difference(at_ns, f"{text} ({abs(len(in_a.sent) - len(in_b.sent))})")
+    return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
+
+
+def _field(folders: tuple[Path, Path], name: str, number: int, recorded: RecordedPackets) -> str:
+    """In which field a packet differs, as far as it was recorded."""
+    messages = [recorded.message(folder, name, number) for folder in folders]
+    if None in messages:
+        return "(to see in which field, run both with --record)"
+    field = next(differing_fields(*messages), None)
+    return f"in {field}" if field else "(but no recorded field does)"
+
+
+def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+    a, b = in_a.consumed, in_b.consumed
+    place = _first_difference(a, b)
+    if place == len(a) == len(b):
+        return None
+    at_ns = float(in_a.consumed_ns[place]) if place < len(a) else np.inf
+    if place in (len(a), len(b)):
+        what = f"hooks took {len(a)} packets in run A, and {len(b)} in run B"
+    else:
+        what = f"hooks took different packets as number {place + 1}"
+    return _Difference(at_ns, f"{name}: {what}")
+
+
+def _first_difference(a: Numbers, b: Numbers) -> int:
+    """The first place at which they differ, from 0; where one ends, at the latest."""
+    common = min(len(a), len(b))
+    unequal = np.flatnonzero(a[:common] != b[:common])
+    return int(unequal[0]) if len(unequal) else common
+
+
+def differing_fields(
+    a: Any, b: Any, name: str = "", sides: tuple[str, str] = ("A", "B")
+) -> Iterator[str]:
+    """Differences between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
+    fields = getattr(a, "__dataclass_fields__", None)
+    if fields:
+        for field in fields:
+            if not field.startswith("__"):
+                inner = f"{name}.{field}" if name else field
+                yield from differing_fields(getattr(a, field), getattr(b, field), inner, sides)
+        return
+    if isinstance(a, np.ndarray | list | tuple) and not isinstance(b, str):
+        if len(a) != len(b):
+            yield f"{name}: {len(a)} elements in {sides[0]}, {len(b)} in {sides[1]}"
+            return
+        for place, (left, right) in enumerate(zip(a, b, strict=True)):
+            yield from differing_fields(left, right, f"{name}[{place}]", sides)
+        return
+    if not (a == b or (a != a and b != b)):  # NaN is what it was
+        left, right = _plain(a), _plain(b)
+        yield f"{name}: {left!r} in {sides[0]}, {right!r} in {sides[1]}"
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy as Python's own, which is shown without its type."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,59 +1,38 @@
-"""Record of a run (``run.json``): made from the last reports of its nodes, and read again.
+"""Record of a run (``run.json``): made from the last reports of its nodes, read again, and checked.
 
 :func:`open_run` refuses what it cannot rely on. :func:`open_for_review` takes what there is, of a
-run that was cut off or of an older version, too, and says what is missing.
+run that was cut off or of an older version, too, and says what is missing. :func:`losses` and
+:func:`broken_budgets` check the record.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from neuros.backends.registered import ran_in_one_process
-from neuros.control import Report
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.project.model import Connection, NodeFile, Project
+from neuros.project.model import Budgets, Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 from neuros.recording.run_file import FORMAT, RUN_FILE, check_record, read_object, read_run_file
 
 if TYPE_CHECKING:
     from neuros.analysis.packets import Numbers, Packets, Trace
+    from neuros.launcher.outcome import Outcome
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 _STATES = ("executing", "waiting", "blocked", "idle")
 
 
-class Ended(Protocol):
-    """Outcome of a run, as far as a record needs it."""
-
-    exit_code: int
-    reason: str
-    reports: dict[str, Report]
-    report_times_s: dict[str, float]
-    timelines: dict[str, list[Sequence[float]]]
-    started_s: float | None
-    elsewhere: Mapping[str, Mapping[str, Any]]
-    ending_s: float | None
-    ended_s: float
-    paused_s: float
-    stacks: dict[str, str]
-
-    @property
-    def running_s(self) -> float | None: ...
-
-    @property
-    def real_time_factor(self) -> float | None: ...
-
-
 def run_record(
     project: Project,
     files: Sequence[NodeFile],
-    ended: Ended,
+    ended: Outcome,
     wall_s: float,
     run_folder: Path,
 ) -> dict[str, Any]:
@@ -134,7 +113,7 @@ def consumed_percent(connection: Mapping[str, Any]) -> float | None:
     return 100 * consumed / sent if sent and consumed is not None else None
 
 
-def _timeline(points: Sequence[Sequence[float]], ended: Ended) -> list[list[float]]:
+def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[float]]:
     """Points of simulated and wall time, both growing; wall time from the first hook on."""
     start_s = ended.started_s or 0.0
     found: list[list[float]] = []
@@ -180,12 +159,12 @@ def _compressed(counted: Sequence[int] | None) -> dict[str, int]:
     return {} if counted is None else {"bytes": counted[0], "compressed_bytes": counted[1]}
 
 
-def _cut_off(ended: Ended) -> list[str]:
+def _cut_off(ended: Outcome) -> list[str]:
     """The nodes that have not reported their end."""
     return [name for name, report in ended.reports.items() if not report.is_final]
 
 
-def _node(name: str, ended: Ended) -> dict[str, Any]:
+def _node(name: str, ended: Outcome) -> dict[str, Any]:
     report = ended.reports.get(name)
     if report is None or report.metrics is None:
         return {"report": None}
@@ -425,3 +404,114 @@ def _missing_lists(run: PastRun) -> list[str]:
     damaged += [file for name in run.nodes for file in run.trace(name).damaged]
     missing += [f"the rest of {file}: the file is damaged" for file in damaged]
     return missing
+
+
+def losses(record: Mapping[str, Any]) -> list[str]:
+    """A sentence for each lossless connection that lost packets, or may have, from ``run.json``."""
+    found = []
+    for connection in record["connections"]:
+        lost, sent, received = (connection[key] for key in ("lost", "sent", "received"))
+        if connection["discard_limit"] != 0 or lost == 0 or not _has_begun(connection, record):
+            continue
+        name = connection["connection"]
+        if lost is not None:
+            packets = "packet" if lost == 1 else "packets"
+            found.append(f"{name} lost {lost} {packets}, though it is lossless (discard_limit 0)")
+        else:
+            found.append(f"{name} is lossless (discard_limit 0), but {_unknown(sent, received)}")
+    return found
+
+
+def _unknown(sent: int | None, received: int | None) -> str:
+    """Say which count is missing for that of lost packets."""
+    if sent is None:
+        return "the number of packets that were sent is not known"
+    if received is None:
+        return f"it is not known how many of {sent} packets arrived"
+    return "the number of packets that it lost is not known: the last report of a node is missing"
+
+
+def broken_budgets(
+    record: Mapping[str, Any], budgets: Budgets, *, is_partial: bool = False
+) -> list[str]:
+    """A sentence for each budget that a run has broken, from its ``run.json``.
+
+    A figure that is not known breaks its budget, except where another part of the project has it
+    (``is_partial``).
+    """
+    return [
+        *_losses(record, budgets.lost_packets),
+        *_slowness(record, budgets.real_time_factor, is_partial),
+        *_irregularity(record, budgets.tick_error_ms),
+    ]
+
+
+def _losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[str]:
+    for connection in record["connections"]:
+        limit = limits.get(connection["connection"])
+        if limit is None or not _has_begun(connection, record):
+            continue
+        name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
+        if lost is None or discarded is None:
+            yield f"it is not known how many packets {name} lost; the limit is {limit}"
+        elif lost + discarded > limit:
+            yield (
+                f"{name} lost {lost + discarded} packets ({lost} on their way,"
+                f" {discarded} discarded); the limit is {limit}"
+            )
+
+
+def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) -> Iterator[str]:
+    factor = record["real_time_factor"]
+    if least is None:
+        return
+    owners = [n for n, node in record["nodes"].items() if node.get("sim_time") is not None]
+    if not all(_is_known(record["nodes"][name]) for name in owners):
+        yield (
+            f"the real-time factor must be at least {least:g}, but is not known: the last report"
+            f" of {' and '.join(owners)} is missing"
+        )
+    elif factor is not None and factor < least:
+        yield f"the real-time factor was {factor:.3g}, but must be at least {least:g}"
+    elif factor is None and not is_partial:
+        yield (
+            f"the real-time factor must be at least {least:g}, but there was none: no node owns"
+            " simulated time, or the node that does never ran a hook"
+        )
+
+
+def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator[str]:
+    if limit_ms is None:
+        return
+    for node, metrics in record["nodes"].items():
+        if _has_ticks(metrics) and not _is_known(metrics):
+            yield (
+                f"it is not known how far ticks of {node} were off their period; the limit is"
+                f" {limit_ms:g} ms"
+            )
+            continue
+        for hook, figures in (metrics.get("hooks") or {}).items():
+            ticks = figures.get("ticks")
+            if ticks and ticks["largest_error_ms"] > limit_ms:
+                yield (
+                    f"a tick of '{hook}' of {node} was off its period by"
+                    f" {ticks['largest_error_ms']:.3g} ms; the limit is {limit_ms:g} ms"
+                )
+
+
+def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool:
+    """Whether a packet may have been sent: not before the nodes at both ends had been loaded."""
+    ends = (end.partition(".")[0] for end in connection["connection"].split(" -> "))
+    here = [record["nodes"][node] for node in ends if node in record["nodes"]]
+    if len(here) < 2 and not (connection["sent"] or connection["received"]):
+        return False  # the node elsewhere never came, as far as is known here
+    return all(node["report"] is not None for node in here)
+
+
+def _is_known(node: Mapping[str, Any]) -> bool:
+    """Whether the figures of a node are those of its end."""
+    return bool(node.get("report") == "final")
+
+
+def _has_ticks(node: Mapping[str, Any]) -> bool:
+    return any(figures.get("ticks") for figures in (node.get("hooks") or {}).values())

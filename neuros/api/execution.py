@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
-from neuros.analysis.budgets import broken_budgets, losses
-from neuros.analysis.run_record import run_record, run_table
+from neuros.analysis.run_record import broken_budgets, losses, run_record, run_table
 from neuros.api.console import Console
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan

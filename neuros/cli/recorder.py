@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.sidecars import END
 from neuros.errors import NeurosError
-from neuros.recording.recorder import Recorder
+from neuros.recording.recorder import Recorder, counts_of, repair, the_only_recorder
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, Topic, load_plan
-from neuros.recording.repair import counts_of, repair, the_only_recorder
 from neuros.recording.spool import ListenedSpool
 
 if TYPE_CHECKING:

@@ -237,9 +237,8 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.findings import findings_of
-    from neuros.analysis.page import report_page
+    from neuros.analysis.pages import panels_page, report_page, world_pages
     from neuros.analysis.run_record import open_for_review
-    from neuros.analysis.slider_pages import panels_page, world_pages
 
     run = open_for_review(options.run)
     findings = findings_of(run)
@@ -271,7 +270,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.analysis.page import figures_of
+    from neuros.analysis.pages import figures_of
 
     try:
         return figures_of(run)
@@ -321,7 +320,7 @@ def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[NeurosError]
 def _comparison(runs: list[PastRun], header: list[str], rows: list[list[str]]) -> bytes:
     from neuros.analysis.comparison import comparison_figure, labels_of
     from neuros.analysis.findings import findings_of
-    from neuros.analysis.page import bottleneck_part, figure_part, page, png, table_part
+    from neuros.analysis.pages import bottleneck_part, figure_part, page, png, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")
@@ -369,7 +368,7 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from neuros.analysis.difference import RecordedPackets, compare
+    from neuros.analysis.comparison import RecordedPackets, compare
     from neuros.analysis.run_record import open_whole
 
     a, b = open_whole(options.run_a), open_whole(options.run_b)
@@ -431,7 +430,7 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _repair(options: argparse.Namespace) -> int:
-    from neuros.recording.repair import KEPT_NAME, repair
+    from neuros.recording.recorder import KEPT_NAME, repair
 
     def complain(text: str) -> None:
         print(f"neuros: {text}", file=sys.stderr)

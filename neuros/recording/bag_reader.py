@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +32,8 @@ from neuros.recording.labelled import (
     simulated_time_ns,
     write_nwb,
 )
+from neuros.recording.recorder import needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
-from neuros.recording.repair import needs_repair, recorded_counts, repair
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
 _MOST_COLUMNS = 100
@@ -329,14 +329,6 @@ _BASE, _NAME, _ARRAY = 1, 2, 3
 _MOST_LAYOUTS = 64
 
 
-class TypeStore(Protocol):
-    """Part of ``rosbags.typesys.store.Typestore`` that is used here."""
-
-    @property
-    def fielddefs(self) -> Mapping[str, Any]: ...
-    def deserialize_cdr(self, rawdata: bytes, typename: str) -> Any: ...
-
-
 class _Irregular(Exception):
     """Data without a layout: sequences of messages or strings, wide strings, big-endian data."""
 
@@ -446,7 +438,7 @@ class _Layout:
         return columns
 
 
-def columns_of(packets: Sequence[bytes], type_name: str, store: TypeStore) -> dict[str, Column]:
+def columns_of(packets: Sequence[bytes], type_name: str, store: Typestore) -> dict[str, Column]:
     """One column for each field, with one row for each message.
 
     Fields of messages within the message have names with dots, ``header.stamp.sec``. Arrays of
@@ -463,7 +455,7 @@ def columns_of(packets: Sequence[bytes], type_name: str, store: TypeStore) -> di
     return {name: _join(parts, len(packets)) for name, parts in found.items()}
 
 
-def _columns_of_none(type_name: str, store: TypeStore) -> dict[str, Column]:
+def _columns_of_none(type_name: str, store: Typestore) -> dict[str, Column]:
     """The columns of no message: those of one whose strings and sequences are empty."""
     try:
         layout = _Layout(_CDR_HEADER, type_name, store.fielddefs)
@@ -482,7 +474,7 @@ def _field_names(type_name: str, types: Mapping[str, Any], prefix: str = "") -> 
 
 
 def _parts(
-    packets: Sequence[bytes], type_name: str, store: TypeStore
+    packets: Sequence[bytes], type_name: str, store: Typestore
 ) -> Iterator[tuple[npt.NDArray[np.intp], dict[str, Column]]]:
     """Groups of messages with the same layout, and those without one in the end."""
     sizes = np.fromiter(map(len, packets), dtype=np.intp, count=len(packets))

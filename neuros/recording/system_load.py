@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import psutil
 
@@ -283,13 +283,6 @@ def _load_of(process: psutil.Process, cpu_s: float | None = None) -> GroupLoad |
     return GroupLoad(cpu_s, memory_bytes, threads) if memory_bytes else None
 
 
-class Meter(Protocol):
-    """Source of readings, as :class:`LoadMeter`."""
-
-    def machine(self) -> MachineLoad: ...
-    def groups(self) -> Mapping[str, GroupLoad]: ...
-
-
 class LoadNow:
     """Load since the last call.
 
@@ -297,7 +290,7 @@ class LoadNow:
         clock: monotonic, seconds.
     """
 
-    def __init__(self, meter: Meter, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, meter: LoadMeter, clock: Callable[[], float] = time.monotonic) -> None:
         self._meter = meter
         self._clock = clock
         self._before: dict[str, float] = {}
@@ -334,7 +327,7 @@ class LoadMonitor(threading.Thread):
     """
 
     def __init__(
-        self, folder: Path, meter: Meter, table: LoadTable, period_s: float = PERIOD_S
+        self, folder: Path, meter: LoadMeter, table: LoadTable, period_s: float = PERIOD_S
     ) -> None:
         super().__init__(name="neuros-monitor", daemon=True)
         self._path = folder / FILE_NAME

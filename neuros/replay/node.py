@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from neuros.analysis.difference import differing_fields
+from neuros.analysis.comparison import differing_fields
 from neuros.analysis.recorded_node import RecordedNode
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import is_whole

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuros.analysis.difference import Verdict, compare, differing_fields
+from neuros.analysis.comparison import Verdict, compare, differing_fields
 from neuros.analysis.run_record import PastRun, open_run, open_whole
 from neuros.errors import EnvironmentFault, UsageError
 

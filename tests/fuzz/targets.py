@@ -26,10 +26,9 @@ from zlib import crc32
 
 import neuros.bag
 from neuros import control
-from neuros.analysis.comparison import comparison_rows
-from neuros.analysis.difference import RecordedPackets, compare
+from neuros.analysis.comparison import RecordedPackets, compare, comparison_rows
 from neuros.analysis.findings import findings_of
-from neuros.analysis.page import figures_of, report_page
+from neuros.analysis.pages import figures_of, report_page
 from neuros.analysis.recorded_node import RecordedNode, recorded_node
 from neuros.analysis.run_record import open_for_review, open_run
 from neuros.cli.main import main

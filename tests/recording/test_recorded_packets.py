@@ -7,8 +7,7 @@ from pathlib import Path
 from recording.recordings import NUMBER, number, plan, record, spool
 from xxhash import xxh3_64_intdigest
 
-from neuros.analysis import difference
-from neuros.analysis.difference import RecordedPackets
+from neuros.analysis.comparison import _LARGE_BYTES, RecordedPackets
 from neuros.transport.large_packets import LARGE_BYTES
 
 
@@ -38,4 +37,4 @@ def test_a_run_without_a_recording_has_nothing_and_a_damaged_one_says_so(tmp_pat
 
 
 def test_packets_are_large_from_the_size_on_from_which_nodes_digest_them_apart() -> None:
-    assert difference._LARGE_BYTES == LARGE_BYTES
+    assert _LARGE_BYTES == LARGE_BYTES

@@ -25,9 +25,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from neuros.recording import recorder as recording
 from neuros.recording.bag_files import BagWriter
-from neuros.recording.recorder import Recorder
+from neuros.recording.recorder import Recorder, repair
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
-from neuros.recording.repair import repair
 from neuros.recording.spool import NO_TIME, SpoolWriter
 from neuros.recording.stored import Stored, stored_messages
 

@@ -1,58 +1,50 @@
-"""HTML page of a run: one file with its tables and figures, without scripts or network."""
+"""HTML pages of a run, one file each: its report, and panels and worlds with a slider over time.
+
+The report has tables and figures, and no scripts. Panels are spike rasters and heat maps; a world
+is a 3-D view over simulated time. None of them needs a network.
+"""
 
 from __future__ import annotations
 
 import base64
 import io
+import json
+import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape
+from importlib.resources import files
+from pathlib import Path
 from string import Template
 from typing import Any
 
-from neuros.analysis.charts import (
-    counts_figure,
-    graph_figure,
-    latency_figure,
-    load_figure,
-    ticks_figure,
-    time_budget_figure,
-    time_figure,
-    timeline_figure,
-)
+import numpy as np
+import numpy.typing as npt
+
+from neuros.analysis import charts
 from neuros.analysis.findings import Findings
 from neuros.analysis.run_record import PastRun
 from neuros.backends.registered import back_end_of
+from neuros.errors import UsageError
+from neuros.node.logs import WORLD_LOG
+from neuros.project.dashboard import ARRAYS, SPIKES
+from neuros.recording.bag_reader import RecordedTopic, open_bag
+from neuros.recording.labelled import has_simulated_time
 
-_PAGE = Template("""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>$title</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 68rem; margin: 2rem auto;
-       padding: 0 1rem }
-h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
-.main { border-left: 6px solid #D55E00; background: #FBF3EC; padding: .6rem 1.2rem }
-.main p:first-of-type { font-size: 1.15rem; font-weight: 600 }
-.missing { border-left: 6px solid #999; background: #F5F5F5; padding: .4rem 1.2rem }
-img { max-width: 100%; height: auto }
-.table { overflow-x: auto }
-table { border-collapse: collapse; font-size: .88rem }
-th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #DDD }
-th:first-child, td:first-child, .text td { text-align: left }
-code { background: #F0F0F0; padding: .1rem .3rem; overflow-wrap: anywhere }
-</style>
-</head>
-<body>
-<h1>$title</h1>
-$body
-</body>
-</html>
-""")
+MOST_SPIKES = 2_000_000
+"""Of one output; later ones are left out."""
+MOST_ARRAYS = 3000
+"""Packets of one output; of more, every k-th is shown."""
+LONGEST_ARRAY = 4096
+MOST_FRAMES = 6000
+"""Of the page of a world; of a longer recording, every k-th frame is shown."""
+
+_STATIC = files("neuros") / "viewers" / "dashboard" / "static"
+_WORLD_SCRIPTS = {"library": "vendor/three.iife.min.js", "scene": "scene.js"}
+_PANELS_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.js")
+_IMPORT = re.compile(r"^import .*$", re.MULTILINE)
 
 
 def png(figure: Any) -> bytes:
@@ -78,7 +70,13 @@ def report_page(run: PastRun, findings: Findings, figures: Mapping[str, tuple[st
 
 def page(title: str, parts: Sequence[str]) -> str:
     """A page of ready-made parts."""
-    return _PAGE.substitute(title=escape(title), body="\n".join(parts))
+    return _filled("report_page.html", title, body="\n".join(parts))
+
+
+def _filled(template: str, title: str, **values: str) -> str:
+    """A page of one of the HTML files beside this module."""
+    text = (files("neuros") / "analysis" / template).read_text("utf-8")
+    return Template(text).substitute(values, title=escape(title))
 
 
 def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
@@ -195,51 +193,51 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[PastRun], Any]], ...] = (
         "Nodes and connections",
         "Each node with its busiest hook and how it spent its time; each connection with its"
         " guarantee, what it carried and lost, and how long a packet waited for a hook (median).",
-        graph_figure,
+        charts.graph_figure,
     ),
     (
         "time_shares",
         "Where the time went",
         "Shares of each node's time, without the start and the end of the run; what is missing to"
         " 100 % is scheduling: a hook whose turn has not come.",
-        time_budget_figure,
+        charts.time_budget_figure,
     ),
     (
         "swim_lanes",
         "Who waits for whom",
         "Hooks as bars, packets from their sender to the start of a hook on them, and"
         " acknowledgements back.",
-        timeline_figure,
+        charts.timeline_figure,
     ),
     (
         "real_time",
         "Simulated against real time",
         "One point per simulated second; wall time from the first hook on.",
-        time_figure,
+        charts.time_figure,
     ),
     (
         "packets",
         "Packets",
         "What became of the packets of each connection.",
-        counts_figure,
+        charts.counts_figure,
     ),
     (
         "latency",
         "Latency",
         "The share of packets on which a hook had started within a time after they were sent.",
-        latency_figure,
+        charts.latency_figure,
     ),
     (
         "ticks",
         "Regularity of timed hooks",
         "Intervals between the starts of a hook with a period.",
-        ticks_figure,
+        charts.ticks_figure,
     ),
     (
         "system_load",
         "Processor and memory",
         "Of each node's processes, once per second from the command on; 100 % is one core.",
-        load_figure,
+        charts.load_figure,
     ),
 )
 
@@ -252,3 +250,117 @@ def figures_of(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
         if figure is not None:
             found[name] = (title, text, png(figure))
     return found
+
+
+def panels_page(run: PastRun) -> str | None:
+    """The page, ``None`` if the bag of the run has nothing that a panel draws.
+
+    Raises:
+        EnvironmentFault: if the bag is damaged.
+    """
+    try:
+        bag = open_bag(run.folder)
+    except UsageError:  # it was not recorded
+        return None
+    with bag:
+        labels = [t.connection or t.name for t in bag.topics.values()]
+        outputs = dict.fromkeys(label.partition(" -> ")[0] for label in labels)
+        panels = [p for name in outputs for p in _panels(name, bag[name], bag.start_ns)]
+    if not panels:
+        return None
+    scripts = (_IMPORT.sub("", (_STATIC / name).read_text("utf-8")) for name in _PANELS_SCRIPTS)
+    title = f"Activity in {run.name}"
+    return _filled("panels_page.html", title, scripts="\n".join(scripts), panels=_in_script(panels))
+
+
+def _in_script(content: Any) -> str:
+    """JSON that does not end the script which holds it."""
+    return json.dumps(content).replace("</", "<\\/")
+
+
+def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str, Any]]:
+    """What the page draws of an output."""
+    if not topic.count:
+        return
+    if topic.type == SPIKES:
+        columns = topic.columns()
+        times = np.concatenate([*columns["times"]])[:MOST_SPIKES].astype("<f8")
+        senders = np.concatenate([*columns["senders"]])[:MOST_SPIKES].astype("<u4")
+        if len(times):
+            order = np.argsort(times, kind="stable")
+            data = {"times": _packed(times[order]), "senders": _packed(senders[order])}
+            size = max(int(columns["size"].max()), int(senders.max()) + 1)
+            span = [float(times.min()), float(times.max())]
+            yield {"output": name, "kind": "spikes", "size": size, "span": span, **data}
+    elif topic.type in ARRAYS:
+        columns = topic.columns()
+        clock = "publish_time_ns" if has_simulated_time(columns) else "log_time_ns"
+        begin_ns = 0 if has_simulated_time(columns) else start_ns
+        stride = -(-topic.count // MOST_ARRAYS)
+        arrays = columns[ARRAYS[topic.type]][::stride]
+        rows = [np.asarray(row, "<f4")[:LONGEST_ARRAY] for row in arrays]
+        times = (columns[clock][::stride] - begin_ns) / 1e9
+        if rows and rows[0].size and all(row.shape == rows[0].shape for row in rows):
+            yield {
+                "output": name,
+                "kind": "array",
+                "field": ARRAYS[topic.type],
+                "size": rows[0].size,
+                "span": [float(times.min()), float(times.max())],
+                "times": _packed(times.astype("<f8")),
+                "values": _packed(np.stack(rows)),
+            }
+
+
+def _packed(numbers: npt.NDArray[Any]) -> str:
+    return base64.b64encode(zlib.compress(numbers.tobytes())).decode()
+
+
+def world_pages(run: PastRun) -> dict[str, str]:
+    """Pages by node, of those whose world was recorded."""
+    scripts = {key: (_STATIC / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
+    found = {}
+    for name in run.nodes:
+        scenes = list(_scenes(run.folder / name / WORLD_LOG))
+        if scenes:
+            title = f"World of {name} in {run.name}"
+            content = _in_script(scenes)
+            found[name] = _filled("world_page.html", title, **scripts, scenes=content)
+    return found
+
+
+def _scenes(file: Path) -> Iterator[dict[str, Any]]:
+    """Each geometry, with the times and poses of its frames; what stood still is left out.
+
+    Where the simulation was reset, time goes on.
+    """
+    scenes: list[tuple[str, list[tuple[float, str]]]] = []
+    before_s, last_s = 0.0, -1.0
+    for line in _lines(file):
+        if "geometry" in line:
+            scenes.append((line["geometry"], []))
+        for _, sim_s, poses in line["frames"]:
+            if before_s + sim_s < last_s:
+                before_s = last_s
+            if before_s + sim_s > last_s or not scenes[-1][1]:
+                last_s = before_s + sim_s
+                scenes[-1][1].append((last_s, poses))
+    stride = -(-sum(len(frames) for _, frames in scenes) // MOST_FRAMES)
+    for geometry, frames in scenes:
+        if kept := frames[::stride]:
+            poses = b"".join(base64.b64decode(poses) for _, poses in kept)
+            yield {
+                "geometry": json.loads(geometry),
+                "times_s": [time_s for time_s, _ in kept],
+                "poses": base64.b64encode(zlib.compress(poses)).decode(),
+            }
+
+
+def _lines(file: Path) -> Iterator[dict[str, Any]]:
+    """Whole lines of the file; a node that was killed may have left half of one."""
+    if file.is_file():
+        for line in file.read_text("utf-8").splitlines():
+            try:
+                yield json.loads(line)
+            except ValueError:
+                return
