@@ -98,7 +98,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "tf": {"geometry_msgs"},
     "snn.nest": {"numpy", "nest"},
     "simulators.convert": {"mujoco", "numpy"},
-    "simulators.convert.meshes": {"mujoco", "numpy", "trimesh"},
+    "simulators.convert.building": {"mujoco", "numpy", "trimesh"},
     "backends.docker": {"docker", "requests"},
     "backends.progress": {"tqdm"},
     "backends.environments.requirements": {"packaging"},

@@ -186,6 +186,12 @@ class Element:
         """``file:line``."""
         return f"{display_name(self.file)}:{self.line}"
 
+    def descendants(self) -> Iterator[Element]:
+        """This element and all in it, in the order of the document."""
+        yield self
+        for child in self.children:
+            yield from child.descendants()
+
     def and_ancestors(self) -> Iterator[Element]:
         element: Element | None = self
         while element is not None:
@@ -215,10 +221,9 @@ class Element:
         return found
 
     def take_all(self) -> None:
-        """Count everything in it as read."""
-        self.taken = True
-        for child in self.children:
-            child.take_all()
+        """Count it and everything in it as read."""
+        for element in self.descendants():
+            element.taken = True
 
     # ---- values; after a problem the default holds
 

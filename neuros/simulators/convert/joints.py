@@ -8,10 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from neuros.simulators.convert.building import Building, set_first
 from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.output import Building, set_first
-from neuros.simulators.convert.poses import Vector
-from neuros.simulators.convert.scopes import Branch, Joint, Scope
+from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
@@ -169,7 +168,7 @@ def add_mimics(building: Building, scope: Scope) -> None:
     """``<mimic>`` of an axis: the joint follows another one (SDF 1.11)."""
     for inner, element in scope.each("joint"):
         for tag in ("axis", "axis2"):
-            mimic = element.child(tag, "mimic") if element.child(tag) else None
+            mimic = element.child(tag, "mimic")
             if mimic is None:
                 continue
             leader = mimic.attributes.get("joint") or mimic.text_of("joint")

@@ -14,10 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from neuros.simulators.convert.building import Building, put
 from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.output import Building, put
-from neuros.simulators.convert.poses import Pose, from_quaternion, from_rpy
-from neuros.simulators.convert.scopes import Joint, Link, Scope
+from neuros.simulators.convert.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom

@@ -9,8 +9,29 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from neuros.simulators.convert.building import (
+    Building,
+    Converted,
+    Meshes,
+    compile_boxed,
+    put,
+    said_by,
+)
 from neuros.simulators.convert.elements import Element, Report
 from neuros.simulators.convert.find import Finder, Includer
+from neuros.simulators.convert.frames import (
+    Branch,
+    Joint,
+    Link,
+    Pose,
+    Scope,
+    Tree,
+    Vector,
+    grow,
+    place_all,
+    read_pose,
+    read_scope,
+)
 from neuros.simulators.convert.joints import (
     add_actuators,
     add_joints,
@@ -25,19 +46,6 @@ from neuros.simulators.convert.links import (
     add_link_sensors,
     add_shapes,
     share_masks,
-)
-from neuros.simulators.convert.meshes import Meshes, compile_boxed, said_by
-from neuros.simulators.convert.output import Building, Converted, put
-from neuros.simulators.convert.poses import Pose, Vector, read_pose
-from neuros.simulators.convert.scopes import (
-    Branch,
-    Joint,
-    Link,
-    Scope,
-    Tree,
-    grow,
-    place_all,
-    read_scope,
 )
 
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}

@@ -9,17 +9,14 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
 from neuros.errors import Problem
-from neuros.simulators.convert.elements import Element, Report, parse
-from neuros.simulators.convert.find import Finder, NotFound
-from neuros.simulators.convert.joints import follow_joint
-from neuros.simulators.convert.meshes import (
+from neuros.simulators.convert.building import (
+    Converted,
     Triangles,
     compile_boxed,
     fill,
@@ -28,7 +25,9 @@ from neuros.simulators.convert.meshes import (
     triangles_of,
     why_unread,
 )
-from neuros.simulators.convert.output import Converted
+from neuros.simulators.convert.elements import Element, Report, parse
+from neuros.simulators.convert.find import Finder, NotFound
+from neuros.simulators.convert.joints import follow_joint
 
 _DRIVES = "declare drives in the node file: `joint` and `drive`"
 _UNSUPPORTED_ELEMENTS = {
@@ -60,18 +59,32 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     if root.tag != "robot":
         root.problem(f"a URDF file begins with <robot>, not with <{root.tag}>")
     _check_numbers(root)
+    unread = _resolve_meshes(root, finder)
+    report.raise_any()
     robot = _copy(root)
-    unread = _resolve_meshes(robot, root, finder)
-    report.raise_any()
     _keep_names(robot)
-    spec, made = _spec(robot, root, unread)
-    for element in _all(root):
-        if element.tag in _UNSUPPORTED_ELEMENTS:
-            element.note(_UNSUPPORTED_ELEMENTS[element.tag])
-        elif element.tag == "mimic" and element.parent is not None:
-            _mimic(spec, element, element.parent)
-    report.raise_any()
-    model = _compiled(spec, root)
+    made: dict[str, Triangles] = {}
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, "unicode"))
+        for mesh in spec.meshes:
+            triangles = triangles_of(Path(mesh.file)) if mesh.file in unread else None
+            if triangles is not None:
+                mesh.file = ""
+                fill(mesh, triangles)
+                made[mesh.name] = triangles
+        for element in root.descendants():
+            if element.tag in _UNSUPPORTED_ELEMENTS:
+                element.note(_UNSUPPORTED_ELEMENTS[element.tag])
+            elif element.tag == "mimic" and element.parent is not None:
+                _mimic(spec, element, element.parent)
+        model, boxed = compile_boxed(spec, made, [])
+    except (ValueError, mujoco.FatalError) as error:
+        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
+        report.raise_any()
+        raise
+    links = {element.name: element for element in root.descendants() if element.tag == "link"}
+    for geom, slab in boxed:
+        links.get(geom.parent.name, root).remark(str(slab))
     return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
 
 
@@ -91,21 +104,12 @@ def _check_numbers(element: Element) -> None:
         _check_numbers(child)
 
 
-def _compiled(spec: Any, root: Element) -> Any:
-    try:
-        return spec.copy().compile()
-    except (ValueError, mujoco.FatalError) as error:
-        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
-        root.report.raise_any()
-        raise
-
-
-def _resolve_meshes(robot: ElementTree.Element, root: Element, finder: Finder) -> set[str]:
-    """Give every mesh in ``robot`` an absolute path; returns those that MuJoCo does not read."""
+def _resolve_meshes(root: Element, finder: Finder) -> set[str]:
+    """Give every mesh an absolute path; returns those that MuJoCo does not read."""
     unread: set[str] = set()
     here, compiler = root.file.parent, root.child("mujoco", "compiler")
     folder = Path("" if compiler is None else compiler.attributes.get("meshdir", ""))
-    for element, twin in zip(_all(root), robot.iter(), strict=True):
+    for element in root.descendants():
         if element.tag != "mesh" or "filename" not in element.attributes:
             continue
         uri = element.attributes["filename"]
@@ -118,7 +122,7 @@ def _resolve_meshes(robot: ElementTree.Element, root: Element, finder: Finder) -
             hint = "name the folder of the package with -I, or in ROS_PACKAGE_PATH"
             element.problem(f"'{uri}' cannot be found", hint)
             continue
-        twin.set("filename", str(path))
+        element.attributes["filename"] = str(path)
         if needs_conversion(path):
             if triangles_of(path) is None:
                 element.problem(why_unread(path))
@@ -139,29 +143,6 @@ def _keep_names(robot: ElementTree.Element) -> None:
     compiler.set("strippath", "false")
 
 
-def _spec(
-    robot: ElementTree.Element, root: Element, unread: set[str]
-) -> tuple[Any, dict[str, Triangles]]:
-    made: dict[str, Triangles] = {}
-    try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, "unicode"))
-        for mesh in spec.meshes:
-            triangles = triangles_of(Path(mesh.file)) if mesh.file in unread else None
-            if triangles is not None:
-                mesh.file = ""
-                fill(mesh, triangles)
-                made[mesh.name] = triangles
-        _, boxed = compile_boxed(spec, made, [])
-    except (ValueError, mujoco.FatalError) as error:
-        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
-        root.report.raise_any()
-        raise
-    links = {element.name: element for element in _all(root) if element.tag == "link"}
-    for geom, slab in boxed:
-        links.get(geom.parent.name, root).remark(str(slab))
-    return spec, made
-
-
 def _mimic(spec: Any, mimic: Element, joint: Element) -> None:
     """MuJoCo's reader passes over ``<mimic>``: the joint follows another one."""
     leader = mimic.attributes.get("joint", "")
@@ -179,9 +160,3 @@ def _copy(element: Element) -> ElementTree.Element:
     copy.text = element.text
     copy.extend(map(_copy, element.children))
     return copy
-
-
-def _all(element: Element) -> Iterator[Element]:
-    yield element
-    for child in element.children:
-        yield from _all(child)
