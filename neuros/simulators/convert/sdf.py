@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from neuros.simulators.convert import joints, links
 from neuros.simulators.convert.building import (
     Building,
     Converted,
@@ -31,21 +32,6 @@ from neuros.simulators.convert.frames import (
     place_all,
     read_pose,
     read_scope,
-)
-from neuros.simulators.convert.joints import (
-    add_actuators,
-    add_joints,
-    add_mimics,
-    close_loop,
-    is_known,
-)
-from neuros.simulators.convert.links import (
-    add_frames,
-    add_joint_sensors,
-    add_lights,
-    add_link_sensors,
-    add_shapes,
-    share_masks,
 )
 
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
@@ -96,20 +82,20 @@ def _read(root: Element) -> Scope:
 
 
 def _grow(scope: Scope) -> Tree:
-    links = [link for inner in scope.and_models() for link in inner.links.values()]
-    joints = []
+    every_link = [link for inner in scope.and_models() for link in inner.links.values()]
+    movable = []
     for inner, element in scope.each("joint"):
         ends = [_end(inner, element, side) for side in ("parent", "child")]
         joint = Joint(element, inner, *ends)
-        if not is_known(joint) or element.name not in inner.frames:
+        if not joints.is_known(joint) or element.name not in inner.frames:
             continue
         if all(end is None or end.is_static for end in ends):
             element.note("left out: neither of its ends can move")
         elif ends[0] is ends[1]:
             element.problem("joins a link to itself, or to a link that does not exist")
         else:
-            joints.append(joint)
-    return grow(links, joints)
+            movable.append(joint)
+    return grow(every_link, movable)
 
 
 def _end(scope: Scope, joint: Element, side: str) -> Link | None:
@@ -125,16 +111,16 @@ def _build(building: Building, scope: Scope, tree: Tree) -> None:
         _read_world(building, scope)
     for branch in tree.branches:
         _add_body(building, branch)
-    share_masks(building)
+    links.share_masks(building)
     for branch in tree.branches:
         if branch.joint is not None:
-            add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
+            links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
     for joint in tree.loops:
-        close_loop(building, joint)
-    add_mimics(building, scope)
-    add_actuators(building, scope)
-    add_frames(building, scope)
-    add_lights(building, scope)
+        joints.close_loop(building, joint)
+    joints.add_mimics(building, scope)
+    joints.add_actuators(building, scope)
+    links.add_frames(building, scope)
+    links.add_lights(building, scope)
     _exclude_contacts(building, scope)
 
 
@@ -153,12 +139,12 @@ def _add_body(building: Building, branch: Branch) -> None:
     if not link.element.is_true("gravity", default=True):
         body.gravcomp = 1.0
     if branch.joint is not None:
-        add_joints(building, branch, branch.joint)
+        joints.add_joints(building, branch, branch.joint)
     elif not link.is_static:
         free = body.add_freejoint()
         free.name = building.name("joint", f"{link.name}/free", link.element)
-    add_shapes(building, link, is_solid=is_solid)
-    add_link_sensors(building, link)
+    links.add_shapes(building, link, is_solid=is_solid)
+    links.add_link_sensors(building, link)
 
 
 def _exclude_contacts(building: Building, scope: Scope) -> None:

@@ -33,6 +33,7 @@ _SHAPES = {
     mujoco.mjtGeom.mjGEOM_MESH.value: "mesh",
     mujoco.mjtGeom.mjGEOM_SDF.value: "mesh",
 }
+_MATERIAL = ("emission", "specular", "shininess")
 # What a plugin may change while the world runs.
 _LOOKS = ("geom_rgba", "geom_size", "geom_pos", "geom_quat", "mat_rgba", "site_rgba", "site_pos")
 
@@ -64,7 +65,7 @@ class WorldView:
         self._given: dict[int, int] = {}
         self._model: Any = None
         self._models = 0
-        self._moving = _Moving.of(None)
+        self._moving = _Moving()
         self._wants_contacts = False
 
     def note(self) -> None:
@@ -86,7 +87,7 @@ class WorldView:
         """
         model, *_ = self._world()
         if model is not self._model:
-            self._moving = _Moving.of(model)
+            self._moving = _Moving(model)
             self._frames.clear()
             self._model, self._models = model, self._models + 1
         found: dict[str, Any] = {"version": f"{self._models}-{_crc_of_looks(model):x}"}
@@ -126,24 +127,16 @@ class _Moving:
         bodies, cameras: their numbers.
     """
 
-    def __init__(self, bodies: list[int], cameras: list[int]) -> None:
-        self.bodies, self.cameras = bodies, cameras
-
-    @classmethod
-    def of(cls, model: Any) -> _Moving:
+    def __init__(self, model: Any = None) -> None:
+        self.bodies: list[int] = []
+        self.cameras: list[int] = []
         if model is None:
-            return cls([], [])
-        moves = [False] * model.nbody
+            return
+        moves = (model.body_jntnum > 0) | (model.body_mocapid >= 0)
         for body in range(1, model.nbody):  # parents come first
-            moves[body] = bool(
-                moves[model.body_parentid[body]]
-                or model.body_jntnum[body]
-                or model.body_mocapid[body] >= 0
-            )
-        return cls(
-            [body for body in range(model.nbody) if moves[body]],
-            [camera for camera in range(model.ncam) if model.cam_mode[camera]],
-        )
+            moves[body] |= moves[model.body_parentid[body]]
+        self.bodies = np.flatnonzero(moves).tolist()
+        self.cameras = np.flatnonzero(model.cam_mode).tolist()
 
     def poses(self, data: Any) -> Any:
         """A row of x, y, z in metres and a quaternion (w, x, y, z) for each, in the world."""
@@ -166,7 +159,7 @@ def geometry(model: Any) -> dict[str, Any]:
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    moving, visual, headlight = _Moving.of(model), model.vis, model.vis.headlight
+    moving, visual, headlight = _Moving(model), model.vis, model.vis.headlight
     meshes = _Meshes(model)
     return {
         "bodies": [
@@ -186,12 +179,12 @@ def geometry(model: Any) -> dict[str, Any]:
         "lights": list(_lights(model)),
         "cameras": [
             {
-                "name": model.camera(camera).name or f"camera {camera}",
-                "body": int(model.cam_bodyid[camera]),
-                **_pose(model.cam_pos[camera], model.cam_quat[camera]),
-                "fovy": float(model.cam_fovy[camera]),
+                "name": camera.name or f"camera {camera.id}",
+                "body": int(camera.bodyid[0]),
+                **_pose(camera.pos, camera.quat),
+                "fovy": float(camera.fovy[0]),
             }
-            for camera in range(model.ncam)
+            for camera in map(model.camera, range(model.ncam))
         ],
         "view": {
             "center": model.stat.center.tolist(),
@@ -211,71 +204,63 @@ def geometry(model: Any) -> dict[str, Any]:
 
 
 def _geoms(model: Any, meshes: _Meshes) -> Iterator[dict[str, Any]]:
-    for geom in range(model.ngeom):
-        kind = int(model.geom_type[geom])
-        material, rgba = int(model.geom_matid[geom]), model.geom_rgba[geom]
-        if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
-            rgba = model.mat_rgba[material]
-        if kind not in _SHAPES or model.geom_group[geom] > _MOST_GROUP or rgba[3] == 0:
+    for geom in map(model.geom, range(model.ngeom)):
+        kind, material = int(geom.type[0]), int(geom.matid[0])
+        if kind not in _SHAPES or geom.group[0] > _MOST_GROUP:
             continue
-        found = {
-            "shape": _SHAPES[kind],
-            "size": model.geom_size[geom].tolist(),
-            "body": int(model.geom_bodyid[geom]),
-            **_pose(model.geom_pos[geom], model.geom_quat[geom]),
-            "rgba": rgba.tolist(),
-        }
+        found = _shape(model, geom)
+        if found["rgba"][3] == 0:
+            continue
         if _SHAPES[kind] == "mesh":
-            found["mesh"] = meshes.number(kind, int(model.geom_dataid[geom]))
+            found["mesh"] = meshes.number(kind, int(geom.dataid[0]))
         if material >= 0:
-            found |= _material(model, material)
+            found |= _material(model.mat(material))
         yield found
 
 
-def _material(model: Any, material: int) -> dict[str, Any]:
-    found = {
-        "emission": float(model.mat_emission[material]),
-        "specular": float(model.mat_specular[material]),
-        "shininess": float(model.mat_shininess[material]),
+def _shape(model: Any, element: Any) -> dict[str, Any]:
+    """The common part of geoms and sites."""
+    material, rgba = int(element.matid[0]), element.rgba
+    if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
+        rgba = model.mat_rgba[material]
+    return {
+        "shape": _SHAPES[int(element.type[0])],
+        "size": element.size.tolist(),
+        "body": int(element.bodyid[0]),
+        **_pose(element.pos, element.quat),
+        "rgba": rgba.tolist(),
     }
-    textures = model.mat_texid[material]
+
+
+def _material(material: Any) -> dict[str, Any]:
+    found = {name: float(getattr(material, name)[0]) for name in _MATERIAL}
+    textures = material.texid
     roles = (mujoco.mjtTextureRole.mjTEXROLE_RGB, mujoco.mjtTextureRole.mjTEXROLE_RGBA)
     texture = next((int(textures[role]) for role in roles if textures[role] >= 0), None)
     if texture is not None:
         found |= {
             "texture": texture,
-            "repeat": model.mat_texrepeat[material].tolist(),
-            "is_uniform": bool(model.mat_texuniform[material]),
+            "repeat": material.texrepeat.tolist(),
+            "is_uniform": bool(material.texuniform[0]),
         }
     return found
 
 
 def _sites(model: Any) -> Iterator[dict[str, Any]]:
-    for site in range(model.nsite):
-        if model.site_group[site] <= _MOST_GROUP:
-            material, rgba = int(model.site_matid[site]), model.site_rgba[site]
-            if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
-                rgba = model.mat_rgba[material]
-            yield {
-                "shape": _SHAPES[int(model.site_type[site])],
-                "size": model.site_size[site].tolist(),
-                "body": int(model.site_bodyid[site]),
-                **_pose(model.site_pos[site], model.site_quat[site]),
-                "rgba": rgba.tolist(),
-            }
+    for site in map(model.site, range(model.nsite)):
+        if site.group[0] <= _MOST_GROUP:
+            yield _shape(model, site)
 
 
 def _lights(model: Any) -> Iterator[dict[str, Any]]:
-    for light in range(model.nlight):
-        if model.light_active[light]:
+    for light in map(model.light, range(model.nlight)):
+        if light.active[0]:
+            vectors = ("pos", "dir", "diffuse", "ambient")
             yield {
-                "type": int(model.light_type[light]),
-                "body": int(model.light_bodyid[light]),
-                "pos": model.light_pos[light].tolist(),
-                "dir": model.light_dir[light].tolist(),
-                "diffuse": model.light_diffuse[light].tolist(),
-                "ambient": model.light_ambient[light].tolist(),
-                "cutoff": float(model.light_cutoff[light]),
+                "type": int(light.type[0]),
+                "body": int(light.bodyid[0]),
+                **{name: getattr(light, name).tolist() for name in vectors},
+                "cutoff": float(light.cutoff[0]),
             }
 
 
