@@ -11,10 +11,287 @@
         images = bag["robot.camera"].xarray()     # xarray, if it is installed
 """
 
+from __future__ import annotations
+
+import math
 import os
 import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
-from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
+import numpy as np
+import numpy.typing as npt
+from rosbags.interfaces import Connection, QosDurability, QosReliability
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from neuros.errors import EnvironmentFault
+from neuros.recording.columns import (
+    LOG_TIME,
+    PUBLISH_TIME,
+    Column,
+    columns_of,
+    dataset_of,
+    library,
+    segment_of,
+    simulated_time_ns,
+    write_nwb,
+)
+from neuros.recording.recorder import needs_repair, recorded_counts, repair
+from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
+from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
+
+__all__ = ["Bag", "RecordedTopic", "open"]
+
+_MOST_COLUMNS = 100
+
+
+class RawPacket(NamedTuple):
+    """A packet as it was recorded: wall time and simulated time in nanoseconds, and CDR."""
+
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class RecordedTopic:
+    """The packets of one topic, in the order in which they were sent.
+
+    Attributes:
+        name: the topic.
+        type: its message type in ROS notation.
+        connection: ``a.out -> b.in``, or ``None`` for a topic that belongs to none.
+        is_reliable, depth, is_latched: of the quality of service that was offered.
+        count: how many packets there are.
+    """
+
+    def __init__(self, bag: Bag, recorded: Connection, connection: str | None) -> None:
+        self._bag = bag
+        self.name = recorded.topic
+        self.type = recorded.msgtype
+        self.connection = connection
+        self.count = recorded.msgcount
+        profiles = getattr(recorded.ext, "offered_qos_profiles", None) or []
+        self.is_reliable = all(p.reliability is QosReliability.RELIABLE for p in profiles)
+        self.is_latched = bool(profiles) and all(
+            p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles
+        )
+        self.depth = max((p.depth for p in profiles), default=0) or 10
+
+    def raw(self) -> list[RawPacket]:
+        """All packets as they were recorded."""
+        return self._bag.packets_of(self.name)
+
+    def messages(self) -> Iterator[tuple[RawPacket, Any]]:
+        """Packets and messages, made by ``rosbags`` one by one."""
+        for packet in self.raw():
+            yield packet, self._bag.message(packet.data, self.type)
+
+    def message(self, place: int) -> Any:
+        """The message at a place, from 0. Raises ``IndexError``."""
+        return self._bag.message(self.raw()[place].data, self.type)
+
+    def columns(self) -> dict[str, Column]:
+        """A column for each field, and the two times; see :meth:`array`."""
+        packets = self.raw()
+        with damage_of(self._bag.folder):
+            return {
+                LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
+                PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
+                **columns_of([p.data for p in packets], self.type, self._bag.store),
+            }
+
+    def array(self) -> npt.NDArray[Any]:
+        """A structured array, one row per packet.
+
+        Its fields are ``log_time_ns`` (wall time), ``publish_time_ns`` (simulated time, where there
+        is one) and those of the message, with dots: ``header.stamp.sec``. Arrays keep their shape;
+        sequences of different length are objects.
+        """
+        columns = self.columns()
+        rows = len(columns[LOG_TIME])
+        made = np.empty(rows, [(name, c.dtype, c.shape[1:]) for name, c in columns.items()])
+        for name, column in columns.items():
+            made[name] = column
+        return made
+
+    def frame(self, clock: Literal["wall", "sim"] = "wall") -> Any:
+        """A ``pandas.DataFrame``, one row per packet; arrays get a column for each element.
+
+        Args:
+            clock: of the index ``time``: ``wall``, when packets were sent (UTC), or ``sim``, the
+                simulated time (a ``TimedeltaIndex``).
+
+        Raises:
+            EnvironmentFault: if pandas is not installed.
+            UsageError: for the simulated time of a bag that has none.
+        """
+        pd = library("pandas", "array()")
+        spread: dict[str, Any] = {}
+        columns = self.columns()
+        for name, column in columns.items():
+            elements = math.prod(column.shape[1:])
+            if column.ndim == 1:
+                spread[name] = column
+            elif elements <= _MOST_COLUMNS:
+                for place, single in enumerate(column.reshape(len(column), elements).T):
+                    spread[f"{name}[{place}]"] = single
+            else:
+                spread[name] = list(column)
+        if clock == "sim":
+            time = pd.to_timedelta(simulated_time_ns(self, columns), unit="ns")
+        else:
+            time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
+        return pd.DataFrame(spread, index=time.rename("time"))
+
+    def xarray(self) -> Any:
+        """An ``xarray.Dataset``: a variable for each field, along the dimension ``time``.
+
+        Images of one size are ``(time, y, x, channel)``, those of one channel ``(time, y, x)``; the
+        axes of other arrays have names like ``position_0``. The coordinate ``time`` is simulated
+        time in seconds; where there is none, wall time since the first packet of the bag. The
+        coordinate ``wall_time`` is that of the wall clock (UTC). Variables whose unit the ROS
+        definition states have it as the attribute ``units``.
+
+        Raises:
+            EnvironmentFault: if xarray is not installed.
+        """
+        return dataset_of(self, self._bag.store.fielddefs, self._bag.start_ns)
+
+    def neo(self) -> Any:
+        """A ``neo.Segment`` of recorded spikes (``neuros_msgs/msg/Spikes``).
+
+        It has a ``SpikeTrain`` for each neuron of the population, in the order of their numbers,
+        annotated with ``neuron``, in seconds of simulated time.
+
+        Raises:
+            EnvironmentFault: if Neo is not installed.
+            UsageError: for packets of another type, and for spikes of neurons that are not there.
+        """
+        return segment_of(self)
+
+    def nwb(self, file: str | os.PathLike[str]) -> None:
+        """Write recorded spikes into a new file of Neurodata Without Borders, a unit per neuron.
+
+        Raises:
+            EnvironmentFault: if PyNWB is not installed.
+            UsageError: as :meth:`neo`.
+            OSError: if the file cannot be written.
+        """
+        write_nwb(self, file, self._bag.start_ns, self._bag.custom.get("run_id", "unknown"))
+
+
+class Bag:
+    """Topics and metadata of a recorded run.
+
+    Attributes:
+        folder: the rosbag2 folder.
+        topics: by name, in the order of the project.
+        custom: what its metadata says of the run: ``run_id``, ``project``, ``project_sha256``,
+            ``versions``, ``seeds``.
+        start_ns: wall time of the first packet, in nanoseconds since 1970.
+        duration_s: from the first packet to the last.
+        missing: by topic, how many packets were in the bag when the run ended, and are not now.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        connections: Mapping[str, str | None],
+        recorded: Mapping[str, int] | None = None,
+    ) -> None:
+        self.folder = folder
+        with opened(folder) as reader, damage_of(folder):
+            self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
+            self.start_ns, self.duration_s = reader.start_time, reader.duration / 1e9
+            found = {c.topic: c for c in reader.connections}
+            self.store = _store_of(found.values())
+            self.topics = {
+                name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
+            }
+        self.missing = {
+            name: lost
+            for name, count in (recorded or {}).items()
+            if (lost := count - (self.topics[name].count if name in self.topics else 0)) > 0
+        }
+        self._stored = StoredTopics(folder, self.refuse)
+        self._packets: dict[str, list[RawPacket]] = {}
+
+    @property
+    def damage(self) -> str | None:
+        """The missing packets, in a sentence."""
+        if not self.missing:
+            return None
+        topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
+        return f"{self.folder} has been damaged since the run; packets that are missing: {topics}"
+
+    def check(self) -> str | None:
+        """What is wrong with the bag, in a sentence; reads all of it."""
+        faults: list[str] = []
+        for _ in stored_messages(self.folder, faults.append):
+            pass
+        return "; ".join([*([self.damage] if self.damage else []), *faults]) or None
+
+    def refuse(self, fault: str) -> None:
+        """Raise a fault of its files, which readers of packets cannot pass over."""
+        raise EnvironmentFault(
+            f"{fault}: its content has changed since it was recorded (`neuros bag repair` keeps"
+            " the packets that can be read)"
+        )
+
+    @property
+    def project(self) -> str | None:
+        """The name of the project."""
+        return self.custom.get("project")
+
+    def __getitem__(self, name: str) -> RecordedTopic:
+        """The topic of that name, of that connection, or of that output.
+
+        An output sends the same packets to all its receivers; of a run that was cut off, the
+        connection that came furthest is taken.
+
+        Raises:
+            KeyError: if there is none; its text names those that there are.
+        """
+        if name in self.topics:
+            return self.topics[name]
+        labels = {topic: topic.connection or "" for topic in self.topics.values()}
+        fitting = [t for t, label in labels.items() if name in (label, label.partition(" -> ")[0])]
+        if fitting:
+            return max(fitting, key=lambda topic: topic.count)
+        there = [topic.connection or topic.name for topic in self.topics.values()]
+        raise KeyError(f"{name}: there are {', '.join(there)}")
+
+    def message(self, data: bytes, type_name: str) -> Any:
+        """A message of a type that the bag has. Raises ``EnvironmentFault`` for other bytes."""
+        with damage_of(self.folder):
+            return self.store.deserialize_cdr(data, type_name)
+
+    def packets_of(self, name: str) -> list[RawPacket]:
+        """All packets of a topic, by their wall time."""
+        if name not in self._packets:
+            packets = [
+                RawPacket(log_ns, publish_ns, data)
+                for _, log_ns, publish_ns, data, _ in self._stored.messages(name)
+            ]
+            count = self.topics[name].count
+            if len(packets) < count:
+                self.refuse(f"{self.folder}: of {count} packets of {name} {len(packets)} are left")
+            packets.sort(key=itemgetter(0))
+            self._packets[name] = packets
+        return self._packets[name]
+
+    def close(self) -> None:
+        """Let go of what has been read."""
+        self._packets.clear()
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def open(run: str | os.PathLike[str]) -> Bag:
@@ -35,4 +312,34 @@ def open(run: str | os.PathLike[str]) -> Bag:
     return bag
 
 
-__all__ = ["Bag", "RecordedTopic", "open"]
+def open_bag(run: str | os.PathLike[str]) -> Bag:
+    """Open the bag of a run, as :func:`open`, but without a warning."""
+    folder = Path(run)
+    if (folder / "metadata.yaml").is_file() and not (folder / PLAN_NAME).is_file():
+        if not (folder.parent / PLAN_NAME).is_file():
+            return Bag(folder, {})
+        folder = folder.parent
+    plan = load_plan(folder)
+    if needs_repair(folder, plan):
+        _repair_if_possible(folder)
+    connections = {topic.name: topic.connection for topic in plan.topics}
+    return Bag(folder / BAG_NAME, connections, recorded_counts(folder))
+
+
+def _repair_if_possible(run: Path) -> None:
+    """A run that still goes on has a bag that can be read as it is."""
+    try:
+        repair(run, lambda _: None)
+    except EnvironmentFault:
+        if not (run / BAG_NAME / "metadata.yaml").is_file():
+            raise
+
+
+def _store_of(connections: Iterable[Connection]) -> Typestore:
+    """The types as the bag defines them."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    for connection in connections:
+        types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+    store.register(types)
+    return store

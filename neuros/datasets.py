@@ -27,10 +27,10 @@ import numpy as np
 import numpy.typing as npt
 
 import neuros.bag
+from neuros.bag import Bag, RecordedTopic
 from neuros.errors import UsageError
 from neuros.project.suggest import did_you_mean
-from neuros.recording.bag_reader import Bag, RecordedTopic
-from neuros.recording.labelled import (
+from neuros.recording.columns import (
     IMAGE,
     LOG_TIME,
     PUBLISH_TIME,

@@ -16,9 +16,9 @@ from xxhash import xxh3_64_intdigest
 
 from neuros.analysis.packets import Numbers, Packets, read_packets
 from neuros.analysis.run_record import PastRun, consumed_percent
+from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
 from neuros.project.model import Connection
-from neuros.recording.bag_reader import Bag, RecordedTopic, open_bag
 from neuros.recording.recording_plan import PLAN_NAME
 from neuros.recording.stored import stored_messages
 

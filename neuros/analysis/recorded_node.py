@@ -9,13 +9,13 @@ from typing import Any
 
 from neuros.analysis.packets import FOLDER, read_packets
 from neuros.analysis.run_record import PastRun, open_run
+from neuros.bag import Bag, open_bag
 from neuros.engine.event_log import is_understood
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.split import node_file_from_json
 from neuros.project.validate import mistake
-from neuros.recording.bag_reader import Bag, open_bag
 from neuros.recording.recording_plan import RecordingPlan, load_plan
 from neuros.recording.run_file import read_object
 

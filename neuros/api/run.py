@@ -13,7 +13,7 @@ from neuros.analysis.run_record import open_run, run_table
 from neuros.errors import RunError
 
 if TYPE_CHECKING:
-    from neuros.recording.bag_reader import Bag
+    from neuros.bag import Bag
 
 
 _LATENCIES = ("p50", "p90", "p99", "max")
@@ -112,7 +112,7 @@ class Run:
             UsageError: if nothing was recorded.
             EnvironmentFault: if the bag is damaged.
         """
-        from neuros.recording.bag_reader import open_bag
+        from neuros.bag import open_bag
 
         return open_bag(self.folder)
 
@@ -177,7 +177,7 @@ def frame_of(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any
     Raises:
         EnvironmentFault: if pandas is not installed.
     """
-    from neuros.recording.labelled import library
+    from neuros.recording.columns import library
 
     pd = library("pandas")
     frame = pd.DataFrame(list(rows))

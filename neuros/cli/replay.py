@@ -18,9 +18,9 @@ from neuros.errors import EnvironmentFault, UsageError
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
+    from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros.project.model import NodeFile
-    from neuros.recording.bag_reader import RecordedTopic
     from neuros.replay.node import ReplayedNode
 
 
@@ -122,8 +122,8 @@ def _replay(options: argparse.Namespace) -> int:
         )
     if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
         raise UsageError("replay: --rate must be above 0; --delay and -w must be 0 or more")
+    from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
-    from neuros.recording.bag_reader import open_bag
     from neuros.transport.playing import PlayedTopic, play
 
     find_messages_of(Path(options.run))

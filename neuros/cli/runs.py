@@ -416,7 +416,7 @@ def add_bag(bag: argparse.ArgumentParser) -> None:
 def _info(options: argparse.Namespace) -> int:
     from tabulate import tabulate
 
-    from neuros.recording.bag_reader import open_bag
+    from neuros.bag import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]

@@ -17,9 +17,10 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import neuros.bag
+from neuros.bag import Bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.bag_reader import Bag, columns_of
+from neuros.recording.columns import columns_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

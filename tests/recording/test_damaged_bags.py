@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from recording.recordings import NUMBER, number, plan, spool
 
 import neuros.bag
+from neuros.bag import Bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault
-from neuros.recording.bag_reader import Bag
 
 VALUES = [*range(1, 201)]
 

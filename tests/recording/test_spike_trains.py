@@ -17,7 +17,7 @@ import neuros
 import neuros.bag
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.dashboard import SPIKES
-from neuros.recording.labelled import trains_of
+from neuros.recording.columns import trains_of
 from neuros.snn import Spikes
 
 PLUGIN = """

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import neuros.bag
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.labelled import dataset_of
+from neuros.recording.columns import dataset_of
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
