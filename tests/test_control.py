@@ -61,7 +61,7 @@ RICH = [
     REPORT,
     Hooks("a", (HookDeclaration(HookKind.TICK, (InputSpec("x", True),), ("o",)),), ("end",)),
     NodeStatus("a", 1, 2.0, LiveCounters(1.0, METRICS, {"c": (2, (7, 8))}, {"c": (1, 9)}), {}),
-    Ended(0, "why", {"a": REPORT}, 2.0, 0.5),
+    Ended(0, "why", {"a": REPORT}, 2.0, 0.5, True),
     Finalising("a", None),
 ]
 

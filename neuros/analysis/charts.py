@@ -23,7 +23,7 @@ SKY, RED, YELLOW, GREY = "#56B4E9", "#D55E00", "#F0E442", "#999999"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED, YELLOW, GREY)
 
 _STATES = {"executing": GREEN, "waiting": SKY, "blocked": RED, "idle": "#DDDDDD"}
-_FATES = {"consumed": BLUE, "unread": YELLOW, "discarded": ORANGE, "lost": RED}
+_FATES = {"consumed": BLUE, "unread": YELLOW, "in_flight": GREY, "discarded": ORANGE, "lost": RED}
 _DPI, _WIDTH_IN = 110, 9.5
 _POINTS = 500
 _MOST_TICKS = 12
@@ -92,7 +92,7 @@ def counts_figure(run: PastRun) -> Any | None:
         return None
     figures = [run.connections[name] for name in names]
     parts = {
-        fate: (shade, np.array([each.get(fate) or 0 for each in figures], float))
+        fate.replace("_", " "): (shade, np.array([each.get(fate) or 0 for each in figures], float))
         for fate, shade in _FATES.items()
     }
     figure, axes = _stacked_bars(names, parts)

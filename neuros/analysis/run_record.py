@@ -8,13 +8,14 @@ run that was cut off or of an older version, too, and says what is missing. :fun
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.registered import ran_in_one_process
+from neuros.engine.metrics import in_flight_and_lost
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, Connection, NodeFile, Project
@@ -58,9 +59,7 @@ def run_record(
         },
         "connections": [
             {
-                **_connection(
-                    c, all_metrics, running_s, run_folder, _cut_off(ended), foreign[str(c)]
-                ),
+                **_connection(c, all_metrics, ended, run_folder, foreign[str(c)]),
                 **_compressed(compressed.get(str(c))),
             }
             for c in sorted({c for file in files for c in file.connections}, key=lambda c: c.index)
@@ -82,14 +81,16 @@ def run_table(record: Mapping[str, Any]) -> str:
     from tabulate import tabulate
 
     counts: tuple[str, ...] = _COUNTS
-    if any(c.get("foreign") for c in record["connections"]):
-        counts = (*counts, "foreign")
+    for count in ("in_flight", "foreign"):
+        if any(c.get(count) for c in record["connections"]):
+            counts = (*counts, count)
     connections = [[c["connection"], *(c[key] for key in counts)] for c in record["connections"]]
+    header = ("connection", *(count.replace("_", " ") for count in counts))
     nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
     parts = [
         tabulate(rows, header, missingval="?", disable_numparse=True, colalign=("left", *right))
         for header, rows, right in (
-            (("connection", *counts), connections, ["right"] * len(counts)),
+            (header, connections, ["right"] * len(counts)),
             (("node", *_STATES, "remark"), nodes, ["right"] * len(_STATES)),
         )
         if rows
@@ -126,9 +127,8 @@ def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[fl
 def _connection(
     connection: Connection,
     all_metrics: Mapping[str, Mapping[str, Any]],
-    running_s: float | None,
+    ended: Outcome,
     run_folder: Path,
-    cut_off: Collection[str],
     foreign: int,
 ) -> dict[str, Any]:
     from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
@@ -139,7 +139,12 @@ def _connection(
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
     # Counts that a node has last reported before it was killed are older than those of the other.
-    is_known = not {connection.source_node, connection.destination_node} & set(cut_off)
+    is_known = not {connection.source_node, connection.destination_node} & set(_cut_off(ended))
+    in_flight, lost, running_s = None, None, ended.running_s
+    if is_known and sent is not None and received is not None:
+        in_flight, lost = in_flight_and_lost(
+            sent, received, connection.is_reliable, ended.has_drained
+        )
     figures = {
         "connection": key,
         "index": connection.index,
@@ -147,7 +152,8 @@ def _connection(
         "queue_size": connection.queue_size,
         "sent": sent,
         "rate_hz": sent / running_s if sent is not None and running_s else None,
-        "lost": sent - received if is_known and None not in (sent, received) else None,
+        "in_flight": in_flight,
+        "lost": lost,
         **{field: incoming.get(field) for field in fields},
         "foreign": foreign,
     }

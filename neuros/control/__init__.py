@@ -453,6 +453,7 @@ class Ended(Message):
         reports: the last one of each node.
         running_s: how long all nodes ran.
         real_time_factor: simulated seconds per second of that.
+        has_drained: whether packets in flight were waited for.
     """
 
     exit_code: int
@@ -460,6 +461,7 @@ class Ended(Message):
     reports: Mapping[str, Report]
     running_s: float | None
     real_time_factor: float | None
+    has_drained: bool = False
 
 
 FROM_NODES: Sequence[type[Message]] = (

@@ -45,6 +45,21 @@ IDLE = Rest(State.IDLE)
 PAUSED = Rest(State.PAUSED)
 
 
+def in_flight_and_lost(
+    sent: int, received: int, is_reliable: bool, has_drained: bool
+) -> tuple[int, int]:
+    """Packets of a connection that had not arrived when a run ended: in flight, and lost.
+
+    Nodes of a run that is not drained stop one after the other, and what one sends to another that
+    has stopped arrives nowhere. A reliable connection loses nothing else. On one of best effort
+    nobody can tell the two apart, and all of them count as lost.
+    """
+    missing = sent - received
+    if is_reliable and not has_drained and missing > 0:
+        return missing, 0
+    return 0, missing
+
+
 class TickIntervals:
     """Intervals between the starts of one timed hook, in a memory that does not grow with them.
 

@@ -310,6 +310,7 @@ class Observers:
                 outcome.reports,
                 outcome.running_s,
                 outcome.real_time_factor,
+                outcome.has_drained,
             )
         )
 

@@ -58,6 +58,8 @@ class Outcome:
         paused_s: how long it has stood still since the first hook.
         is_paused: whether it stands still now.
         stacks: where nodes that were killed stood in their plugins, by name.
+        has_drained: whether packets in flight were waited for. After a signal or a failure they are
+            not: a node that stops later may send to one that has stopped.
         late_drain: why it was not drained in time, empty if it was.
         ended_s: when all processes had ended.
         is_signalled: whether the user has asked for the end by a signal, be it after another cause.
@@ -74,6 +76,7 @@ class Outcome:
     started_s: float | None = None
     ending_s: float | None = None
     stacks: dict[str, str] = field(default_factory=dict)
+    has_drained: bool = False
     late_drain: str = ""
     ended_s: float = 0.0
     failures: list[str] = field(default_factory=list)

@@ -127,11 +127,13 @@ class Shutdown:
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
             if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+                self._outcome.has_drained = True
                 self._stop()
             elif now_s >= self._deadline_s:
                 why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
                 self._output.log("WARN", f"not drained in time: {why}")
                 self._outcome.late_drain = why
+                self._outcome.has_drained = True
                 self._stop()
 
     def _look_at_stopping(self, now_s: float) -> None:

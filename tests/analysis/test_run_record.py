@@ -28,16 +28,22 @@ def report(name: str, *, is_final: bool) -> Report:
 
 
 @pytest.mark.parametrize(
-    ("final", "lost"), [({"clock", "display"}, 2), ({"display"}, None), ({"clock"}, None)]
+    ("final", "has_drained", "lost", "in_flight"),
+    [
+        ({"clock", "display"}, True, 2, 0),
+        ({"clock", "display"}, False, 0, 2),
+        ({"display"}, True, None, None),
+        ({"clock"}, False, None, None),
+    ],
 )
 def test_nobody_knows_what_was_lost_once_a_node_was_killed(
-    final: set[str], lost: int | None, tmp_path: Path
+    final: set[str], has_drained: bool, lost: int | None, in_flight: int | None, tmp_path: Path
 ) -> None:
     project = load_project(PROJECT, workspace=tmp_path).project
-    ended = Outcome(exit_code=1, reason="killed", ended_s=2.0)
+    ended = Outcome(exit_code=1, reason="killed", ended_s=2.0, has_drained=has_drained)
     ended.reports = {name: report(name, is_final=name in final) for name in ROWS}
     ended.report_times_s = dict.fromkeys(ROWS, 1.5)
     files = split(project, lambda _: Folders(tmp_path, tmp_path, tmp_path))
     (connection,) = run_record(project, files, ended, 1.0, tmp_path)["connections"]
     assert (connection["sent"], connection["received"]) == (7, 5)
-    assert connection["lost"] == lost
+    assert (connection["lost"], connection["in_flight"]) == (lost, in_flight)

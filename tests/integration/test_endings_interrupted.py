@@ -124,6 +124,35 @@ def _waits_with_ctrl_c(pid: int) -> bool:
     return bool(int(mask, 16) >> (signal.SIGINT - 1) & 1)
 
 
+OUTLASTS_B = """
+@neuros_tick(seconds=0.1, outputs=["o", "p"])
+def send(node):
+    node.get_logger().info("running")
+    saved, deadline_s = node.run_dir.parent / "b" / "saved", time.monotonic() + 4.0
+    while not saved.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    return node.make_packet("o"), node.make_packet("p")
+"""
+
+
+def test_what_is_sent_to_a_node_that_has_stopped_is_in_flight_and_not_lost(tmp_path: Path) -> None:
+    with made_bench(tmp_path, "process") as bench:
+        wires = ("a.o -> b.x", ("a.p -> b.y", None))
+        bench.project(*wires, a=OUTLASTS_B, b=SINK + SINK.replace("x", "y"))
+        running = bench.start()
+        running.wait_for("[a]: running")
+        running.signal(signal.SIGINT)
+        finished = running.finish(GONE_WITHIN_S)
+    assert_ended(finished, 130, "ended by Ctrl\\+C")
+    counts = ("sent", "received", "in_flight", "lost")
+    lossless, best_effort = (
+        [each[count] for count in counts] for each in finished.record["connections"]
+    )
+    assert lossless == [1, 0, 1, 0]
+    assert best_effort == [1, 0, 0, 1], "nobody can tell"
+    assert "in flight" in finished.output
+
+
 def test_a_second_ctrl_c_kills_at_once(bench: Bench) -> None:
     bench.project(a=RUNS + "@neuros_finalise()\ndef dawdle(node):\n    time.sleep(30)\n")
     running = bench.start()

@@ -27,6 +27,7 @@ from neuros.control import (
     Watch,
 )
 from neuros.control.link import ControlLink
+from neuros.engine.metrics import in_flight_and_lost
 from neuros.engine.time_budget import time_budget_of
 from neuros.errors import ControlError
 from neuros.viewers.dashboard.pages import Pages, data_url
@@ -209,6 +210,7 @@ class LiveMetrics:
         reports: Mapping[str, Report],
         running_s: float | None,
         real_time_factor: float | None,
+        has_drained: bool,
     ) -> None:
         """The run is over: counts are final, and rates and shares are those of the whole run.
 
@@ -216,6 +218,7 @@ class LiveMetrics:
             reports: the last one of each node that has made one.
             running_s: how long all nodes ran.
             real_time_factor: of that time.
+            has_drained: whether packets in flight were waited for.
         """
         self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
         ends: dict[str, dict[str, int]] = {}
@@ -234,12 +237,16 @@ class LiveMetrics:
                     ends.setdefault(connection, {}).update(counters)
         for connection, shown in self.connections.items():
             count, final = shown.get("sent", shown.get("received")), ends.get(connection, {})
-            is_known = {"sent", "received"} <= {*final}
+            lost = None
+            if {"sent", "received"} <= {*final}:
+                _, lost = in_flight_and_lost(
+                    final["sent"], final["received"], bool(final["is_reliable"]), has_drained
+                )
             shown |= {
                 "is_blocked": False,
                 "latency_ms": None,
                 "rate_hz": count / running_s if count is not None and running_s else None,
-                "lost": final["sent"] - final["received"] if is_known else None,
+                "lost": lost,
             }
         self._ended_factor = real_time_factor
 
@@ -392,8 +399,8 @@ class LiveRun:
                 self._pages.send("phase", self.phase)
             case LogRecord(severity, text):
                 self._pages.send("log", [f"[{severity}] [neuros] {text}"])
-            case Ended(exit_code, reason, reports, running_s, real_time_factor):
-                self._metrics.end(reports, running_s, real_time_factor)
+            case Ended(exit_code, reason, reports, running_s, real_time_factor, has_drained):
+                self._metrics.end(reports, running_s, real_time_factor, has_drained)
                 self._show()
                 self.phase = {"phase": "ended", "is_paused": False}
                 self.phase |= {"exit_code": exit_code, "reason": reason}

@@ -157,7 +157,11 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     figures.take(node_status("b", 1.0, incoming=incoming(1)))
     nothing = dict.fromkeys(STATES, 0.0) | {"executing": {}, "waiting": {}, "blocked": {}}
     ends = {
-        "a": ({LINK: {"sent": 8, "outstanding": 0}}, {}, {"executing": {"f": 1.0}, "idle": 3.0}),
+        "a": (
+            {LINK: {"sent": 8, "outstanding": 0, "is_reliable": True}},
+            {},
+            {"executing": {"f": 1.0}, "idle": 3.0},
+        ),
         "b": ({}, {LINK: {"received": 6, "discarded": 2, "unread": 0}}, {"waiting": {"x": 4.0}}),
     }
     metrics: dict[str, Any] = {
@@ -172,7 +176,7 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     reports = {
         name: Report(node=name, metrics=each, is_final=True) for name, each in metrics.items()
     }
-    figures.end(reports, 4.0, 0.25)
+    figures.end(reports, 4.0, 0.25, has_drained=True)
     assert {node["state"] for node in figures.nodes.values()} == {"ended"}
     assert figures.nodes["a"]["shares"] == pytest.approx(
         {"executing": 0.25, "waiting": 0, "blocked": 0, "idle": 0.75}
@@ -186,6 +190,9 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     )
     assert (shown["rate_hz"], figures.real_time_factor) == (2.0, 0.25)
 
+    figures.end(reports, 4.0, 0.25, has_drained=False)
+    assert figures.connections[LINK]["lost"] == 0, "they are in flight"
+
     reports["b"] = replace(reports["b"], is_final=False)
-    figures.end(reports, 4.0, 0.25)
+    figures.end(reports, 4.0, 0.25, has_drained=True)
     assert figures.connections[LINK]["lost"] is None
