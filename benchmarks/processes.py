@@ -14,7 +14,7 @@ from typing import IO
 from benchmarks.machine import ROOT
 from benchmarks.measure import Unavailable
 from neuros.backends.domain import choose_domain
-from neuros.backends.placement import children_on, usable_cores
+from neuros.backends.node_command import children_on, usable_cores
 
 END_S = 5.0
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.ports import BackEnd, SimulatorKind, TransportKind
 from neuros.project.suggest import did_you_mean
 
 Part = TypeVar("Part")
@@ -121,3 +122,11 @@ class Registry(Generic[Part]):
                 )
             found[each.name] = Entry(each.value, distribution)
         return found
+
+
+AUTO = "auto"
+"""In place of the name of a back end: the best one that can be used."""
+
+BACK_ENDS: Registry[BackEnd] = Registry("neuros.backends", "back end", BackEnd, further=[AUTO])
+TRANSPORTS: Registry[TransportKind] = Registry("neuros.transports", "transport", TransportKind)
+SIMULATORS: Registry[SimulatorKind] = Registry("neuros.simulators", "simulator", SimulatorKind)

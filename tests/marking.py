@@ -53,7 +53,7 @@ BY_NAME = {
     "process": (
         "messages/test_stubs.py",
         "recording/test_provenance.py",
-        "backends/environments/test_container_pythons.py",
+        "backends/test_container_pythons.py",
         "backends/test_charliecloud_back_end.py",
         "backends/test_placement.py",
         "backends/test_reaper.py",

@@ -22,7 +22,7 @@ from PIL import Image, ImageChops
 from viewers.dashboard.browser import browser_page
 from viewers.dashboard.visitor import address
 
-from neuros.backends.environments.pythons import find_python
+from neuros.backends.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
 from neuros.installation.packages import find_uv, run_installs
 from neuros.installation.progress import Progress
@@ -35,7 +35,7 @@ IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 
 FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
 PYTHONS = [(3, minor) for minor in range(10, NEWEST_FOR_NEST[1] + 1)]
 _DIGESTS = """
-from neuros.backends.docker.recipes import OWN_FOLDER, find_recipe, names_in
+from neuros.backends.containers import OWN_FOLDER, find_recipe, names_in
 print({name: find_recipe(name).digest for name in names_in(OWN_FOLDER)})
 """
 

@@ -9,14 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.executors.registered import EXECUTORS
+from neuros.executors.executor import EXECUTORS
 from neuros.ports import BackEnd
-from neuros.registry import OWN
-from neuros.simulators.registered import SIMULATORS
-from neuros.transport.registered import TRANSPORTS
-from neuros.viewers.registered import VIEWERS
+from neuros.registry import BACK_ENDS, OWN, SIMULATORS, TRANSPORTS
+from neuros.viewers.viewer import VIEWERS
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / "neuros").rglob("*.py"))
@@ -47,8 +44,8 @@ def test_our_parts_are_found_without_any_installation() -> None:
     """As in a container, and in a checkout that was updated and not installed again."""
     program = (
         "import sys; sys.path.insert(0, '.')\n"
-        "import neuros.backends.registered as back_ends\n"
-        "back_ends.BACK_ENDS.load('docker')\n"
+        "import neuros.registry as registry\n"
+        "registry.BACK_ENDS.load('docker')\n"
         "assert not {'importlib.metadata', 'docker'} & {*sys.modules}"
     )
     done = subprocess.run([sys.executable, "-IS", "-c", program], cwd=ROOT, check=False)

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from neuros.analysis import charts
 from neuros.analysis.findings import Findings
 from neuros.analysis.run_record import PastRun
-from neuros.backends.registered import back_end_of
+from neuros.backends.choice import back_end_of
 from neuros.bag import RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG

@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.backends.registered import ran_in_one_process
+from neuros.backends.choice import ran_in_one_process
 from neuros.engine.metrics import in_flight_and_lost
 from neuros.engine.time_budget import TimeBudget, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError

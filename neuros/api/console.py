@@ -9,8 +9,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TextIO
 
-from neuros.backends.console import LAYOUT, LogTail, NonBlockingWriter, format_record, wants_colours
-from neuros.backends.progress import Progress
+from neuros.backends.console import (
+    LAYOUT,
+    LogTail,
+    NonBlockingWriter,
+    Progress,
+    format_record,
+    wants_colours,
+)
 
 _REDRAW_S = 0.5
 _PLAIN_S = 10.0

@@ -17,10 +17,10 @@ from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.recording import Recording, log_of, recording_of, summary
 from neuros.api.run_folder import make_run_folder, write_node_files
+from neuros.backends.console import Progress
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
-from neuros.backends.progress import Progress
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import Session, reaper_environment, this_process
 from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
@@ -31,7 +31,7 @@ from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
-from neuros.viewers.registered import Shown
+from neuros.viewers.viewer import Shown
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)

@@ -33,9 +33,8 @@ import yaml
 from neuros.api.part import parts_to_json
 from neuros.api.request import ExportOptions
 from neuros.api.slurm_script import script_of
-from neuros.backends.containers import bare_name
-from neuros.backends.docker.recipes import files_of, find_recipe
-from neuros.backends.placement import THREAD_VARIABLES
+from neuros.backends.containers import bare_name, files_of, find_recipe
+from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
 from neuros.errors import UsageError
 from neuros.options import options_of

@@ -15,8 +15,8 @@ from typing import Any
 
 from neuros.api.plan import Network, Plan, check_machine, chosen_network
 from neuros.api.request import Request
+from neuros.backends.choice import Chosen
 from neuros.backends.process_launchers import PROCESS
-from neuros.backends.registered import Chosen
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, NodeFile, Project
 from neuros.project.names import Names

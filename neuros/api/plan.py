@@ -13,11 +13,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.request import Request
-from neuros.backends.environments.pythons import Pythons, require_one_python
-from neuros.backends.node_command import without_mark
-from neuros.backends.placement import place, usable_cores
+from neuros.backends.choice import Chosen, choose
+from neuros.backends.node_command import place, usable_cores, without_mark
+from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
-from neuros.backends.registered import AUTO, Chosen, choose
 from neuros.backends.run_processes import RUN_ID
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
@@ -30,6 +29,7 @@ from neuros.project.names import SESSION
 from neuros.project.scanner import display_name, place_of
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
+from neuros.registry import AUTO
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,

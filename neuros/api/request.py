@@ -26,19 +26,19 @@ _RECORDING = "recording: NAME is a topic, an output (node.output) or a connectio
 
 
 def _back_ends() -> Iterable[str]:
-    from neuros.backends.registered import AUTO, BACK_ENDS
+    from neuros.registry import AUTO, BACK_ENDS
 
     return [AUTO, *BACK_ENDS]
 
 
 def _viewers() -> Iterable[str]:
-    from neuros.viewers.registered import VIEWERS
+    from neuros.viewers.viewer import VIEWERS
 
     return VIEWERS
 
 
 def _executors() -> Iterable[str]:
-    from neuros.executors.registered import EXECUTORS
+    from neuros.executors.executor import EXECUTORS
 
     return EXECUTORS
 

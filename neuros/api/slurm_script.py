@@ -12,7 +12,7 @@ from pathlib import Path
 
 from neuros.api.request import ExportOptions
 from neuros.errors import UsageError
-from neuros.executors.registered import JobResources
+from neuros.executors.executor import JobResources
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Project
 from neuros.project.suggest import did_you_mean

@@ -33,7 +33,7 @@ from neuros.api.sweep_job import (
 )
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
-from neuros.executors.registered import JobResources, Jobs, SweepPlan, open_executor
+from neuros.executors.executor import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
 from neuros.recording.run_file import RUN_FILE
 

@@ -15,8 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.plan import make_environments
-from neuros.backends.environments.pythons import Pythons
 from neuros.backends.node_command import signal_in_words, without_mark
+from neuros.backends.pythons import Pythons
 from neuros.errors import Problem
 from neuros.messages.needed import Messages
 from neuros.project.model import Node, Project

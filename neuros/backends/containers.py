@@ -1,14 +1,22 @@
-"""Finds the folder that describes a container, beside the project file or in NeuROS."""
+"""Folders of containers, beside the project file or in NeuROS, and the recipes of images in them.
+
+A recipe is a folder ``containers/<name>`` with a ``Dockerfile``, or with a ``requirements.txt``
+only. The project's own, beside its project file, come before NeuROS's. Nothing here asks an engine.
+"""
 
 from __future__ import annotations
 
 import difflib
+import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
+from neuros.backends.docker.dockerfile import images_in
 from neuros.distribution import CONTAINERS
+from neuros.errors import EnvironmentFault
 
 FOLDER = "containers"
 OWN_FOLDER = CONTAINERS
@@ -16,6 +24,21 @@ OWN_FOLDER = CONTAINERS
 
 STANDARD = ("neuros_python", "neuros_mujoco", "neuros_nest")
 """Those that the examples need."""
+
+BASE = "neuros_python"
+"""The recipe that makes an image with Python one that runs nodes."""
+
+BASE_ARGUMENT = "BASE_IMAGE"
+
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+_FROM_REQUIREMENTS = f"""\
+ARG {BASE_ARGUMENT}={BASE}
+FROM ${{{BASE_ARGUMENT}}}
+USER 0
+COPY requirements.txt /tmp/requirements.txt
+RUN /opt/neuros/bin/pip install --no-cache-dir -r /tmp/requirements.txt
+USER 1000:1000
+"""
 
 _SLIP = 0.9
 """Similarity (difflib) of ``neuros_pyton`` and ``neuros_python``; of unlike names it is less."""
@@ -72,3 +95,137 @@ def misspelt(container: str, project: Path, own: Path = OWN_FOLDER) -> str:
         return ""
     known = [each.name for place in (project / FOLDER, own) for each in place.glob("*/")]
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SLIP)), "")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A folder from which an image can be built.
+
+    Attributes:
+        name: of the container.
+        folder: with the ``Dockerfile``, ``requirements.txt``, and what else goes into the image.
+        dockerfile: its text; made up where there is a ``requirements.txt`` only.
+        parents: the recipes among the images that it begins from.
+        digest: changes whenever a file of it changes, or one of a parent.
+    """
+
+    name: str
+    folder: Path
+    dockerfile: str
+    parents: tuple[Recipe, ...]
+    digest: str
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is one of NeuROS's."""
+        return self.folder.parent == OWN_FOLDER
+
+    def takes(self, base: str) -> bool:
+        """Whether it begins from ``base`` if that is its ``BASE_IMAGE``."""
+        return base in images_in(self.dockerfile, {BASE_ARGUMENT: base})
+
+    def parents_on(self, base: str | None) -> list[Recipe]:
+        """The parents that are left where ``base`` replaces the default of ``BASE_IMAGE``."""
+        if base is None:
+            return list(self.parents)
+        names = {bare_name(name) for name in images_in(self.dockerfile, {BASE_ARGUMENT: base})}
+        return [parent for parent in self.parents if parent.name in names]
+
+    @property
+    def tags(self) -> list[str]:
+        """The names of its image; NeuROS's own are the ``latest``, too, for use by hand."""
+        own = [f"{self.name}:latest"] if self.is_own else []
+        return [f"{self.name}:{self.digest[:12]}", *own]
+
+    def __str__(self) -> str:
+        return str(self.folder)
+
+
+def find_recipe(
+    container: str, project_folder: Path | None = None, own_folder: Path = OWN_FOLDER
+) -> Recipe | None:
+    """The recipe of a container, with its parents; ``None`` where it can only be an image.
+
+    Raises:
+        EnvironmentFault: for a folder that holds none, or recipes that go round in a circle.
+    """
+    places = [own_folder] if project_folder is None else [project_folder / FOLDER, own_folder]
+    return _find(bare_name(container), places, ())
+
+
+def _find(name: str, places: list[Path], children: tuple[str, ...]) -> Recipe | None:
+    folder = folder_of(name, places)
+    if folder is None:
+        return None
+    if name in children:
+        raise EnvironmentFault(
+            f"{folder}: the images begin from each other: {' -> '.join([*children, name])}"
+        )
+    text = _dockerfile_of(folder)
+    parents = tuple(
+        parent
+        for image in images_in(text)
+        if (parent := _find(bare_name(image), places, (*children, name)))
+    )
+    # An image without rclpy gets what the base has, so the base is an ancestor of all.
+    base = _find(BASE, places[-1:], ()) if name != BASE and not parents else None
+    return Recipe(name, folder, text, parents, _digest(folder, text, [*parents, base]))
+
+
+def in_order(recipes: Iterable[Recipe], bases: Mapping[str, str] = _NOTHING) -> list[Recipe]:
+    """The recipes and all their parents, each once, parents first.
+
+    ``bases`` are images by container name: what the user wants instead of the Dockerfile's.
+    """
+    found: dict[Path, Recipe] = {}
+
+    def add(recipe: Recipe) -> None:
+        for parent in recipe.parents_on(bases.get(recipe.name)):
+            add(parent)
+        found.setdefault(recipe.folder, recipe)
+
+    for recipe in recipes:
+        add(recipe)
+    return list(found.values())
+
+
+def names_in(folder: Path) -> list[str]:
+    """The containers for which a folder ``containers`` has recipes."""
+    if not folder.is_dir():
+        return []
+    return sorted(
+        each.name
+        for each in folder.iterdir()
+        if any((each / file).is_file() for file in ("Dockerfile", "requirements.txt"))
+    )
+
+
+def _dockerfile_of(folder: Path) -> str:
+    try:
+        return (folder / "Dockerfile").read_text("utf-8")
+    except FileNotFoundError:
+        if (folder / "requirements.txt").is_file():
+            return _FROM_REQUIREMENTS
+        raise EnvironmentFault(
+            f"{folder}: there is neither a Dockerfile nor a requirements.txt in it"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise EnvironmentFault(f"{folder}/Dockerfile cannot be read: {error}") from error
+
+
+def _digest(folder: Path, dockerfile: str, parents: Iterable[Recipe | None]) -> str:
+    """Of names, contents and rights to execute: what the engine gets of a folder."""
+    whole = hashlib.sha256(dockerfile.encode())
+    for file in files_of(folder):
+        whole.update(f"\0{file.relative_to(folder)}\0{file.stat().st_mode & 0o111}\0".encode())
+        whole.update(hashlib.sha256(file.read_bytes()).digest())
+    for parent in parents:
+        whole.update(parent.digest.encode() if parent else b"")
+    return whole.hexdigest()
+
+
+def files_of(folder: Path) -> Iterator[Path]:
+    """The files that go to the engine, in a fixed order."""
+    for file in sorted(folder.rglob("*")):
+        if file.is_file() and "__pycache__" not in file.parts:
+            yield file

@@ -1,10 +1,13 @@
-"""Command line, environment and scripts of a node process, with the ROS wheel environment.
+"""Command line, environment, scripts and cores of a node process, with the ROS wheel environment.
 
 The ROS wheels from PyPI install a ``.pth`` file: each Python of their environment looks for their
 libraries and restarts itself once, with ``LD_LIBRARY_PATH`` and a mark in the environment. Two
 things follow. A child that runs another environment's Python must not inherit the mark: it would
 find no libraries. And a child that runs this Python can be given both, so that it need not start
 twice.
+
+A node with ``affinity`` has the cores that it names; the kernel places all others. A rule that gave
+each node a core of its own was measured and dropped: ``docs/placement.md`` has the figures.
 """
 
 from __future__ import annotations
@@ -15,21 +18,29 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.backends.placement import THREAD_VARIABLES, Cores, on_cores, thread_limits
 from neuros.ports import NodeProgram
-from neuros.project.model import NodeFile
+from neuros.project.model import Node, NodeFile
+
+Cores = tuple[int, ...]
+"""Numbers of cores, ascending."""
+
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+"""How many threads the usual numerical libraries start."""
 
 # One thread each: more threads than free cores make numerical libraries slower, not faster, and
 # simulators differ in the last bit with their number.
-DEFAULTS = {
-    "PYTHONUNBUFFERED": "1",
-    **dict.fromkeys(THREAD_VARIABLES, "1"),
-}
+DEFAULTS = {"PYTHONUNBUFFERED": "1", **dict.fromkeys(THREAD_VARIABLES, "1")}
 # Runs the scripts one after another, each with the log of its node for output, by themselves where
 # they may be executed (seen from where they run, which may be a container); the shell passes
 # SIGTERM on to them, and a script that fails ends it. ``exec`` then makes the node process of it:
@@ -264,3 +275,47 @@ def _paths(text: str) -> list[str]:
 def _is_ours(path: str) -> bool:
     prefixes = (str(Path(sys.prefix)), os.path.realpath(sys.prefix))
     return any(path == inside or path.startswith(f"{inside}{os.sep}") for inside in prefixes)
+
+
+def place(nodes: Sequence[Node]) -> Mapping[str, Cores]:
+    """The cores of each node with ``affinity``, by name; also those that this machine lacks."""
+    return {node.name: tuple(sorted(node.affinity)) for node in nodes if node.affinity}
+
+
+def thread_limits(nodes: Sequence[Node]) -> dict[str, str]:
+    """The environment that keeps numerical libraries to the cores that nodes have asked for.
+
+    Nodes of one process run one at a time: what the widest of them asked for is enough.
+    """
+    count = max((len(node.affinity) for node in nodes), default=0)
+    return dict.fromkeys(THREAD_VARIABLES, str(count)) if count else {}
+
+
+def on_cores(cores: Cores | None) -> str:
+    """The cores of a node in words, empty where the kernel chooses."""
+    if not cores:
+        return ""
+    return f" on core{'s' if len(cores) > 1 else ''} {', '.join(map(str, cores))}"
+
+
+def usable_cores() -> frozenset[int]:
+    """The cores that this process may use: ``taskset`` and control groups are respected."""
+    return frozenset(os.sched_getaffinity(0))
+
+
+@contextlib.contextmanager
+def children_on(cores: Collection[int]) -> Iterator[None]:
+    """Processes that this thread starts inside get these cores, and so do all their threads.
+
+    The mask is there before the first instruction of the child: scripts, imports and the threads
+    of DDS have it, too. Without any nothing changes. Raises ``OSError`` for one that is not there.
+    """
+    if not cores:
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)

@@ -17,12 +17,12 @@ from typing import Any
 from neuros.backends.node_command import (
     PROCESS_LOG,
     NodeProcess,
+    children_on,
     common_process,
     node_process,
     script_failure,
     signal_in_words,
 )
-from neuros.backends.placement import children_on
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project

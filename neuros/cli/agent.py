@@ -24,11 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
-from neuros.backends.environments.pythons import Pythons
-from neuros.backends.machines.mirror import Follower
+from neuros.backends.machines.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import RECEIVED, RUNS, TreeStore, tree_cache
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
+from neuros.backends.pythons import Pythons
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
 from neuros.backends.sessions import Session, reaper_environment, this_process

@@ -13,7 +13,7 @@ from types import FrameType
 
 from neuros.api.loading import workspaces_of
 from neuros.api.plan import are_made, make_environments
-from neuros.backends.environments.pythons import Pythons
+from neuros.backends.pythons import Pythons
 from neuros.errors import UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import message_cache

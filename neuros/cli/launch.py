@@ -21,17 +21,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request, SweepOptions
-from neuros.backends.registered import AUTO, BACK_ENDS
 from neuros.cli import EXIT_CODES
 from neuros.cli.output import JSON, add_format, print_json
 from neuros.cli.projects import add_project, load_with_messages
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
+from neuros.registry import AUTO, BACK_ENDS
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
     from neuros.ports import BackEnd
-    from neuros.viewers.registered import Views
+    from neuros.viewers.viewer import Views
 
 EXIT_FAILED = 1
 SUBJECTS = {"--node-graph": "graph", "--visualisations": "packets"}
@@ -174,7 +174,7 @@ def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
         names.append("dashboard")
     if not (names or subjects):
         return None
-    from neuros.viewers.registered import Views
+    from neuros.viewers.viewer import Views
 
     return Views(back_end, names, subjects, options.dashboard_port)
 

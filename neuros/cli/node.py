@@ -25,7 +25,7 @@ from neuros.ports import ControlListener, Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
-from neuros.transport.registered import TRANSPORTS
+from neuros.registry import TRANSPORTS
 
 _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
 _STANDARD = (0, 1, 2)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros.project.model import NodeFile
-    from neuros.replay.node import ReplayedNode
+    from neuros.replay.replayed_node import ReplayedNode
 
 
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
@@ -175,7 +175,7 @@ def _replay_node(options: argparse.Namespace) -> int:
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.workspace import message_cache
-    from neuros.replay.containers import as_on_this_machine
+    from neuros.replay.from_container import as_on_this_machine
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
     file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
@@ -203,10 +203,10 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
     Raises:
         EnvironmentFault: if it cannot be made.
     """
-    from neuros.backends.environments.pythons import Pythons
-    from neuros.backends.registered import ran_in_one_process
+    from neuros.backends.choice import ran_in_one_process
+    from neuros.backends.pythons import Pythons
     from neuros.cli.environments import make_shown_environments
-    from neuros.replay.containers import not_here, ran_in_container
+    from neuros.replay.from_container import not_here, ran_in_container
 
     own = [] if ran_in_one_process(run.record) else [file.node]
     try:
@@ -223,9 +223,8 @@ def _replayed(options: argparse.Namespace) -> int:
     from neuros.analysis.run_record import open_run
     from neuros.project.split import node_file_from_json
     from neuros.recording.provenance import python_versions
-    from neuros.replay.containers import note_on_versions, ran_in_container
-    from neuros.replay.debugging import debugpy_on
-    from neuros.replay.node import ReplayedNode, files_changed_since
+    from neuros.replay.from_container import note_on_versions, ran_in_container
+    from neuros.replay.replayed_node import ReplayedNode, debugpy_on, files_changed_since
 
     faulthandler.enable()
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
@@ -247,7 +246,7 @@ def _replayed(options: argparse.Namespace) -> int:
 
 def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
     """Replay it; returns whether the user has left a debugger."""
-    from neuros.replay.debugging import Debugger, is_quit
+    from neuros.replay.replayed_node import Debugger, is_quit
 
     debugger = Debugger() if use_pdb else None
 
@@ -271,7 +270,7 @@ def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
 
 
 def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> int:
-    from neuros.replay.containers import missing_module, not_here, ran_in_container
+    from neuros.replay.from_container import missing_module, not_here, ran_in_container
 
     compared = node.comparison
     count = f"{_count(compared.packets, 'packet')} on {_count(compared.connections, 'connection')}"

@@ -16,7 +16,7 @@ from neuros.cli.output import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:
-    from neuros.backends.docker.recipes import Recipe
+    from neuros.backends.containers import Recipe
 
 _CONTAINERS_EPILOG = """\
 exit codes:
@@ -141,8 +141,8 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _build_images(options: argparse.Namespace) -> int:
+    from neuros.backends.docker.builders import served, surroundings
     from neuros.backends.docker.building import ImageBuilder, Wishes
-    from neuros.backends.docker.context import served, surroundings
     from neuros.backends.docker.engine import connect
     from neuros.installation.progress import Progress
 
@@ -174,9 +174,9 @@ def _build_images(options: argparse.Namespace) -> int:
 
 
 def _list_images(options: argparse.Namespace) -> int:
+    from neuros.backends.containers import names_in
     from neuros.backends.docker.engine import connect
     from neuros.backends.docker.images import inventory
-    from neuros.backends.docker.recipes import names_in
 
     with closing(connect()) as engine:
         images = inventory(engine)
@@ -211,7 +211,7 @@ def _remove_images(options: argparse.Namespace) -> int:
 
 def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
     """The recipes, and the images without one, that are behind names, folders and projects."""
-    from neuros.backends.docker.recipes import find_recipe
+    from neuros.backends.containers import find_recipe
 
     recipes: list[Recipe] = []
     images: list[str] = []
@@ -228,7 +228,7 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 def _containers(name: str) -> list[tuple[str, Path | None]]:
     """What a name stands for: containers, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
-    from neuros.backends.docker.recipes import names_in
+    from neuros.backends.containers import names_in
     from neuros.distribution import WORKSPACE
     from neuros.project.load import load_project
 

@@ -16,21 +16,22 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.loading import load_with_messages
+from neuros.backends.choice import option_values
 from neuros.backends.domain import choose_domain
 from neuros.backends.machines.deployment import Machines
-from neuros.backends.placement import usable_cores
-from neuros.backends.registered import BACK_ENDS, option_values
+from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.installation.machine import Machine
-from neuros.ports import Finding, State
+from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
+from neuros.ports import Finding, SimulatorKind, State
 from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
-from neuros.registry import Part, Registry
-from neuros.simulators.registered import SIMULATORS, installed
+from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry
 
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")
@@ -38,6 +39,7 @@ _LEAST_SHARED_BYTES = 64 * 2**20
 """What Docker gives a container, too, if it is not asked for more."""
 _GPU_TIMEOUT_S = 10.0
 _DELIVERY_TIMEOUT_S = 60.0
+_RENDERING_TIMEOUT_S = 60.0
 
 
 def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
@@ -183,6 +185,60 @@ def _gpu() -> Finding:
     except (OSError, subprocess.SubprocessError) as error:
         return Finding.bad("GPU", f"nvidia-smi fails ({error})", "mend the driver")
     return Finding.good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))
+
+
+class _MuJoCo(SimulatorKind):
+    name = "mujoco"
+
+    def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
+        yield installed("MuJoCo", "mujoco", install_command("mujoco"))
+        yield prove_rendering(environ)
+
+
+class _Nest(SimulatorKind):
+    name = "nest"
+
+    def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
+        yield installed("NEST", "nest-simulator", install_command("nest"))
+
+
+MUJOCO = _MuJoCo()
+NEST = _Nest()
+
+
+def installed(subject: str, distribution: str, remedy: str) -> Finding:
+    """The version of a distribution; it is absent if it is not installed."""
+    try:
+        return Finding.good(subject, f"{distribution} {metadata.version(distribution)}")
+    except metadata.PackageNotFoundError:
+        return Finding.absent(subject, "not installed", remedy)
+
+
+def prove_rendering(environ: Mapping[str, str]) -> Finding:
+    """Render one picture with the OpenGL that simulated cameras would use."""
+    subject = "cameras"
+    if find_spec("mujoco") is None:
+        return Finding.absent(subject, "not tried without MuJoCo")
+    program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
+    command = [sys.executable, "-c", program]
+    try:
+        done = subprocess.run(
+            command,
+            env=dict(environ),
+            capture_output=True,
+            text=True,
+            timeout=_RENDERING_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Finding.bad(
+            subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl()
+        )
+    if done.returncode == 0:
+        return Finding.good(subject, f"a picture was rendered with {done.stdout.strip()}")
+    rows = done.stderr.strip().splitlines() or [f"rendering ends with {done.returncode}"]
+    is_expected = bool(environ.get("MUJOCO_GL") or offscreen_opengl())
+    return (Finding.bad if is_expected else Finding.absent)(subject, rows[-1])
 
 
 def prove_delivery(

@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from neuros.errors import EnvironmentFault
-from neuros.executors.registered import Job, Jobs, SweepExecutor, SweepPlan, not_installed
+from neuros.executors.executor import Job, Jobs, SweepExecutor, SweepPlan, not_installed
 
 FOLDER = ".slurm"
 """Logs, jobs and results, in the folder of the sweep."""

@@ -4,35 +4,30 @@ A probe is a report that a node makes between two events. Probes of different no
 the same instant, so one round of them can miss a packet that is under way; two rounds with the same
 counters cannot (F. Mattern, "Algorithms for distributed termination detection", 1987).
 
-:class:`Settling` finds out when nothing moves any more in a run that is paused: the end of a step
-of a session. Each node process answers when no event waits in it, and none starts anything unasked.
-They answer at different instants, but with counters by connection one round is enough: if something
-still moved, then some process was the first to receive a packet after its answer. That was sent
-before the answer of its sender, so the counters of this connection would differ (Mattern's channel
-counting).
+A loop in which every hook waits for the one before it never comes to rest by itself, so a drained
+end has to stop it after one more round. Which hooks these are follows from the declarations of
+plugins: :func:`last_round`. Of a node that had to be killed, they tell which finalise hooks did not
+run.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeAlias
+from typing import Any
 
 from neuros.control import (
-    AtRest,
+    HookDeclaration,
+    Hooks,
     Message,
-    NewestPacket,
-    Pause,
     Probe,
     Probed,
     ReceivedCounts,
     SentCounts,
-    Settle,
-    Settled,
 )
-from neuros.control.link import ControlLink
-from neuros.launcher.channels import Channels
+from neuros.hooks import HookKind, InputSpec
 from neuros.launcher.peers import Peers
 from neuros.project.model import Connection, NodeFile
 
@@ -300,107 +295,175 @@ def _reliable(
             )
 
 
-_FIRST_LOOK_S = 0.0005
-_RAREST_LOOK_S = 0.02
-_LOST_AFTER_S = 0.1
-"""On a connection that may lose packets, one that has not arrived for so long has been lost."""
-_NEVER_S = 3600.0
+@dataclass(frozen=True)
+class DeclaredHook(HookDeclaration):
+    """A hook as its plugin declares it; ``place`` is that among the hooks of its node's engine."""
 
-Counts: TypeAlias = Mapping[str, tuple[int, int]]
-"""By connection, packets that have passed, and those acknowledged; -1: none ever are."""
-
-
-class Settling:
-    """Answers ``settle`` of a session: once all nodes have begun, and nothing moves.
-
-    Args:
-        names: the nodes, all of which have to answer.
-        clock: monotonic, seconds.
-    """
-
-    def __init__(
-        self,
-        names: Iterable[str],
-        channels: Channels,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._names = set(names)
-        self._channels = channels
-        self._clock = clock
-        self._asker: ControlLink | None = None
-        self._asked = Settle(0, {})
-        self._round = 0
-        self._pause_s = 0.0
-        self._due_s: float | None = None
-        self._answers: dict[tuple[str, ...], AtRest] = {}
-        self._packets: dict[str, NewestPacket] = {}
-        self._last: tuple[Counts, Counts] | None = None
-        self._last_s = 0.0
+    node: str = ""
+    place: int = 0
 
     @property
-    def wait_s(self) -> float:
-        """Seconds until :meth:`look` has something to do."""
-        return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
+    def required(self) -> list[InputSpec]:
+        """The inputs without which it does not start."""
+        return [port for port in self.inputs if not port.is_optional]
 
-    def ask(self, asker: ControlLink, message: Settle) -> None:
-        """Find out from now on, and answer this one; what was asked before is answered no more."""
-        self._asker, self._asked = asker, message
-        self._packets.clear()
-        self._pause_s, self._last = 0.0, None
-        self._begin_round()
+    @property
+    def may_go_on(self) -> bool:
+        """Whether it starts while its project drains."""
+        return self.kind is HookKind.FUNCTION and bool(self.required or not self.outputs)
 
-    def take(self, answer: AtRest) -> None:
-        """Take an answer of a process, perhaps to the last round."""
-        if answer.number != self._round or self._asker is None:
-            return
-        self._answers[answer.nodes] = answer
-        self._packets.update(answer.packets)
-        if {name for names in self._answers for name in names} == self._names:
-            self._judge(self._asker)
 
-    def look(self) -> None:
-        """Ask again where it is time."""
-        if self._due_s is not None and self._clock() >= self._due_s:
-            self._begin_round()
+class Declarations:
+    """The hooks of the nodes that have been loaded.
 
-    def _begin_round(self) -> None:
-        self._due_s = None
-        if not self._channels.greeted >= self._names:
-            self._ask_later()
-            return
-        self._round += 1
-        self._answers.clear()
-        known = {name: packet.number for name, packet in self._packets.items()}
-        self._channels.send(Settle(self._round, {**self._asked.known, **known}))
+    Args:
+        files: the nodes.
+    """
 
-    def _ask_later(self) -> None:
-        self._pause_s = min(max(2 * self._pause_s, _FIRST_LOOK_S), _RAREST_LOOK_S)
-        self._due_s = self._clock() + self._pause_s
+    def __init__(self, files: Sequence[NodeFile]) -> None:
+        self._connections = {connection for file in files for connection in file.connections}
+        self._external = {
+            (file.node.name, port.name)
+            for file in files
+            for port in file.node.inputs
+            if port.external_topic is not None
+        }
+        self._hooks: dict[str, list[DeclaredHook]] = {}
+        self._finalisers: dict[str, list[str]] = {}
+        self._finalising: dict[str, str | None] = {}
 
-    def _judge(self, asker: ControlLink) -> None:
-        answers = self._answers.values()
-        if not all(answer.has_begun for answer in answers) or self._is_under_way():
-            self._ask_later()
-        else:
-            self._answer(asker)
+    def take(self, message: Hooks) -> None:
+        """Take the declarations of a node."""
+        node = message.node
+        self._finalisers[node] = list(message.finalise)
+        self._hooks[node] = [
+            DeclaredHook(hook.kind, hook.inputs, hook.outputs, node, place)
+            for place, hook in enumerate(message.hooks)
+        ]
 
-    def _is_under_way(self) -> bool:
-        """Whether a packet or an acknowledgement is on its way, and not lost."""
-        sent = _joined(answer.sent for answer in self._answers.values())
-        received = _joined(answer.received for answer in self._answers.values())
-        different = [key for key in sent if sent[key] != received[key]]
-        if any(sent[key][1] >= 0 for key in different):
+    def note_finalising(self, node: str, hook: str | None) -> None:
+        """A node has started this finalise hook; ``""``: to close what it holds; ``None``: done."""
+        self._finalising[node] = hook
+        if hook and hook in self._finalisers.get(node, ()):
+            self._finalisers[node].remove(hook)
+
+    def is_finalising(self, node: str) -> bool:
+        """Whether a node has come as far as its finalise hooks."""
+        return node in self._finalising
+
+    def unfinished(self, node: str) -> list[str]:
+        """Clauses about the finalise hooks of a node that has not made its final report."""
+        clauses = []
+        hook = self._finalising.get(node)
+        if hook:
+            clauses.append(f"finalise hook '{hook}' of '{node}' did not finish")
+        elif hook is not None:
+            clauses.append(f"what '{node}' has registered with node.on_close did not end")
+        if names := self._finalisers.get(node):
+            hooks = " and ".join(f"'{name}'" for name in names)
+            noun = "hook" if len(names) == 1 else "hooks"
+            clauses.append(f"finalise {noun} {hooks} of '{node}' did not run")
+        return clauses
+
+    def last_round(self, stopped: str) -> dict[str, tuple[int, ...]]:
+        """By node, the places of the hooks that may start once more only, for the end to come.
+
+        ``stopped`` is the node that starts no further hook, empty if there is none.
+        """
+        hooks = [hook for hooks in self._hooks.values() for hook in hooks]
+        found: dict[str, list[int]] = {}
+        for hook in last_round(hooks, self._connections, self._external, stopped):
+            found.setdefault(hook.node, []).append(hook.place)
+        return {node: tuple(places) for node, places in found.items()}
+
+
+def last_round(
+    hooks: Collection[DeclaredHook],
+    connections: Collection[Connection],
+    external: Collection[tuple[str, str]] = (),
+    stopped: str = "",
+) -> list[DeclaredHook]:
+    """The hooks that have to be stopped for a draining project to come to its end.
+
+    Those that could go on for ever are the largest set of which each hook gets its required inputs
+    from others of the set (or from an external topic), and sends reliably to takers of the set
+    only: any other taker starves, and its sender blocks. A hook of the set has to be stopped if it
+    is in a ring of required inputs, or passes on what an external topic brings: the others only
+    work off what these send.
+
+    Args:
+        hooks: of all nodes that are known; others count as resting.
+        connections: with an end at one of these nodes.
+        external: the inputs that are bound to an external topic, as ``(node, input)``.
+        stopped: the node that starts no further hook.
+    """
+    known = {hook.node for hook in hooks}
+    endless = {hook for hook in hooks if hook.may_go_on and hook.node != stopped}
+
+    takers: dict[tuple[str, str], list[DeclaredHook]] = defaultdict(list)
+    origins: dict[tuple[str, str], list[DeclaredHook]] = defaultdict(list)
+    into: dict[tuple[str, str], list[Connection]] = defaultdict(list)
+    out_of: dict[tuple[str, str], list[Connection]] = defaultdict(list)
+    for hook in hooks:
+        for port in hook.inputs if hook.kind is not HookKind.INITIALISE else ():
+            takers[hook.node, port.name].append(hook)
+        for output in hook.outputs:
+            origins[hook.node, output].append(hook)
+    for connection in connections:
+        into[connection.destination_node, connection.destination_input].append(connection)
+        out_of[connection.source_node, connection.source_output].append(connection)
+
+    def senders(hook: DeclaredHook, port: InputSpec) -> list[list[DeclaredHook]]:
+        """For each connection of an input, the hooks of the set that send on it."""
+        return [
+            [each for each in origins[c.source_node, c.source_output] if each in endless]
+            for c in into[hook.node, port.name]
+        ]
+
+    def is_fed(hook: DeclaredHook, port: InputSpec) -> bool:
+        if (hook.node, port.name) in external:
             return True
-        if (sent, received) != self._last:
-            self._last, self._last_s = (sent, received), self._clock()
-        return bool(different) and self._clock() - self._last_s < _LOST_AFTER_S
+        found = senders(hook, port)
+        return bool(found) and (all(found) if port.is_all else any(found))
 
-    def _answer(self, asker: ControlLink) -> None:
-        self._asker = None
-        self._channels.send(Pause())  # takes back what hooks could not use of a step
-        times = {n: t for answer in self._answers.values() for n, t in answer.sim_times.items()}
-        self._channels.send_to(asker, Settled(self._asked.number, times, dict(self._packets)))
+    def is_free(hook: DeclaredHook) -> bool:
+        return all(
+            c.destination_node in known
+            and endless.issuperset(takers[c.destination_node, c.destination_input])
+            for output in hook.outputs
+            for c in out_of[hook.node, output]
+            if c.is_reliable
+        )
+
+    while ending := [
+        hook
+        for hook in endless
+        if not (all(is_fed(hook, port) for port in hook.required) and is_free(hook))
+    ]:
+        endless.difference_update(ending)
+    before = {
+        hook: {h for port in hook.required for some in senders(hook, port) for h in some}
+        for hook in endless
+    }
+    return sorted(
+        (
+            hook
+            for hook in endless
+            if _is_in_ring(hook, before)
+            or (hook.outputs and any((hook.node, port.name) in external for port in hook.required))
+        ),
+        key=lambda hook: (hook.node, hook.place),
+    )
 
 
-def _joined(parts: Iterable[Counts]) -> Counts:
-    return {key: counts for part in parts for key, counts in part.items()}
+def _is_in_ring(start: DeclaredHook, before: Mapping[DeclaredHook, set[DeclaredHook]]) -> bool:
+    """Whether a hook requires, through others, what it sends itself."""
+    seen: set[DeclaredHook] = set()
+    ahead = [start]
+    while ahead:
+        for hook in before[ahead.pop()] - seen:
+            if hook == start:
+                return True
+            seen.add(hook)
+            ahead.append(hook)
+    return False

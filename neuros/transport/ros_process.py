@@ -23,7 +23,7 @@ from rclpy.qos import (
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from neuros.ports import Transport
+from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.names import INTERNAL
 from neuros.transport.copying import RosPackets
@@ -283,3 +283,33 @@ def _qos(lease_s: float) -> QoSProfile:
         liveliness=QoSLivelinessPolicy.AUTOMATIC,
         liveliness_lease_duration=Duration(seconds=lease_s),
     )
+
+
+class _Rclpy(TransportKind):
+    """``ros``, between processes, and ``memory``, for nodes of one process."""
+
+    def __init__(self, name: str, *, in_memory: bool) -> None:
+        self.name = name
+        self._in_memory = in_memory
+
+    def middleware(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        digests: bool,
+        record: bool,
+        debug: bool,
+    ) -> RosProcess:
+        return RosProcess(
+            files,
+            on_failure,
+            in_memory=self._in_memory,
+            digests=digests,
+            record=record,
+            debug=debug,
+        )
+
+
+ROS = _Rclpy("ros", in_memory=False)
+MEMORY = _Rclpy("memory", in_memory=True)

@@ -22,7 +22,7 @@ from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
 from neuros.project.graph import guarantee
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
-from neuros.viewers.registered import Shown, Viewer
+from neuros.viewers.viewer import Shown, Viewer
 from neuros.viewers.windows import open_page
 
 HOST = "127.0.0.1"

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuros.backends.docker.tool import ToolContainer, find_tool_image
+from neuros.backends.docker.launcher import ToolContainer, find_tool_image
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Reaper
 from neuros.project.model import Project
-from neuros.viewers.registered import Shown, Viewer
+from neuros.viewers.viewer import Shown, Viewer
 
 RVIZ_FILE = "project.rviz"
 _END_S = 2.0

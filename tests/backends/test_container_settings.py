@@ -10,8 +10,15 @@ import pytest
 
 from neuros.backends.docker.images import Image
 from neuros.backends.docker.launcher import how_it_ended
-from neuros.backends.docker.layout import as_here, inside, outside
-from neuros.backends.docker.settings import DDS_SETTINGS, User, container_settings, user_for
+from neuros.backends.docker.settings import (
+    DDS_SETTINGS,
+    User,
+    as_here,
+    container_settings,
+    inside,
+    outside,
+    user_for,
+)
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
@@ -115,7 +122,7 @@ def test_gpus_and_devices_are_requested(gpus: tuple[str, ...], request_: dict[st
 def test_the_display_is_open_to_those_alone_that_ask_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.backends.docker.settings._X11", tmp_path)
+    monkeypatch.setattr("neuros.backends.docker.settings.X11", tmp_path)
     environ = {"DISPLAY": ":1", "NEUROS_GUI": "1"}
     user = User(1000, 1001, environ=environ, xauthority=Path("/home/me/.Xauthority"))
     closed = settings(node_file(), user)
@@ -131,7 +138,7 @@ def test_the_display_is_open_to_those_alone_that_ask_for_it(
 def test_a_display_over_the_network_comes_without_a_socket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.backends.docker.settings._X11", tmp_path / "none")
+    monkeypatch.setattr("neuros.backends.docker.settings.X11", tmp_path / "none")
     user = User(1000, 1001, environ={"DISPLAY": "localhost:10.0"})
     found = settings(node_file(access=Access(display=True)), user)
     assert found["environment"]["DISPLAY"] == "localhost:10.0"

@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from neuros.backends.docker.build_steps import BuildLog
-from neuros.backends.docker.context import CERTIFICATES, context_of, served, surroundings
-from neuros.backends.docker.python_in_image import PythonInImage, chosen
+from neuros.backends.docker.builders import CERTIFICATES, BuildLog, context_of, served, surroundings
+from neuros.backends.docker.images import PythonInImage, chosen
 from neuros.errors import EnvironmentFault
 
 

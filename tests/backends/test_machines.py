@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.control_sockets import UnixListener, connect
+from neuros.backends.machines.files import RECEIVED, RUNS, Follower, TreeStore, scan, write_chunk
 from neuros.backends.machines.machine import ClockOffset, agent_command
-from neuros.backends.machines.mirror import Follower, write_chunk
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import RECEIVED, RUNS, TreeStore, scan
 from neuros.cli.agent import Agent, remove_old_runs
 from neuros.control import LiveCounters, Message, NodeStatus, Report
 from neuros.control.link import encode

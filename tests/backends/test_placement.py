@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuros.backends.node_command import NodeProcess
-from neuros.backends.placement import (
+from neuros.backends.node_command import (
     THREAD_VARIABLES,
+    NodeProcess,
     children_on,
     place,
     thread_limits,

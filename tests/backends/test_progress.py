@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from neuros.backends.progress import Progress
+from neuros.backends.console import Progress
 from neuros.control import Report
 from neuros.launcher.outcome import Outcome
 

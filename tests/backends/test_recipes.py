@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from neuros.backends.containers import OWN_FOLDER, Recipe, find_recipe, in_order, names_in
 from neuros.backends.docker.dockerfile import (
     after_each_from,
     arguments_of,
@@ -15,7 +16,6 @@ from neuros.backends.docker.dockerfile import (
     needs_buildkit,
     on_images,
 )
-from neuros.backends.docker.recipes import OWN_FOLDER, Recipe, find_recipe, in_order, names_in
 from neuros.errors import EnvironmentFault
 
 

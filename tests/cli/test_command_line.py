@@ -15,7 +15,7 @@ import pytest
 from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
-from neuros.backends.registered import choose
+from neuros.backends.choice import choose
 from neuros.cli.launch import signals_noted
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError

@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 
 from neuros.backends.docker.back_end import look_at_containers
-from neuros.backends.registered import BACK_ENDS
 from neuros.doctor import checks
 from neuros.ports import Finding, State
-from neuros.simulators.registered import SIMULATORS
+from neuros.registry import BACK_ENDS, SIMULATORS
 
 
 def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from test_engine_projects import delays, projects, slow_and_fast, strict_plugin, strict_projects
 
 from neuros.hooks import All, HookSpec, Optional
-from neuros.launcher.declarations import Declarations
+from neuros.launcher.quiescence import Declarations
 from neuros.node.reports import declared
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 

@@ -17,8 +17,7 @@ from api_projects import dice
 import neuros
 from neuros.api.run import Run
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.executors.pools import _resources_for
-from neuros.executors.registered import JobResources, SweepPlan, open_executor
+from neuros.executors.executor import JobResources, SweepPlan, _resources_for, open_executor
 from neuros.executors.slurm import _parameters
 
 FACES = "nodes.thrower.environment.FACES"

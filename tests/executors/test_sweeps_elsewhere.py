@@ -192,7 +192,7 @@ def test_on_dask_workers_take_what_their_resources_allow(dask: str, tmp_path: Pa
 def test_a_dask_scheduler_that_is_not_there_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.executors.pools._ANSWER_S", 0.5)
+    monkeypatch.setattr("neuros.executors.executor._ANSWER_S", 0.5)
     with pytest.raises(EnvironmentFault, match="no Dask scheduler answers at tcp:"):
         neuros.sweep(dice(tmp_path), executor="dask=tcp://127.0.0.1:9", output=tmp_path / "table")
 

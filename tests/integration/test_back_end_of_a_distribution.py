@@ -127,7 +127,7 @@ def test_a_name_that_two_distributions_have_is_refused(installed: Path) -> None:
 def test_a_launch_by_name_asks_no_metadata() -> None:
     """Searching those of all distributions takes some 10 ms."""
     program = (
-        "import sys, neuros.backends.registered as r; r.BACK_ENDS.load('process');"
+        "import sys, neuros.registry as r; r.BACK_ENDS.load('process');"
         " assert 'importlib.metadata' not in sys.modules"
     )
     assert subprocess.run([sys.executable, "-S", "-c", program], check=False).returncode == 0

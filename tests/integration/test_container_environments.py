@@ -18,7 +18,7 @@ import pytest
 from launching import EXAMPLES, Finished, Running, launch, start
 from packages import make_slow_package, make_wheel
 
-from neuros.backends.environments.pythons import HERE, find_python
+from neuros.backends.pythons import HERE, find_python
 from neuros.backends.run_processes import RUN_ID
 from neuros.installation.machine import NEWEST, OLDEST, dotted
 

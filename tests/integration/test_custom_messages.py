@@ -20,7 +20,7 @@ import neuros.bag
 from containers import connected, require_containers
 from neuros.backends.docker.images import images_for
 from neuros.backends.domain import choose_domain
-from neuros.backends.environments.pythons import HERE
+from neuros.backends.pythons import HERE
 from neuros.errors import EnvironmentFault
 from neuros.messages.package import Ros
 

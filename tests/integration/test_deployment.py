@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from launching import Finished, Running, launch, start
 
+from neuros.backends.machines.files import scan
 from neuros.backends.machines.machine import Machine, agent_command
-from neuros.backends.machines.trees import scan
 from neuros.control.link import encode
 from neuros.control.machines import Lacking
 from neuros.errors import EnvironmentFault

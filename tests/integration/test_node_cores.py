@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from launching import BACKENDS, launch
 
-from neuros.backends.placement import THREAD_VARIABLES
+from neuros.backends.node_command import THREAD_VARIABLES
 
 CORES = sorted(os.sched_getaffinity(0))
 PORT = "std_msgs/msg/Int32"

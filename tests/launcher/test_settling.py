@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from neuros.control import AtRest, Message, NewestPacket, Pause, Settle, Settled
 from neuros.control.link import ControlLink
-from neuros.launcher.channels import Channels
-from neuros.launcher.quiescence import Settling
+from neuros.launcher.channels import Channels, Settling
 
 SESSION = cast(ControlLink, "the session")
 

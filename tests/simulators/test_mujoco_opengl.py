@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
+from neuros.doctor.checks import prove_rendering
 from neuros.installation import machine
 from neuros.ports import State
 from neuros.simulators.mujoco import cameras
-from neuros.simulators.registered import prove_rendering
 
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 60.0
@@ -196,7 +196,7 @@ class TestDoctor:
     def test_opengl_that_is_not_there_need_not_be(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("neuros.simulators.registered.offscreen_opengl", lambda: "")
+        monkeypatch.setattr("neuros.doctor.checks.offscreen_opengl", lambda: "")
         finding = prove_rendering(without(EGL + OSMESA, tmp_path))
         assert finding.state is State.ABSENT
         assert "neither EGL" in finding.text

@@ -8,12 +8,12 @@ from typing import Any, cast
 
 import pytest
 
-from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Reaper
 from neuros.project.load import load_project
-from neuros.viewers import registered
-from neuros.viewers.registered import Shown, Viewer, Views
+from neuros.registry import BACK_ENDS
+from neuros.viewers import viewer
+from neuros.viewers.viewer import Shown, Viewer, Views
 
 PROCESS = BACK_ENDS.load("process")
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
@@ -54,7 +54,7 @@ def screens(monkeypatch: pytest.MonkeyPatch) -> Screens:
         Screen("best", {"graph": 3, "packets": 1}, why_not="best needs a display"),
     ]
     screens = Screens({each.name: each for each in every})
-    monkeypatch.setattr(registered, "VIEWERS", screens)
+    monkeypatch.setattr(viewer, "VIEWERS", screens)
     return screens
 
 

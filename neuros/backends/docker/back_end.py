@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.containers import STANDARD, find_container
-from neuros.backends.docker.layout import as_here, inside, outside
+from neuros.backends.docker.settings import as_here, inside, outside
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, Notice

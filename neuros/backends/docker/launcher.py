@@ -1,4 +1,4 @@
-"""The Docker back end: one container per node."""
+"""Containers of a run: one for each node, and those of graphical tools of ROS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import requests
 from docker import DockerClient
-from docker.errors import DockerException
+from docker.errors import DockerException, ImageNotFound
 
 from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import (
@@ -31,8 +31,10 @@ from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import (
     NETWORK_MODE,
     NO_NETWORK,
+    X11,
     container_name,
     container_settings,
+    mount,
     shared_memory,
     user_for,
 )
@@ -40,17 +42,21 @@ from neuros.backends.node_command import (
     last_line,
     log_file,
     node_folder,
+    on_cores,
     script_failure,
     signal_in_words,
 )
-from neuros.backends.placement import on_cores
 from neuros.backends.run_processes import RUN_ID, RunProcesses
 from neuros.backends.shared_memory import hold
+from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault
-from neuros.ports import NodeProgram
+from neuros.ports import NodeProgram, Reaper
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import NodeFile
 from neuros.project.resources import memory_text
+
+TOOL_IMAGE = "neuros_tools"
+_STOP_S = 2
 
 _MOST_AT_ONCE = 16
 _OUT_OF_MEMORY = 128 + signal.SIGKILL
@@ -427,3 +433,63 @@ class ContainerEvents(threading.Thread):
             fate.exit_code = int(actor["Attributes"]["exitCode"])
         elif event["Action"] in ("destroy", "remove"):  # podman says remove
             fate.is_gone = True
+
+
+def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
+    """``None`` if there is the image, else in a few words why not."""
+    try:
+        engine = connect(environ)
+    except EnvironmentFault:
+        return f"there is no Docker engine for the image {TOOL_IMAGE}"
+    try:
+        engine.images.get(TOOL_IMAGE)
+    except ImageNotFound:
+        return f"the image {TOOL_IMAGE} is not built ({build_command(TOOL_IMAGE)})"
+    except (DockerException, requests.RequestException) as error:
+        return f"the Docker engine does not say whether it has the image {TOOL_IMAGE}: {error}"
+    finally:
+        engine.close()
+    return None
+
+
+class ToolContainer:
+    """A tool in a container: the host's network and display, the run folder to read.
+
+    Raises:
+        EnvironmentFault: if it cannot be started.
+    """
+
+    def __init__(
+        self, program: str, arguments: Sequence[str], run: Path, environment: Mapping[str, str]
+    ) -> None:
+        self._engine = connect()
+        passed = {key: os.environ[key] for key in ("DISPLAY", "XAUTHORITY") if key in os.environ}
+        seen = [run, X11, *map(Path, filter(None, [passed.get("XAUTHORITY")]))]
+        with engine_faults(f"{program} in a container of {TOOL_IMAGE}"):
+            self._container = self._engine.containers.run(
+                TOOL_IMAGE,
+                [program, *arguments],
+                detach=True,
+                auto_remove=True,
+                environment={**environment, **passed, "HOME": "/tmp", "ROS_LOG_DIR": "/tmp"},
+                labels={
+                    RUN_LABEL: environment.get(RUN_ID, ""),
+                    "neuros.run_folder": str(run),
+                },
+                mounts=[mount(path, path) for path in seen if path.exists()],
+                network_mode="host",
+                ipc_mode="host",
+                user=f"{os.getuid()}:{os.getgid()}",
+                cap_drop=["ALL"],
+                security_opt=["no-new-privileges"],
+            )
+
+    def announce(self, reaper: Reaper) -> None:
+        """Have it removed if the launcher is killed."""
+        reaper.clean_with(leftovers.__name__, engine_socket(self._engine))
+
+    def finish(self) -> None:
+        """End it with the run."""
+        with contextlib.suppress(DockerException, requests.RequestException):
+            self._container.stop(timeout=_STOP_S)  # its window may have been closed long ago
+        self._engine.close()

@@ -35,8 +35,7 @@ from neuros.backends.docker.engine import (
     engine_socket,
 )
 from neuros.backends.docker.images import Image, image_for
-from neuros.backends.docker.layout import LIBRARY, MESSAGES, ROOT
-from neuros.backends.docker.settings import NETWORK_MODE, limits
+from neuros.backends.docker.settings import LIBRARY, MESSAGES, NETWORK_MODE, ROOT, limits
 from neuros.backends.node_command import DEFAULTS, without_mark
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault

@@ -4,35 +4,58 @@ By default a container is locked down: the caller's user id and no capability, n
 programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
 goes with it. It sees the project and the workspace, which it can read, and the run folder, where it
 can write new files and into a folder of its own: what the other nodes and the run itself have there
-it can only read.
+it can only read. The paths under which it sees them do not depend on the machine.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neuros.backends.docker.images import Image
-from neuros.backends.docker.layout import DDS_FILE, FOLDERS, LIBRARY, XAUTHORITY, inside
 from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.node_command import (
     DEFAULTS,
+    THREAD_VARIABLES,
+    Cores,
     log_file,
     node_environment,
     node_folder,
     start_arguments,
+    thread_limits,
     with_messages,
 )
-from neuros.backends.placement import THREAD_VARIABLES, Cores, thread_limits
 from neuros.backends.run_processes import RUN_ID
 from neuros.control import CONTROL_VARIABLE
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
-from neuros.project.model import Node, NodeFile
+from neuros.project.model import Folders, Node, NodeFile
+from neuros.project.split import translated
+
+if TYPE_CHECKING:
+    from neuros.backends.docker.images import Image
+
+ROOT = Path("/neuros")
+FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "workspace", run=ROOT / "run")
+"""What a node may read and write, as it sees it."""
+
+MESSAGES = ROOT / "messages"
+"""The built message packages of the run, each in a folder that has the same name here."""
+
+LIBRARY = ROOT / "lib"
+"""What ``PYTHONPATH`` names: NeuROS itself is in there, from the launcher's own installation."""
+
+XAUTHORITY = ROOT / "xauthority"
+"""The key to the user's display, where a node has one."""
+
+DDS_FILE = ROOT / "fast_dds.xml"
+"""The user's own settings of Fast DDS, where there are any."""
+
+_INSIDE = re.compile(rf"(?<![\w/.]){ROOT}/({'|'.join(each.name for each in fields(Folders))})\b")
 
 # Discovery stays on this machine, so that nodes have to share its network. Large packets go through
 # shared memory where both ends see the same: the containers of one run do, and see nobody else's.
@@ -53,7 +76,7 @@ PASSED_ON = (
 # Fast DDS reads settings of the user's own from the file that this names.
 DDS_SETTINGS = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
-_X11 = Path("/tmp/.X11-unix")
+X11 = Path("/tmp/.X11-unix")
 _TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
 # What the engine keeps (`docker logs`) says where the rest is: the node writes its log itself, so
 # that nothing passes through the engine, and nothing is lost when that or the launcher dies.
@@ -230,31 +253,32 @@ def _mounts(
 ) -> list[dict[str, Any]]:
     own = node_folder(file) / "node.json"
     mounts = [
-        _mount(PACKAGE, LIBRARY / PACKAGE.name),
-        _mount(file.folders.project, FOLDERS.project),
-        _mount(file.folders.run, FOLDERS.run, read_only=False),
+        mount(PACKAGE, LIBRARY / PACKAGE.name),
+        mount(file.folders.project, FOLDERS.project),
+        mount(file.folders.run, FOLDERS.run, read_only=False),
         # In a folder that it may write to; but what it was told stays as it was.
-        _mount(own, node_folder(inside(file)) / own.name),
-        *(_mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
-        _mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
+        mount(own, node_folder(inside(file)) / own.name),
+        *(mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
+        mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
     ]
     if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
-        mounts.append(_mount(file.folders.workspace, FOLDERS.workspace))
+        mounts.append(mount(file.folders.workspace, FOLDERS.workspace))
     mounts += [
-        _mount(here.parent, there.parent)
+        mount(here.parent, there.parent)
         for here, there in zip(file.messages, inside(file).messages, strict=True)
     ]
     if user.dds_settings:
-        mounts.append(_mount(user.dds_settings, DDS_FILE))
+        mounts.append(mount(user.dds_settings, DDS_FILE))
     if file.node.access.display and user.display:
-        if _X11.is_dir():  # with a display over the network (ssh -X) there may be none
-            mounts.append(_mount(_X11, _X11))
+        if X11.is_dir():  # with a display over the network (ssh -X) there may be none
+            mounts.append(mount(X11, X11))
         if user.xauthority:
-            mounts.append(_mount(user.xauthority, XAUTHORITY))
+            mounts.append(mount(user.xauthority, XAUTHORITY))
     return mounts
 
 
-def _mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
+def mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
+    """A folder or file of this machine, as a container sees it."""
     return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
 
 
@@ -282,3 +306,51 @@ def _group_of(file: NodeFile, device: str) -> int:
             f"node '{file.node.name}' asks for the device {device}: {error.strerror}: is it plugged"
             f" in? Another one: --set nodes.{file.node.name}.devices='[\"/dev/...\"]'"
         ) from error
+
+
+def inside(file: NodeFile) -> NodeFile:
+    """A node with all paths as it sees them in its container."""
+    return replace(
+        file,
+        node=translated(file.node, lambda path: _inside(path, file)),
+        folders=FOLDERS,
+        messages=tuple(_inside(path, file) for path in file.messages),
+    )
+
+
+def outside(file: NodeFile, folders: Folders, messages: Path = MESSAGES) -> NodeFile:
+    """The inverse of :func:`inside`: the node with the paths of a machine with these folders.
+
+    Args:
+        messages: the folder with built message packages.
+    """
+    there = [(getattr(FOLDERS, e.name), getattr(folders, e.name)) for e in fields(Folders)]
+    pairs = [*there, (MESSAGES, messages)]
+    return replace(
+        file,
+        node=translated(file.node, lambda path: _moved(path, pairs)),
+        folders=folders,
+        messages=tuple(_moved(path, pairs) for path in file.messages),
+    )
+
+
+def as_here(text: str, folders: Folders) -> str:
+    """Text of a node, with its paths replaced by those of this machine."""
+    here = {each.name: str(getattr(folders, each.name)) for each in fields(Folders)}
+    return _INSIDE.sub(lambda match: here[match[1]], text)
+
+
+def _inside(path: Path, file: NodeFile) -> Path:
+    """A path of this machine as a container sees it; what it does not see stays as it is."""
+    here = file.folders
+    mounted = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
+    mounted += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
+    return _moved(path, mounted)
+
+
+def _moved(path: Path, places: Sequence[tuple[Path, Path]]) -> Path:
+    """A path in one of the first folders as one in the second; the innermost counts."""
+    for here, there in sorted(places, key=lambda pair: -len(pair[0].parts)):
+        if path.is_relative_to(here):
+            return there / path.relative_to(here)
+    return path

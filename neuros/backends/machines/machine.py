@@ -21,9 +21,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neuros.backends.machines.mirror import write_chunk
+from neuros.backends.machines.files import scan, write_chunk
 from neuros.backends.machines.pump import Pump
-from neuros.backends.machines.trees import scan
 from neuros.backends.node_command import without_mark
 from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of

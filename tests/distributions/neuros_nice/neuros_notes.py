@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neuros.ports import BackEnd, Reaper
-from neuros.viewers.registered import Shown, Viewer
+from neuros.viewers.viewer import Shown, Viewer
 
 
 class Note:

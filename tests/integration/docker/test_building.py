@@ -19,8 +19,8 @@ from docker.errors import APIError
 from needs import cannot_run
 
 from containers import connected, require_containers, wait_until
-from neuros.backends.docker.build_steps import pulled
-from neuros.backends.docker.context import context_of
+from neuros.backends.docker.builders import context_of
+from neuros.backends.docker.building import pulled
 from neuros.backends.docker.images import image_for
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault

@@ -15,7 +15,7 @@ from launching import start
 from viewers.dashboard.visitor import WATCHED, Visitor, address, is_full
 
 from containers import connected, require_containers, wait_until
-from neuros.backends.docker.tool import IMAGE
+from neuros.backends.docker.launcher import TOOL_IMAGE
 from neuros.backends.domain import choose_domain
 
 # A stand-in for the tools of a ROS distribution, which no test machine has the gigabytes for.
@@ -32,8 +32,8 @@ def engine() -> Iterator[DockerClient]:
 @pytest.fixture
 def tools(engine: DockerClient) -> Iterator[None]:
     """An image of tools, which goes with the test."""
-    if engine.images.list(name=IMAGE):
-        pytest.skip(f"the image {IMAGE} is there, and is not to be replaced by a stand-in")
+    if engine.images.list(name=TOOL_IMAGE):
+        pytest.skip(f"the image {TOOL_IMAGE} is there, and is not to be replaced by a stand-in")
     files = {"rviz2": TOOL, "Dockerfile": "FROM neuros_python\nCOPY rviz2 /usr/local/bin/\n"}
     files["Dockerfile"] += "ENTRYPOINT []\n"
     context = io.BytesIO()
@@ -43,9 +43,9 @@ def tools(engine: DockerClient) -> Iterator[None]:
             info.size, info.mode = len(text), 0o755
             tar.addfile(info, io.BytesIO(text.encode()))
     context.seek(0)
-    engine.images.build(fileobj=context, custom_context=True, tag=IMAGE, rm=True)
+    engine.images.build(fileobj=context, custom_context=True, tag=TOOL_IMAGE, rm=True)
     yield
-    engine.images.remove(IMAGE, force=True)
+    engine.images.remove(TOOL_IMAGE, force=True)
 
 
 def is_below(folder: str, parent: Path) -> bool:
@@ -68,7 +68,7 @@ def test_a_tool_in_a_container_sees_the_run_and_goes_with_a_killed_launcher(
     tmp_path: Path, engine: DockerClient
 ) -> None:
     def containers() -> list[str]:
-        found = engine.containers.list(filters={"ancestor": IMAGE})
+        found = engine.containers.list(filters={"ancestor": TOOL_IMAGE})
         return [
             each.id for each in found if each.labels["neuros.run_folder"].startswith(str(tmp_path))
         ]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.environments.cache import Entry, cache_folder, sweep
+from neuros.backends.virtual_environments import Entry, cache_folder, sweep
 
 MONTHS_AGO_S = time.time() - 90 * 24 * 3600
 KEY = "0123456789ab"

@@ -1,55 +1,55 @@
-"""Python of each container: chosen among those of this machine, or made before anything starts.
+"""Python of each container, for nodes that run as processes.
 
-On the launcher's own version of Python an environment is a layer: its site-packages have what the
-container asks for and this environment has not, and everything else is found in this environment.
-On another version of Python it has everything, ROS 2 included.
+A node whose container has a ``requirements.txt`` that this environment satisfies runs on this
+Python. Every other container gets a virtual environment of its own, made before anything starts
+(:mod:`neuros.backends.virtual_environments`). What is chosen here changes nothing.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
-import importlib.metadata
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from neuros.backends.containers import ContainerFolder, find_container
-from neuros.backends.environments.cache import Entry, cache_folder, sweep
-from neuros.backends.environments.requirements import Requirements, read_requirements, unmet
+from neuros.backends.virtual_environments import (
+    HERE,
+    Choice,
+    Entry,
+    Requirements,
+    Version,
+    cache_folder,
+    make,
+    own_needs,
+    packages_here,
+    read_requirements,
+    sweep,
+    unmet,
+)
 from neuros.caching import KEY_LENGTH
-from neuros.distribution import PACKAGE, install_command
+from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     NEWEST,
     OLDEST,
     clean_environment,
     dotted,
-    system_install,
 )
-from neuros.installation.packages import explain_machine, find_uv, run_installs
 from neuros.installation.progress import Progress
 from neuros.project.model import Node
 
-Version = tuple[int, int]
 FILE = ".python-version"
 _VERSION = re.compile(r"(?:c?python-?)?(\d+)\.(\d+)(?:\.\d+)*")
 _ASK = "import sys; print(sys.implementation.name, *sys.version_info[:2])"
 _ANSWER_TIMEOUT_S = 10.0
-HERE: Version = sys.version_info[:2]
 _FORMAT = 1  # of what is made: another one makes all environments anew
-_FULL_BYTES = 0.6e9  # ROS 2, and pip's copies while it works
-_BOOTSTRAPPER = "ros_wheels_bootstrapper"
-_NONE = re.compile(r"satisfies the requirement (.+?) \(from versions: (.*)\)")
-_CONFLICT = re.compile(r"The conflict is caused by:\n((?: {4}.+\n)+)")
-_FEW = 5
 
 
 def wanted_version(folder: Path) -> Version | None:
@@ -113,50 +113,6 @@ def _is_version(path: Path, version: Version, environ: Mapping[str, str]) -> boo
     return answer.stdout.split() == ["cpython", *map(str, version)]
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The Python and the packages of a container.
-
-    Attributes:
-        version: the Python that it is to run on.
-        entry: its place in the cache.
-        lacks: what this environment lacks, in words, as far as that had to be found out.
-        base: the interpreter to make its environment with; ``None`` if nothing is to be made.
-        notice: what the user should know, or empty.
-    """
-
-    container: ContainerFolder
-    requirements: Requirements
-    version: Version
-    entry: Entry
-    lacks: tuple[str, ...] = ()
-    base: Path | None = None
-    notice: str = ""
-
-    @property
-    def is_layered(self) -> bool:
-        """Whether its environment lies on top of this one, and has only what differs."""
-        return self.version == HERE
-
-    @property
-    def path(self) -> Path:
-        """Its Python, which may have to be made first."""
-        if self.base is not None:
-            return self.entry.future_python
-        return self.entry.python() or Path(sys.executable)
-
-    def settle(self) -> None:
-        """Remember for later starts that it is in use, or that this very Python does.
-
-        Raises ``OSError``.
-        """
-        if self.base is not None:
-            return
-        if self.entry.python() is None:
-            self.entry.settle(is_here=True)
-        self.entry.note_use()
-
-
 def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) -> Choice:
     """Choose for a container with a ``requirements.txt``.
 
@@ -194,20 +150,6 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
     lacks = tuple(unmet(requirements, any_version=container.is_own))
     base = Path(getattr(sys, "_base_executable", sys.executable)) if lacks else None
     return Choice(container, requirements, HERE, entry, lacks, base)
-
-
-def own_needs() -> list[str]:
-    """The requirements of NeuROS itself; empty if it is not installed here."""
-    try:
-        needs = importlib.metadata.requires("neuros") or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    return [need for need in needs if "extra ==" not in need]
-
-
-def packages_here() -> list[Path]:
-    """The folders of this Python with installed packages, those that are found first first."""
-    return [Path(p) for p in sys.path if Path(p).name in ("site-packages", "dist-packages")]
 
 
 def _entry(
@@ -350,176 +292,3 @@ def _containers(
         container = find_container(name, project)
         if container and container.requirements.is_file():
             yield container, of_nodes
-
-
-def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """Make the environment, unless another launch has made it meanwhile.
-
-    Args:
-        run_environment: is added to the environment of the programs that this starts.
-
-    Raises:
-        EnvironmentFault: with a sentence for the user; then nothing of it is left but the log.
-    """
-    try:
-        choice.entry.folder.parent.mkdir(parents=True, exist_ok=True)
-        with choice.entry.locked(wait=False) as is_mine:
-            if is_mine:
-                return _make(choice, progress, run_environment)
-        progress.step(f"waiting for another launch that makes {_words(choice)}")
-        with choice.entry.locked():
-            _make(choice, progress, run_environment)
-    except OSError as error:
-        raise _fault(choice, why_no_files(error, choice.entry.folder.parent)) from error
-
-
-def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """Make it, under the lock."""
-    entry = choice.entry
-    if entry.python():
-        return
-    entry.remove()  # what an interrupted run has left
-    try:
-        _make_venv(choice, progress, run_environment)
-        _add_links(choice)
-        _install(choice, progress, run_environment)
-        entry.settle(is_here=False)
-    except BaseException:
-        entry.remove()
-        raise
-
-
-def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    folder, because = choice.entry.folder, f" ({', '.join(choice.lacks)})" if choice.lacks else ""
-    progress.step(f"making {_words(choice)}{because}: {folder}")
-    free_bytes = shutil.disk_usage(folder.parent).free
-    if not choice.is_layered and free_bytes < _FULL_BYTES:
-        raise _fault(
-            choice,
-            f"{folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment needs"
-            f" {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
-        )
-    # A layer finds pip where it finds the rest.
-    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    made = subprocess.run(
-        [str(choice.base), "-m", "venv", *options, str(folder)],
-        env={**clean_environment(os.environ), **run_environment},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if made.returncode:
-        output = (made.stdout + made.stderr).strip()
-        raise _fault(choice, why_no_venv(output, dotted(choice.version)))
-
-
-def _add_links(choice: Choice) -> None:
-    """Give it this NeuROS, and, if it is a layer, what is here."""
-    folder = choice.entry.folder
-    site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
-    (site_packages / "neuros").symlink_to(PACKAGE, target_is_directory=True)
-    if choice.is_layered:
-        rows = [str(path) for path in packages_here()]
-        if _is_here(_BOOTSTRAPPER):
-            _link_libraries(folder, site_packages)
-            rows.append(f"import {_BOOTSTRAPPER}")
-        # Lines of a .pth file come behind what is in the environment itself.
-        layer = "".join(f"{row}\n" for row in rows)
-        (site_packages / "neuros_layer.pth").write_text(layer, "utf-8")
-
-
-def _link_libraries(folder: Path, site_packages: Path) -> None:
-    """The wheels of ROS 2 look for their libraries and files below the prefix of their Python."""
-    prefix = Path(sys.prefix)
-    libraries = [path for path in (prefix / "lib").iterdir() if not path.name.startswith("python")]
-    for path in (*libraries, prefix / "share"):
-        link = folder / path.relative_to(prefix)
-        if path.exists() and not link.exists():
-            link.symlink_to(path)
-    for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
-        (site_packages / path.name).symlink_to(path)
-
-
-def _is_here(package: str) -> bool:
-    return any((folder / package).is_dir() for folder in packages_here())
-
-
-def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    entry, needs = choice.entry, own_needs()
-    wanted = ["--requirement", str(choice.requirements.file)]
-    # With hashes, pip refuses what has none: then what NeuROS needs comes first, by itself.
-    calls = [[*wanted, *needs]]
-    if choice.requirements.has_hashes:
-        calls = [needs, ["--require-hashes", *wanted]]
-    if not needs:
-        cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
-        raise _fault(choice, cause)
-    progress.step(f"installing {choice.requirements.file} (log: {entry.log})")
-    environ = {**clean_environment(os.environ), **run_environment}
-    # uv does not see what a layer finds in this environment, and would install all of it again.
-    uv = None if choice.is_layered else find_uv(Path(sys.executable), environ)
-    entry.log.unlink(missing_ok=True)
-    output = run_installs(
-        entry.future_python, uv, calls, entry.folder, entry.log, progress, environ
-    )
-    if output is not None:
-        cause = why_pip_failed(output, dotted(choice.version), needs)
-        raise _fault(choice, f"{cause} (log: {entry.log})")
-
-
-def _words(choice: Choice) -> str:
-    name = choice.container.name
-    return f"the environment of container '{name}', Python {dotted(choice.version)}"
-
-
-def _fault(choice: Choice, cause: str) -> EnvironmentFault:
-    return EnvironmentFault(
-        f"container '{choice.container.name}': {choice.requirements.file} is not satisfied here,"
-        f" and its environment cannot be made: {cause}"
-    )
-
-
-def why_pip_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
-    """The cause in the output of pip, for a version of Python as ``3.12``.
-
-    ``own_needs`` are the requirements of NeuROS itself that pip was given, too.
-    """
-    if sentence := explain_machine(output, again="launch"):
-        return sentence
-    if none := _NONE.search(output):
-        return f"no {none[1]} exists for Python {python} ({_there_is(none[2].split(', '))})"
-    if conflict := _CONFLICT.search(output):
-        rows = "; ".join(row.strip() for row in conflict[1].splitlines())
-        own = [need for need in own_needs if re.search(rf"\b{_name_of(need)}\b", rows)]
-        return f"these exclude each other: {rows}" + "".join(f"; NeuROS needs {n}" for n in own)
-    errors = re.findall(r"^ERROR: (.+)", output, re.MULTILINE)
-    return errors[0] if errors else "pip failed"
-
-
-def why_no_venv(output: str, python: str) -> str:
-    """The cause in the output of ``venv``."""
-    if re.search(r"ensurepip|No module named '?venv", output):
-        remedy = system_install(apt=f"python{python}-venv", dnf="python3-pip")
-        return f"Python {python} has no venv: {remedy}"
-    rows = output.splitlines() or ["venv failed"]
-    return explain_machine(output) or rows[-1]
-
-
-def why_no_files(error: OSError, cache: Path) -> str:
-    """The cause in an error of the cache's folder."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"the disk of {cache} is full: make room (df -h), or set XDG_CACHE_HOME"
-    return f"{error.filename or cache}: {error.strerror}: set XDG_CACHE_HOME to another folder"
-
-
-def _there_is(versions: Sequence[str]) -> str:
-    if list(versions) == ["none"]:
-        return "pip finds no package of that name"
-    more = "..., " if len(versions) > _FEW else ""
-    return f"there is {more}{', '.join(versions[-_FEW:])}"
-
-
-def _name_of(requirement: str) -> str:
-    match = re.match(r"[\w.-]+", requirement)
-    return re.escape(match[0]) if match else ""

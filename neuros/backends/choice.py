@@ -1,4 +1,4 @@
-"""The registered back ends, and the choice of ``--backend``."""
+"""Choice of ``--backend``, and the back ends of runs that are over."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ from typing import Any
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.ports import BackEnd, Deployment, Notice
 from neuros.project.model import Node, Project
-from neuros.registry import Registry
-
-AUTO = "auto"
-BACK_ENDS: Registry[BackEnd] = Registry("neuros.backends", "back end", BackEnd, further=[AUTO])
+from neuros.registry import AUTO, BACK_ENDS
 
 
 @dataclass(frozen=True)

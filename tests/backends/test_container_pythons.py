@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.containers import ContainerFolder, find_container
-from neuros.backends.environments.pythons import (
+from neuros.backends.pythons import (
     HERE,
     Choice,
     Pythons,
@@ -19,10 +19,8 @@ from neuros.backends.environments.pythons import (
     find_python,
     require_one_python,
     wanted_version,
-    why_no_files,
-    why_no_venv,
-    why_pip_failed,
 )
+from neuros.backends.virtual_environments import why_no_files, why_no_venv, why_pip_failed
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 

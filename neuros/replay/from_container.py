@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from neuros.analysis.run_record import PastRun
-from neuros.backends.registered import BACK_ENDS
 from neuros.errors import EnvironmentFault, NeurosError
 from neuros.ports import BackEnd
 from neuros.project.model import Folders, NodeFile
+from neuros.registry import BACK_ENDS
 
 _FEW = 5
 _INSTALLERS = {"pip", "setuptools", "wheel"}  # nothing that a node computes depends on them

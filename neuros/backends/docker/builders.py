@@ -1,4 +1,4 @@
-"""Steps of an image build, their log, and the causes of failures.
+"""Both builders of the engine: what goes into an image build, what it says, why it fails.
 
 BuildKit understands more of a Dockerfile than the classic builder; every engine that NeuROS takes
 has both. BuildKit asks its client for the files of a build over a session (gRPC), which the SDK
@@ -9,38 +9,42 @@ time of the build.
 from __future__ import annotations
 
 import base64
-import contextlib
 import gzip
 import io
 import re
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import tarfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from types import MappingProxyType
 from typing import Any
 
 from docker import DockerClient
-from docker.errors import APIError
 
-from neuros.backends.docker.context import CERTIFICATES, Surroundings, context_of, serving
+from neuros.backends.containers import files_of
 from neuros.backends.docker.dockerfile import (
     Instruction,
-    after_each_from,
     has_syntax_line,
-    label_line,
-    needs_buildkit,
 )
 from neuros.backends.docker.engine import Abilities, engine_socket
-from neuros.backends.docker.python_in_image import PythonInImage, python_in
-from neuros.backends.docker.recipes import BASE, BASE_ARGUMENT, find_recipe
-from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault
-from neuros.installation.progress import Progress
 
+DOCKERFILE = "Dockerfile"
+CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
+"""Where a build finds the certificates that the user gives; it is taken away at the end."""
+
+_CERTIFICATES_IN_CONTEXT = ".neuros-ca-bundle.pem"
+_TRUST = ("PIP_CERT", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "FTP_PROXY", "NO_PROXY", "ALL_PROXY")
 _NOTHING: Mapping[str, str] = MappingProxyType({})
-_DOCKERFILE = "Dockerfile"
+_NO_FILES: Mapping[str, bytes] = MappingProxyType({})
+
 _TAIL_LINES = 12
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -107,133 +111,143 @@ _CAUSES = (
     ),
 )
 
+_HEREDOCS_SINCE = (23, 0)
+_IMAGE_ID = re.compile(r"\bsha256:([0-9a-f]{12})[0-9a-f]{52}\b")
+_TEMPORARY = "neuros_begin"
+_WRAPPED = re.compile(
+    r"^((failed to solve( with frontend \S+)?|failed to create LLB definition): )+"
+)
+_TRACE = "moby.buildkit.trace"
+_BY_HAND = "or build the image by hand (docker build -t NAME) and put its NAME into the project"
 
-class BuildSteps:
-    """The builds that one image takes, all with one log.
 
-    Args:
-        name: of the image, for messages.
-        log: the file for what the engine says.
+@dataclass(frozen=True)
+class Surroundings:
+    """Needs of this machine that all builds share.
+
+    Attributes:
+        arguments: build arguments; the engine keeps proxies out of the images' history.
+        network: of the build, ``None`` for the engine's default.
+        ca_bundle: certificates to trust besides, PEM.
+        wheels: the address of a wheelhouse, or "".
     """
 
-    def __init__(
-        self,
-        engine: DockerClient,
-        around: Surroundings,
-        progress: Progress,
-        name: str,
-        log: Path,
-    ) -> None:
-        self._engine, self._around, self._progress = engine, around, progress
-        self._name, self._log = name, log
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.unlink(missing_ok=True)
+    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    network: str | None = None
+    ca_bundle: bytes = b""
+    wheels: str = ""
 
-    def build(
-        self,
-        folder: Path | None,
-        dockerfile: str,
-        arguments: Mapping[str, str] = _NOTHING,
-    ) -> str:
-        """Build from the files of ``folder``; returns the id of the image.
+    @property
+    def files(self) -> dict[str, bytes]:
+        """Files to lay beside every Dockerfile."""
+        return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
 
-        Raises:
-            EnvironmentFault: if it fails.
-        """
-        found = needs_buildkit(dockerfile)
-        if found:
-            require_buildkit(self._engine, self._name, dockerfile, *found)
-        if self._around.lines:
-            dockerfile = after_each_from(dockerfile, self._around.lines)
-        given = {**self._around.arguments, **arguments}
-        settings = {"network_mode": self._around.network}
-        if not found:
-            archive = context_of(folder, dockerfile, self._around.files)
-            return self._run(archive, buildargs=given, **settings)
-        with named(self._engine, {**given, _DOCKERFILE: dockerfile}) as texts:
-            archive = context_of(folder, texts.pop(_DOCKERFILE), self._around.files)
-            with buildkit_messages(self._engine, archive, buildargs=texts, **settings) as messages:
-                return self._follow(messages)
-
-    def _run(self, archive: io.BytesIO, **settings: Any) -> str:
-        # The classic builder's API: each line of its output is a JSON object.
-        stream = self._engine.api.build(
-            fileobj=archive,
-            custom_context=True,
-            decode=True,
-            rm=True,
-            forcerm=True,
-            **settings,
-        )
-        return self._follow(stream)
-
-    def _follow(self, messages: Iterable[Mapping[str, Any]]) -> str:
-        log = BuildLog(self._log, lambda line: self._progress.detail(f"{self._name}: {line}"))
-        image = log.follow(messages)
-        if image is None:
-            for line in log.tail:
-                self._progress.step(f"  {line[:300]}")
-            raise EnvironmentFault(
-                f"image '{self._name}' cannot be built: {log.cause} (log: {self._log})"
-            )
-        return image
-
-    def able(self, image: str) -> tuple[str, PythonInImage]:
-        """The image itself if it can run nodes, else one with what it lacks on top of it.
-
-        Raises:
-            EnvironmentFault: if it can never run nodes.
-        """
-        python = python_in(self._engine, image, self._name)
-        if python.has_rclpy:
-            return image, python
-        base = find_recipe(BASE)
-        if base is None:
-            raise EnvironmentFault(
-                f"image '{self._name}' has no rclpy, and there is no folder containers/{BASE} to"
-                f" add it from: {install_command()}"
-            )
-        added = {BASE_ARGUMENT: image, "CONSTRAINTS": ""}
-        made = self.build(base.folder, base.dockerfile, added)
-        python = python_in(self._engine, made, self._name)
-        if not python.has_rclpy:
-            raise EnvironmentFault(
-                f"image '{self._name}': rclpy was installed, but does not load; to see why, run"
-                f" docker run --rm --entrypoint {python.path} {made[7:19]} -c 'import rclpy'"
-            )
-        return made, python
-
-    def finish(self, image: str, tags: Sequence[str], labels: Mapping[str, str]) -> None:
-        """Take away what only the build needed, write the labels, and give it its names."""
-        lines = [f"FROM {image}"]
-        if self._around.ca_bundle:
-            user = self._engine.images.get(image).attrs["Config"].get("User") or "0"
-            lines += ["USER 0", f"RUN rm -f {CERTIFICATES}", f"USER {user}"]
-        lines.append(label_line(labels))
-        made = self._run(context_of(None, "\n".join(lines)), tag=tags[0], network_mode="none")
-        for further in tags[1:]:
-            self._engine.images.get(made).tag(further)
+    @property
+    def lines(self) -> str:
+        """Lines to declare in every stage of a Dockerfile."""
+        lines = []
+        if self.ca_bundle:
+            lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
+            lines.append(f"ARG {' '.join(f'{name}={CERTIFICATES}' for name in _TRUST)}")
+        if self.wheels:
+            lines.append(f"ARG PIP_NO_INDEX=1 PIP_FIND_LINKS={self.wheels}")
+        return "\n".join(lines)
 
 
-def pulled(engine: DockerClient, name: str, *, newest: bool) -> Any:
-    """An image of that name, from its registry where it is not there (or the ``newest`` is wanted).
+def surroundings(
+    engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
+) -> Surroundings:
+    """Needs of this machine, from its environment and the engine.
+
+    A wheelhouse leaves proxies out, and packages of the operating system.
+    """
+    proxies = {
+        name: environ[name]
+        for upper in _PROXIES
+        for name in (upper, upper.lower())
+        if environ.get(name)
+    }
+    is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
+    has_bridge = any(network.name == "bridge" for network in engine.networks.list())
+    return Surroundings(
+        arguments={"SYSTEM_PACKAGES": "", "WINDOWS": "no"} if wheels else proxies,
+        network="host" if wheels or is_here or not has_bridge else None,
+        ca_bundle=ca_bundle.read_bytes() if ca_bundle else b"",
+        wheels=wheels,
+    )
+
+
+def context_of(
+    folder: Path | None, dockerfile: str, further: Mapping[str, bytes] = _NO_FILES
+) -> io.BytesIO:
+    """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files.
+
+    A link becomes the file that it leads to, which may be outside.
+    """
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w", dereference=True) as tar:
+        for file in files_of(folder) if folder else ():
+            if file.name != DOCKERFILE or file.parent != folder:
+                tar.add(file, str(file.relative_to(folder or file)), filter=_anonymous)
+        for name, content in {DOCKERFILE: dockerfile.encode(), **further}.items():
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o644
+            tar.addfile(entry, io.BytesIO(content))
+    archive.seek(0)
+    return archive
+
+
+def _anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+    """Make it readable by all, without its owner."""
+    entry.uid = entry.gid = 0
+    entry.uname = entry.gname = ""
+    entry.mode = 0o755 if entry.mode & 0o111 else 0o644
+    return entry
+
+
+@contextmanager
+def serving(server: ThreadingHTTPServer) -> Iterator[str]:
+    """Serve as long as the context lasts; yields the address, which ends without a slash."""
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder of wheels while an image is built without a package index; yields the address.
+
+    The classic builder has no mounts, and what is copied into an image stays in its layers. So pip
+    gets the wheels over HTTP from this machine, while the build uses this machine's network; only
+    programs of this machine reach the server.
 
     Raises:
-        EnvironmentFault: if it cannot be had.
+        EnvironmentFault: if there are no wheels.
     """
-    if not newest:
-        with contextlib.suppress(APIError):
-            return engine.images.get(name)
+    if not any(folder.glob("*.whl")):
+        raise EnvironmentFault(f"--wheelhouse {folder}: there are no wheels (*.whl) in this folder")
+    with serving(_server(folder)) as address:
+        yield f"{address}/"
+
+
+def _server(folder: Path) -> ThreadingHTTPServer:
+    """At the same port for the same folder, if that is free: the builder caches by address."""
+    handler = partial(_Handler, directory=str(folder))
     try:
-        return engine.images.pull(name, None if ":" in name.rpartition("/")[2] else "latest")
-    except APIError as error:
-        remedy = "docker load it, or name one that the engine has with --base-image"
-        with contextlib.suppress(APIError):
-            engine.images.get(name)
-            remedy = "leave out --pull to use the one that the engine has"
-        raise EnvironmentFault(
-            f"image '{name}' cannot be pulled ({error.explanation or error}): {remedy}"
-        ) from error
+        port = 20000 + zlib.crc32(bytes(folder.resolve())) % 10000
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except OSError:
+        return ThreadingHTTPServer(("127.0.0.1", 0), handler)
 
 
 class BuildLog:
@@ -286,16 +300,6 @@ class BuildLog:
                 self._lines.append(line.rstrip())
                 if line.startswith("Step ") or re.match(r"\s*(Collecting|Downloading)", line):
                     self._show(line.strip())
-
-
-_HEREDOCS_SINCE = (23, 0)
-_IMAGE_ID = re.compile(r"\bsha256:([0-9a-f]{12})[0-9a-f]{52}\b")
-_TEMPORARY = "neuros_begin"
-_WRAPPED = re.compile(
-    r"^((failed to solve( with frontend \S+)?|failed to create LLB definition): )+"
-)
-_TRACE = "moby.buildkit.trace"
-_BY_HAND = "or build the image by hand (docker build -t NAME) and put its NAME into the project"
 
 
 def require_buildkit(

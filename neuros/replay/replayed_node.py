@@ -1,11 +1,16 @@
-"""Replays one node of a recorded run: the real plugin on the real engine, with recorded packets."""
+"""Replays one node of a recorded run: the real plugin on the real engine, with recorded packets.
+
+At the end of the module are the debuggers that it can run under.
+"""
 
 from __future__ import annotations
 
+import bdb
+import pdb
 import queue
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,18 +21,18 @@ from neuros.analysis.recorded_node import RecordedNode
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import is_whole
 from neuros.engine.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
-from neuros.errors import NeurosError
+from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.hooks import HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
-from neuros.replay.debugging import is_quit
 from neuros.transport.compression import Traffic
 from neuros.transport.messages import decode, message_class
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
 _LOOK_S = 0.1
+_DEBUGPY_HOST = "127.0.0.1"
 
 SIDES = ("the run", "the replay")
 
@@ -224,7 +229,7 @@ class ReplayedNode:
             try:
                 event = self._loop.from_threads.get(timeout=_LOOK_S)
             except queue.Empty:
-                if _has_threads():
+                if threading.active_count() > 1:
                     continue
                 raise ReplayParted(
                     "a thread of the plugin sent packets in the run, but no thread does in the"
@@ -282,13 +287,63 @@ class ReplayedNode:
             self._runtime.failures.log(error)
 
 
-def _has_threads() -> bool:
-    """Whether a thread besides this one is there."""
-    return threading.active_count() > 1
-
-
 def files_changed_since(run_folder: Path, file: NodeFile) -> list[Path]:
     """The plugin, and Python files beside it, that were changed after the run had begun."""
     begun = (run_folder / "project.json").stat().st_mtime
     beside = sorted(file.node.plugin.parent.glob("*.py"))
     return [path for path in beside if path.stat().st_mtime > begun]
+
+
+class Debugger:
+    """Python's own debugger, at the start of every hook and after a failure."""
+
+    def __init__(self) -> None:
+        self._pdb = pdb.Pdb(nosigint=True, readrc=False)
+
+    def run(self, action: Callable[[], None], functions: Iterable[Any]) -> None:
+        """Run ``action`` with a breakpoint at the start of each of these functions."""
+        for function in functions:
+            code = function.__code__
+            self._pdb.set_break(code.co_filename, code.co_firstlineno, funcname=code.co_name)
+        self._pdb.rcLines = ["continue"]  # it would stop in NeuROS first
+        self._pdb.runcall(action)
+
+    def look_at(self, error: BaseException) -> None:
+        """Let the user look at where an error came from."""
+        print(f"{type(error).__name__}: {error}")
+        self._pdb.reset()
+        self._pdb.interaction(None, error.__traceback__)
+
+
+def is_quit(error: BaseException | None) -> bool:
+    """Whether the user has left a debugger, or pressed Ctrl+C: anywhere in an error's causes."""
+    while error is not None:
+        if isinstance(error, bdb.BdbQuit | KeyboardInterrupt):
+            return True
+        error = error.__cause__
+    return False
+
+
+@contextmanager
+def debugpy_on(port: int | None) -> Iterator[None]:
+    """Wait for an editor to attach, if a port is given.
+
+    Raises:
+        EnvironmentFault: if debugpy is not installed.
+        UsageError: if the port cannot be used.
+    """
+    if port is not None:
+        try:
+            import debugpy
+        except ImportError as error:
+            raise EnvironmentFault(
+                "--debugpy: debugpy is not installed for the Python of this node:"
+                " pip install debugpy, or use --pdb"
+            ) from error
+        try:
+            debugpy.listen((_DEBUGPY_HOST, port))
+        except (RuntimeError, OSError) as error:
+            raise UsageError(f"--debugpy {port}: {error}") from error
+        print(f"waiting for a debugger to attach to {_DEBUGPY_HOST}:{port}", flush=True)
+        debugpy.wait_for_client()
+    yield

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.analysis.run_record import PastRun
-from neuros.replay.containers import note_on_versions
+from neuros.replay.from_container import note_on_versions
 
 
 def versions(python: str = "3.11.2", **packages: str) -> dict[str, Any]:

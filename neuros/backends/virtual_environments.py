@@ -1,0 +1,504 @@
+"""Virtual environments of containers: what goes into them, how they are made and kept.
+
+On the launcher's own version of Python an environment is a layer: its site-packages have what the
+container asks for and this environment has not, and everything else is found in this environment.
+On another version of Python it has everything, ROS 2 included.
+
+::
+
+    ~/.cache/neuros/environments/     (or $XDG_CACHE_HOME/neuros/environments)
+        <container>-<key>/            a virtual environment
+        <container>-<key>.json        says that it is whole, and which Python to run
+        <container>-<key>.lock        only while somebody makes it
+        <container>-<key>.log         what pip wrote
+
+The ``.json`` is written last, in one step: what was interrupted never looks whole. There are some
+without a folder: they remember that the launcher's own environment does, which saves the next
+start from reading the metadata of packages.
+
+``requirements.txt`` is read as pip reads it, and compared with what is installed here. The format:
+https://pip.pypa.io/en/stable/reference/requirements-file-format/
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuros.backends.containers import ContainerFolder
+from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
+from neuros.distribution import PACKAGE, install_command
+from neuros.errors import EnvironmentFault
+from neuros.installation.machine import clean_environment, dotted, system_install
+from neuros.installation.packages import explain_machine, find_uv, run_installs
+from neuros.installation.progress import Progress
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+Version = tuple[int, int]
+HERE: Version = sys.version_info[:2]
+_FULL_BYTES = 0.6e9  # ROS 2, and pip's copies while it works
+_BOOTSTRAPPER = "ros_wheels_bootstrapper"
+_NONE = re.compile(r"satisfies the requirement (.+?) \(from versions: (.*)\)")
+_CONFLICT = re.compile(r"The conflict is caused by:\n((?: {4}.+\n)+)")
+_FEW = 5
+
+
+def cache_folder(environ: Mapping[str, str]) -> Path:
+    """The folder of all environments."""
+    return cache_root(environ) / "environments"
+
+
+@dataclass(frozen=True)
+class Entry(Kept):
+    """One environment, made or not; the log has what pip wrote."""
+
+    @property
+    def stamp(self) -> Path:
+        return self.beside(".json")
+
+    @property
+    def future_python(self) -> Path:
+        """The Python in it, once it is made."""
+        return self.folder / "bin" / "python"
+
+    def python(self) -> Path | None:
+        """The Python to run, if that has been settled and is there."""
+        try:
+            is_here = json.loads(self.stamp.read_text("utf-8"))["is_here"]
+        except (OSError, ValueError, LookupError, TypeError):
+            return None
+        python = Path(sys.executable) if is_here else self.future_python
+        return python if os.access(python, os.X_OK) else None
+
+    def note_use(self) -> None:
+        """Keep it from being removed as unused."""
+        with contextlib.suppress(OSError):
+            os.utime(self.stamp)
+
+    def settle(self, *, is_here: bool) -> None:
+        """From now on it is whole; or, where ``is_here``, the launcher's own Python does.
+
+        Raises ``OSError``.
+        """
+        self.stamp.parent.mkdir(parents=True, exist_ok=True)
+        draft = self.beside(f".json.{os.getpid()}")
+        try:
+            draft.write_text(json.dumps({"is_here": is_here}), "utf-8")
+            draft.replace(self.stamp)
+        finally:
+            draft.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove it, as far as that is possible; the log stays."""
+        with contextlib.suppress(OSError):
+            for file in self.folder.parent.glob(f"{self.folder.name}.json*"):
+                file.unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def sweep(cache: Path) -> None:
+    """Remove what was interrupted, and what no run has used for a month."""
+    oldest_s = time.time() - UNUSED_S
+    for entry in map(Entry, kept_in(cache)):
+        with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
+            if is_mine and _last_used_s(entry) < oldest_s:
+                entry.remove()
+                entry.log.unlink(missing_ok=True)
+
+
+def _last_used_s(entry: Entry) -> float:
+    """When a run last used it; 0 for a folder that is not whole."""
+    try:
+        return entry.stamp.stat().st_mtime
+    except FileNotFoundError:
+        is_log_alone = not entry.folder.exists() and entry.log.exists()
+        return entry.log.stat().st_mtime if is_log_alone else 0.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The Python and the packages of a container.
+
+    Attributes:
+        version: the Python that it is to run on.
+        entry: its place in the cache.
+        lacks: what this environment lacks, in words, as far as that had to be found out.
+        base: the interpreter to make its environment with; ``None`` if nothing is to be made.
+        notice: what the user should know, or empty.
+    """
+
+    container: ContainerFolder
+    requirements: Requirements
+    version: Version
+    entry: Entry
+    lacks: tuple[str, ...] = ()
+    base: Path | None = None
+    notice: str = ""
+
+    @property
+    def is_layered(self) -> bool:
+        """Whether its environment lies on top of this one, and has only what differs."""
+        return self.version == HERE
+
+    @property
+    def path(self) -> Path:
+        """Its Python, which may have to be made first."""
+        if self.base is not None:
+            return self.entry.future_python
+        return self.entry.python() or Path(sys.executable)
+
+    def settle(self) -> None:
+        """Remember for later starts that it is in use, or that this very Python does.
+
+        Raises ``OSError``.
+        """
+        if self.base is not None:
+            return
+        if self.entry.python() is None:
+            self.entry.settle(is_here=True)
+        self.entry.note_use()
+
+
+def own_needs() -> list[str]:
+    """The requirements of NeuROS itself; empty if it is not installed here."""
+    try:
+        needs = importlib.metadata.requires("neuros") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    return [need for need in needs if "extra ==" not in need]
+
+
+def packages_here() -> list[Path]:
+    """The folders of this Python with installed packages, those that are found first first."""
+    return [Path(p) for p in sys.path if Path(p).name in ("site-packages", "dist-packages")]
+
+
+def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+    """Make the environment, unless another launch has made it meanwhile.
+
+    Args:
+        run_environment: is added to the environment of the programs that this starts.
+
+    Raises:
+        EnvironmentFault: with a sentence for the user; then nothing of it is left but the log.
+    """
+    try:
+        choice.entry.folder.parent.mkdir(parents=True, exist_ok=True)
+        with choice.entry.locked(wait=False) as is_mine:
+            if is_mine:
+                return _make(choice, progress, run_environment)
+        progress.step(f"waiting for another launch that makes {_words(choice)}")
+        with choice.entry.locked():
+            _make(choice, progress, run_environment)
+    except OSError as error:
+        raise _fault(choice, why_no_files(error, choice.entry.folder.parent)) from error
+
+
+def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+    """Make it, under the lock."""
+    entry = choice.entry
+    if entry.python():
+        return
+    entry.remove()  # what an interrupted run has left
+    try:
+        _make_venv(choice, progress, run_environment)
+        _add_links(choice)
+        _install(choice, progress, run_environment)
+        entry.settle(is_here=False)
+    except BaseException:
+        entry.remove()
+        raise
+
+
+def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+    folder, because = choice.entry.folder, f" ({', '.join(choice.lacks)})" if choice.lacks else ""
+    progress.step(f"making {_words(choice)}{because}: {folder}")
+    free_bytes = shutil.disk_usage(folder.parent).free
+    if not choice.is_layered and free_bytes < _FULL_BYTES:
+        raise _fault(
+            choice,
+            f"{folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment needs"
+            f" {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
+        )
+    # A layer finds pip where it finds the rest.
+    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
+    made = subprocess.run(
+        [str(choice.base), "-m", "venv", *options, str(folder)],
+        env={**clean_environment(os.environ), **run_environment},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if made.returncode:
+        output = (made.stdout + made.stderr).strip()
+        raise _fault(choice, why_no_venv(output, dotted(choice.version)))
+
+
+def _add_links(choice: Choice) -> None:
+    """Give it this NeuROS, and, if it is a layer, what is here."""
+    folder = choice.entry.folder
+    site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
+    (site_packages / "neuros").symlink_to(PACKAGE, target_is_directory=True)
+    if choice.is_layered:
+        rows = [str(path) for path in packages_here()]
+        if _is_here(_BOOTSTRAPPER):
+            _link_libraries(folder, site_packages)
+            rows.append(f"import {_BOOTSTRAPPER}")
+        # Lines of a .pth file come behind what is in the environment itself.
+        layer = "".join(f"{row}\n" for row in rows)
+        (site_packages / "neuros_layer.pth").write_text(layer, "utf-8")
+
+
+def _link_libraries(folder: Path, site_packages: Path) -> None:
+    """The wheels of ROS 2 look for their libraries and files below the prefix of their Python."""
+    prefix = Path(sys.prefix)
+    libraries = [path for path in (prefix / "lib").iterdir() if not path.name.startswith("python")]
+    for path in (*libraries, prefix / "share"):
+        link = folder / path.relative_to(prefix)
+        if path.exists() and not link.exists():
+            link.symlink_to(path)
+    for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
+        (site_packages / path.name).symlink_to(path)
+
+
+def _is_here(package: str) -> bool:
+    return any((folder / package).is_dir() for folder in packages_here())
+
+
+def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+    entry, needs = choice.entry, own_needs()
+    wanted = ["--requirement", str(choice.requirements.file)]
+    # With hashes, pip refuses what has none: then what NeuROS needs comes first, by itself.
+    calls = [[*wanted, *needs]]
+    if choice.requirements.has_hashes:
+        calls = [needs, ["--require-hashes", *wanted]]
+    if not needs:
+        cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
+        raise _fault(choice, cause)
+    progress.step(f"installing {choice.requirements.file} (log: {entry.log})")
+    environ = {**clean_environment(os.environ), **run_environment}
+    # uv does not see what a layer finds in this environment, and would install all of it again.
+    uv = None if choice.is_layered else find_uv(Path(sys.executable), environ)
+    entry.log.unlink(missing_ok=True)
+    output = run_installs(
+        entry.future_python, uv, calls, entry.folder, entry.log, progress, environ
+    )
+    if output is not None:
+        cause = why_pip_failed(output, dotted(choice.version), needs)
+        raise _fault(choice, f"{cause} (log: {entry.log})")
+
+
+def _words(choice: Choice) -> str:
+    name = choice.container.name
+    return f"the environment of container '{name}', Python {dotted(choice.version)}"
+
+
+def _fault(choice: Choice, cause: str) -> EnvironmentFault:
+    return EnvironmentFault(
+        f"container '{choice.container.name}': {choice.requirements.file} is not satisfied here,"
+        f" and its environment cannot be made: {cause}"
+    )
+
+
+def why_pip_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
+    """The cause in the output of pip, for a version of Python as ``3.12``.
+
+    ``own_needs`` are the requirements of NeuROS itself that pip was given, too.
+    """
+    if sentence := explain_machine(output, again="launch"):
+        return sentence
+    if none := _NONE.search(output):
+        return f"no {none[1]} exists for Python {python} ({_there_is(none[2].split(', '))})"
+    if conflict := _CONFLICT.search(output):
+        rows = "; ".join(row.strip() for row in conflict[1].splitlines())
+        own = [need for need in own_needs if re.search(rf"\b{_name_of(need)}\b", rows)]
+        return f"these exclude each other: {rows}" + "".join(f"; NeuROS needs {n}" for n in own)
+    errors = re.findall(r"^ERROR: (.+)", output, re.MULTILINE)
+    return errors[0] if errors else "pip failed"
+
+
+def why_no_venv(output: str, python: str) -> str:
+    """The cause in the output of ``venv``."""
+    if re.search(r"ensurepip|No module named '?venv", output):
+        remedy = system_install(apt=f"python{python}-venv", dnf="python3-pip")
+        return f"Python {python} has no venv: {remedy}"
+    rows = output.splitlines() or ["venv failed"]
+    return explain_machine(output) or rows[-1]
+
+
+def why_no_files(error: OSError, cache: Path) -> str:
+    """The cause in an error of the cache's folder."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"the disk of {cache} is full: make room (df -h), or set XDG_CACHE_HOME"
+    return f"{error.filename or cache}: {error.strerror}: set XDG_CACHE_HOME to another folder"
+
+
+def _there_is(versions: Sequence[str]) -> str:
+    if list(versions) == ["none"]:
+        return "pip finds no package of that name"
+    more = "..., " if len(versions) > _FEW else ""
+    return f"there is {more}{', '.join(versions[-_FEW:])}"
+
+
+def _name_of(requirement: str) -> str:
+    match = re.match(r"[\w.-]+", requirement)
+    return re.escape(match[0]) if match else ""
+
+
+_COMMENT = re.compile(r"(^|\s+)#.*$")
+_INCLUDE = re.compile(r"(-r|-c|--requirement|--constraint)(?:\s+|=|(?<=-[rc]))(?P<file>\S.*)")
+_OPTION = re.compile(r"\s--?\w.*$")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One requirement, or an option of pip.
+
+    Attributes:
+        is_constraint: whether it applies only if something else asks for the package.
+    """
+
+    text: str
+    is_constraint: bool = False
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """A ``requirements.txt`` with all files that it includes.
+
+    Attributes:
+        digest: changes with the content of any of them.
+    """
+
+    file: Path
+    lines: tuple[Line, ...]
+    digest: str
+
+    @property
+    def has_hashes(self) -> bool:
+        """Whether pip refuses packages without a hash."""
+        return any("--hash" in line.text for line in self.lines)
+
+
+def read_requirements(file: Path) -> Requirements:
+    """Read a file and what it includes.
+
+    Raises:
+        EnvironmentFault: if one of them cannot be read.
+    """
+    digest = hashlib.sha256()
+    lines: list[Line] = []
+    seen: set[tuple[Path, bool]] = set()
+
+    def read(path: Path, is_constraint: bool) -> None:
+        if (path.resolve(), is_constraint) in seen:
+            return
+        seen.add((path.resolve(), is_constraint))
+        text = _text(path)
+        digest.update(f"{is_constraint} {len(text)} {text}".encode())
+        for row in _rows(text):
+            include = _INCLUDE.fullmatch(row)
+            if include and "://" not in include["file"]:
+                read(path.parent / include["file"], is_constraint or "c" in include[1])
+            else:
+                lines.append(Line(row, is_constraint))
+
+    read(file, False)
+    return Requirements(file, tuple(lines), digest.hexdigest())
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text("utf-8-sig")
+    except OSError as error:
+        raise EnvironmentFault(f"{file} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise EnvironmentFault(f"{file} is not valid UTF-8: save it as UTF-8") from error
+
+
+def _rows(text: str) -> Iterator[str]:
+    """Lines without comments; a backslash at the end joins a line to the next."""
+    for row in re.sub(r"\\\r?\n", "", text).splitlines():
+        stripped = _COMMENT.sub("", row).strip()
+        if stripped:
+            yield stripped
+
+
+def unmet(requirements: Requirements, *, any_version: bool = False) -> list[str]:
+    """Requirements that this environment lacks, in words; empty if it lacks none.
+
+    Args:
+        any_version: whether it is enough that a package is there.
+    """
+    found = [
+        lack
+        for line in requirements.lines
+        if not line.text.startswith("-") or line.text.startswith(("-e", "--editable"))
+        for lack in _lacks(line, any_version)
+    ]
+    return list(dict.fromkeys(found))
+
+
+def _lacks(line: Line, any_version: bool) -> Iterator[str]:
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    text = _OPTION.sub("", line.text)
+    try:
+        requirement = Requirement(text)
+    except InvalidRequirement:  # a path, an address, or a mistake: pip knows
+        yield line.text
+        return
+    pending, seen = [(requirement, "")], {""}
+    while pending:
+        wanted, extra = pending.pop()
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
+            continue
+        installed = _installed(wanted.name)
+        if installed is None:
+            if not line.is_constraint:
+                yield f"{_without_marker(wanted)} (not installed)"
+            continue
+        if not (any_version or _fits(wanted, installed)):
+            yield f"{_without_marker(wanted)} ({installed.version} is installed)"
+            continue
+        # What an extra adds is a requirement, too; other dependencies came with the package.
+        for name in wanted.extras - seen:
+            seen.add(name)
+            needs = [Requirement(need) for need in installed.requires or () if "extra" in need]
+            pending += [(need, name) for need in needs]
+
+
+def _installed(name: str) -> importlib.metadata.Distribution | None:
+    """A package of this environment; ``None`` also for what an interrupted pip has left of one."""
+    try:
+        found = importlib.metadata.distribution(name)
+        return found if found.version else None
+    except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
+        return None
+
+
+def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
+    if wanted.url:
+        origin = installed.read_text("direct_url.json")
+        return origin is not None and json.loads(origin).get("url") == wanted.url
+    return wanted.specifier.contains(installed.version, prereleases=True)
+
+
+def _without_marker(wanted: Requirement) -> str:
+    return str(wanted).partition(";")[0].strip()
