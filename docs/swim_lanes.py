@@ -16,7 +16,7 @@ from pathlib import Path
 
 import neuros
 from neuros.analysis.charts import timeline_figure
-from neuros.analysis.pages import png
+from neuros.analysis.run_pages import png
 from neuros.analysis.run_record import open_for_review
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -120,7 +120,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "replay.replayed_node": {"debugpy"},
     "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
     "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
-    "visualise.figures": {"numpy"},
+    "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},
     "bag": {"rosbags", "numpy"},

@@ -237,7 +237,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.findings import findings_of
-    from neuros.analysis.pages import panels_page, report_page, world_pages
+    from neuros.analysis.run_pages import panels_page, report_page, world_pages
     from neuros.analysis.run_record import open_for_review
 
     run = open_for_review(options.run)
@@ -270,7 +270,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _figures(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
-    from neuros.analysis.pages import figures_of
+    from neuros.analysis.run_pages import figures_of
 
     try:
         return figures_of(run)
@@ -320,7 +320,7 @@ def _readable(folders: Sequence[Path]) -> tuple[list[PastRun], list[NeurosError]
 def _comparison(runs: list[PastRun], header: list[str], rows: list[list[str]]) -> bytes:
     from neuros.analysis.comparison import comparison_figure, labels_of
     from neuros.analysis.findings import findings_of
-    from neuros.analysis.pages import bottleneck_part, figure_part, page, png, table_part
+    from neuros.analysis.run_pages import bottleneck_part, figure_part, page, png, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")

@@ -8,12 +8,9 @@ import os
 import select
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from neuros.viewers.dashboard.server import Sources
+from typing import Any
 
 _LAST_LOG_BYTES = 1 << 16
 
@@ -78,7 +75,8 @@ async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
     names, pages = tuple(told["names"]), Pages()
     link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
     run = LiveRun(pages, link, names, told["start_s"])
-    dashboard = Dashboard(told["plan"], _sources(told, names), pages, run)
+    logs = {name: Path(path) for name, path in told["logs"].items()}
+    dashboard = Dashboard(told["plan"], lambda: _Log(logs), _load(told, names), pages, run)
     await dashboard.serve(listening, told["token"], told["run"])
 
 
@@ -88,14 +86,12 @@ def _is_looked_at(listening: socket.socket) -> bool:
     return listening in readable
 
 
-def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
+def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mapping[str, Any]]:
     from neuros.api.observation import owner_of_processes
     from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadNow
-    from neuros.viewers.dashboard.server import Sources
 
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
     load_now = LoadNow(LoadMeter(owner))
-    logs = {name: Path(path) for name, path in told["logs"].items()}
 
     def load() -> Mapping[str, Any]:
         load = load_now()
@@ -103,7 +99,7 @@ def _sources(told: Mapping[str, Any], names: tuple[str, ...]) -> Sources:
         load["groups"]["dashboard"] = load["groups"].pop(LAUNCHER)
         return load
 
-    return Sources(lambda: _Log(logs), load)
+    return load
 
 
 class _Log:

@@ -23,7 +23,7 @@ from neuros.project.graph import guarantee
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
 from neuros.viewers.viewer import Shown, Viewer
-from neuros.viewers.windows import open_page
+from neuros.viewers.windows import end_process, open_page
 
 HOST = "127.0.0.1"
 _RERUN_MEMORY = "512MB"
@@ -98,7 +98,7 @@ class _DashboardView:
         if process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
-        _end(process, _END_S)
+        end_process(process, _END_S)
 
 
 class _RerunView:
@@ -135,7 +135,7 @@ class _RerunView:
     def finish(self) -> None:
         """End them with the run: the feeder by itself, then the server."""
         for process in reversed(self._processes):
-            _end(process, _END_S if process is self._processes[-1] else 0)
+            end_process(process, _END_S if process is self._processes[-1] else 0)
 
 
 class _Dashboard(Viewer):
@@ -183,17 +183,6 @@ def _tell(process: subprocess.Popen[bytes], told: Mapping[str, Any]) -> None:
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(json.dumps(told).encode() + b"\n")
         process.stdin.flush()
-
-
-def _end(process: subprocess.Popen[bytes], patience_s: float) -> None:
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(patience_s)
-    process.kill()  # which does nothing to one that has ended
-    process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with contextlib.suppress(BrokenPipeError):
-                pipe.close()
 
 
 def _free_ports(count: int) -> Sequence[int]:

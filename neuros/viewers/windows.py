@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from neuros.backends.docker.launcher import ToolContainer, find_tool_image
@@ -20,7 +19,6 @@ from neuros.viewers.viewer import Shown, Viewer
 
 RVIZ_FILE = "project.rviz"
 _END_S = 2.0
-_MOST_WAIT_S = 5.0
 
 DISPLAYS = {
     "geometry_msgs/msg/AccelStamped": "Accel",
@@ -53,36 +51,18 @@ _FIXED_FRAME = "map"
 _TOOLS = ("Interact", "MoveCamera", "Select", "FocusCamera", "Measure")
 
 
-@dataclass(frozen=True)
-class Tool:
-    """A tool that can run here.
+class ToolProcess:
+    """A tool as a process of this machine, with the environment of a run.
 
-    Attributes:
-        program: its name.
-        path: where it is, ``None``: in the image ``neuros_tools``.
+    Raises:
+        EnvironmentFault: if it cannot be started.
     """
 
-    program: str
-    path: str | None
-
-    def start(
-        self, arguments: Sequence[str], run: Path, environment: Mapping[str, str]
-    ) -> ToolProcess | ToolContainer:
-        """Start it with the environment of a run. Raises ``EnvironmentFault``."""
-        if self.path is None:
-            return ToolContainer(self.program, arguments, run, environment)
-        command = [self.path, *arguments]
-        log = run / f"{self.program}.log"
-        return ToolProcess(
-            start_sidecar(self.program, command, run, log, environment, is_ours=False)
+    def __init__(self, program: str, command: Sequence[str], run: Shown) -> None:
+        log = run.folder / f"{program}.log"
+        self._process = start_sidecar(
+            program, command, run.folder, log, run.environment, is_ours=False
         )
-
-
-class ToolProcess:
-    """A tool that runs as a process of this machine."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._process = process
 
     def announce(self, reaper: Reaper) -> None:
         """Have it ended if the launcher is killed."""
@@ -90,29 +70,39 @@ class ToolProcess:
 
     def finish(self) -> None:
         """End it with the run."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
         self._process.terminate()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait(_MOST_WAIT_S)
+        end_process(self._process, _END_S)
+
+
+def end_process(process: subprocess.Popen[bytes], patience_s: float) -> None:
+    """Wait for the end of a sidecar process, and no longer than that."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(patience_s)
+    process.kill()  # which does nothing to one that has ended
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
 
 
 class _Window:
-    """A tool on a run."""
+    """A tool on a run; ``path``: where it is, ``None``: in the image ``neuros_tools``."""
 
-    def __init__(self, tool: Tool, arguments: Callable[[Shown], Sequence[str]]) -> None:
-        self._tool = tool
-        self._arguments = arguments
+    def __init__(
+        self, program: str, path: str | None, arguments: Callable[[Shown], Sequence[str]]
+    ) -> None:
+        self._program, self._path, self._arguments = program, path, arguments
         self._running: ToolProcess | ToolContainer | None = None
 
     def start(self, run: Shown, reaper: Reaper) -> str:
-        self._running = self._tool.start(self._arguments(run), run.folder, run.environment)
+        arguments = self._arguments(run)
+        if self._path is None:
+            self._running = ToolContainer(self._program, arguments, run.folder, run.environment)
+        else:
+            self._running = ToolProcess(self._program, [self._path, *arguments], run)
         self._running.announce(reaper)
-        return f"{self._tool.program}: a window on this display"
+        return f"{self._program}: a window on this display"
 
     def finish(self) -> None:
         if self._running is not None:
@@ -132,7 +122,7 @@ class _ToolViewer(Viewer):
             raise EnvironmentFault(
                 "nodes of one process talk past ROS, where its tools see nothing"
             )
-        return _Window(find_tool(self.name), self._arguments)
+        return _Window(self.name, find_tool(self.name), self._arguments)
 
 
 def _configured(run: Shown) -> Sequence[str]:
@@ -158,14 +148,17 @@ def open_page(url: str) -> None:
         webbrowser.open(url)
 
 
-def find_tool(program: str, environ: Mapping[str, str] = os.environ) -> Tool:
-    """The tool. Raises ``EnvironmentFault``: in a few words why it cannot run here."""
+def find_tool(program: str, environ: Mapping[str, str] = os.environ) -> str | None:
+    """The path of a tool, ``None`` if it is in the image ``neuros_tools``.
+
+    Raises ``EnvironmentFault``: in a few words why it cannot run here.
+    """
     if not has_display(environ):
         raise EnvironmentFault(f"{program} needs a display")
     path = shutil.which(program, path=environ.get("PATH"))
     if path is None and (reason := find_tool_image(environ)):
         raise EnvironmentFault(f"{program} is not on PATH, and {reason}")
-    return Tool(program, path)
+    return path
 
 
 def rviz_configuration(project: Project) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuros.analysis import pages
+from neuros.analysis import run_pages
 from neuros.analysis.run_record import PastRun
 from neuros.node.logs import WORLD_LOG, WorldLog
 
@@ -58,7 +58,7 @@ def log(run: PastRun) -> WorldLog:
 
 def scenes(run: PastRun) -> list[dict[str, Any]]:
     """What the page of the robot holds."""
-    found = pages.world_pages(run)
+    found = run_pages.world_pages(run)
     assert [*found] == ["robot"]
     text = found["robot"].partition('<script type="application/json" id="scenes">')[2]
     found: list[dict[str, Any]] = json.loads(text.partition("</script>")[0])
@@ -69,7 +69,7 @@ def scenes(run: PastRun) -> list[dict[str, Any]]:
 
 
 def test_a_run_without_a_recorded_world_has_no_page(run: PastRun) -> None:
-    assert pages.world_pages(run) == {}
+    assert run_pages.world_pages(run) == {}
 
 
 def test_frames_are_in_their_order_and_geometry_is_kept_once(run: PastRun, log: WorldLog) -> None:
@@ -108,7 +108,7 @@ def test_what_stands_still_is_one_frame_and_time_goes_on_after_a_reset(
 def test_of_a_long_recording_every_kth_frame_is_shown(
     run: PastRun, log: WorldLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pages, "MOST_FRAMES", 4)
+    monkeypatch.setattr(run_pages, "MOST_FRAMES", 4)
     world = World()
     for number in range(10):
         world.at(number, number)

@@ -28,8 +28,8 @@ import neuros.bag
 from neuros import control
 from neuros.analysis.comparison import RecordedPackets, compare, comparison_rows
 from neuros.analysis.findings import findings_of
-from neuros.analysis.pages import figures_of, report_page
 from neuros.analysis.recorded_node import RecordedNode, recorded_node
+from neuros.analysis.run_pages import figures_of, report_page
 from neuros.analysis.run_record import open_for_review, open_run
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, encode, kind_of
@@ -49,7 +49,7 @@ from neuros.transport.ros import data_qos
 from neuros.transport.ros_graph import qos_profile
 from neuros.viewers.dashboard.live_metrics import LiveRun
 from neuros.viewers.dashboard.pages import Pages
-from neuros.viewers.dashboard.server import Dashboard, Sources
+from neuros.viewers.dashboard.server import Dashboard
 from tests.message_packages import MANIFEST
 from tests.message_values import message_classes
 from tests.recording.recordings import NUMBER, number, plan, spool
@@ -460,7 +460,7 @@ async def answer(
     """The status of the answer of a dashboard; ``None`` where it goes on for ever."""
     here, there = socket.socketpair()
     pages, link = Pages(), ControlLink(here, control.TO_OBSERVERS, "the supervisor")
-    dashboard = Dashboard({}, Sources(lambda: None, dict), pages, LiveRun(pages, link, ("a",), 0.0))  # type: ignore[arg-type, return-value]
+    dashboard = Dashboard({}, lambda: None, dict, pages, LiveRun(pages, link, ("a",), 0.0))  # type: ignore[arg-type, return-value]
     app = dashboard.app(TOKEN, "0123456789abcdef")
     statuses: list[int] = []
     scope = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import EnvironmentFault
-from neuros.viewers.windows import Tool, find_tool, has_display
+from neuros.viewers.windows import find_tool, has_display
 
 NO_ENGINE = {"DOCKER_HOST": "unix:///nowhere.sock"}
 
@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_tool_on_the_path_runs_where_there_is_a_display(folder: Path) -> None:
     environ = {"PATH": str(folder), "DISPLAY": ":1", **NO_ENGINE}
-    assert find_tool("rqt_graph", environ) == Tool("rqt_graph", str(folder / "rqt_graph"))
+    assert find_tool("rqt_graph", environ) == str(folder / "rqt_graph")
 
 
 def test_without_a_display_no_tool_runs(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -122,10 +123,8 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         if 0 < effort < _NO_LIMIT:
             joint.actfrcrange, joint.actfrclimited = [-effort, effort], True
         velocity = limit.child("velocity")
-        if velocity is not None and not 0 <= limit.number("velocity", -1) < _NO_LIMIT:
-            velocity.take_all()
-        elif velocity is not None:
-            velocity.taken = False
+        if velocity is not None:  # a limit that limits something is listed
+            velocity.taken = not 0 <= limit.number("velocity", -1) < _NO_LIMIT
     dynamics = axis.child("dynamics")
     if dynamics is not None:
         set_first(joint, "damping", dynamics.number("damping", 0.0))
@@ -155,12 +154,17 @@ def _follow(building: Building, joint: str, leader: str, offset: float, ratio: f
 
 def follow_joint(spec: Any, joint: str, leader: str, offset: float, ratio: float) -> Any:
     """Add the constraint to a spec, without a name of its own; returns it."""
-    equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
-    equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
-    equality.name1, equality.name2 = joint, leader
-    data = np.zeros(len(equality.data))
-    data[:2] = offset, ratio
-    equality.data = data
+    return _add_equality(
+        spec, mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT, (joint, leader), [offset, ratio]
+    )
+
+
+def _add_equality(
+    spec: Any, kind: Any, sort: Any, names: tuple[str, str], data: Sequence[float]
+) -> Any:
+    first, second = names
+    equality = spec.add_equality(type=kind, objtype=sort, name1=first, name2=second)
+    equality.data = np.pad(data, (0, len(equality.data) - len(data)))
     return equality
 
 
@@ -208,17 +212,13 @@ def close_loop(building: Building, joint: Joint) -> None:
 
 def _hold(building: Building, joint: Joint, kind: object, point: Vector, suffix: str = "") -> None:
     first, second = joint.child or joint.parent, joint.parent if joint.child else None
-    equality = building.spec.add_equality(type=kind)
-    equality.objtype = mujoco.mjtObj.mjOBJ_BODY
-    equality.name = building.name("equality", joint.name + suffix, joint.element)
-    equality.name1 = building.body(first).name
-    equality.name2 = building.body(second).name if second else "world"
-    data = np.zeros(len(equality.data))
+    names = building.body(first).name, building.body(second).name if second else "world"
+    # As much against turning as against moving; the pose is the present one.
+    data: Any = [*[0.0] * 10, 1.0]
     if kind == _CONNECT and first is not None:
-        data[:3] = first.pose.inverse().rotation @ (point - first.pose.position)
-    elif kind == _WELD:
-        data[10] = 1.0  # as much against turning as against moving; the pose is the present one
-    equality.data = data
+        data = first.pose.inverse().rotation @ (point - first.pose.position)
+    equality = _add_equality(building.spec, kind, mujoco.mjtObj.mjOBJ_BODY, names, data)
+    equality.name = building.name("equality", joint.name + suffix, joint.element)
 
 
 def add_actuators(building: Building, scope: Scope) -> None:

@@ -23,7 +23,6 @@ import secrets
 import socket
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import SplitResult, quote, urlencode, urlsplit
@@ -81,34 +80,26 @@ class LogSource(Protocol):
     def close(self) -> None: ...
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Readings of this machine while a page is open.
-
-    Attributes:
-        open_log: begins to read the logs, with the last lines that there are.
-        load: the load of the machine and of each node, since it was last asked; JSON-serialisable.
-    """
-
-    open_log: Callable[[], LogSource]
-    load: Callable[[], Mapping[str, Any]]
-
-
 class Dashboard:
     """Serves one run until that is over.
 
     Args:
         plan: what :func:`neuros.viewers.web.project_view` tells of the project.
+        open_log: begins to read the logs, with the last lines that there are.
+        load: the load of the machine and of each node, since it was last asked; JSON-serialisable.
         pages: shared with ``run``.
     """
 
     def __init__(
-        self, plan: Mapping[str, Any], sources: Sources, pages: Pages, run: LiveRun
+        self,
+        plan: Mapping[str, Any],
+        open_log: Callable[[], LogSource],
+        load: Callable[[], Mapping[str, Any]],
+        pages: Pages,
+        run: LiveRun,
     ) -> None:
-        self._plan = plan
-        self._sources = sources
-        self._pages = pages
-        self._run = run
+        self._plan, self._open_log, self._load = plan, open_log, load
+        self._pages, self._run = pages, run
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
 
     async def serve(self, listening: socket.socket, token: str, run: str) -> None:
@@ -204,7 +195,7 @@ class Dashboard:
     async def _read_logs(self) -> None:
         while True:
             await self._pages.are_watched.wait()
-            log = self._sources.open_log()
+            log = self._open_log()
             try:
                 while self._pages.are_watched.is_set():
                     lines = log.read()
@@ -221,7 +212,7 @@ class Dashboard:
     async def _read_load(self) -> None:
         while True:
             await self._pages.are_watched.wait()
-            self._pages.send("load", await asyncio.to_thread(self._sources.load))
+            self._pages.send("load", await asyncio.to_thread(self._load))
             await asyncio.sleep(_LOAD_S)
 
 

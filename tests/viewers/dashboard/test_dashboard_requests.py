@@ -14,7 +14,7 @@ from neuros.control import TO_OBSERVERS
 from neuros.control.link import ControlLink
 from neuros.viewers.dashboard.live_metrics import LiveRun
 from neuros.viewers.dashboard.pages import Pages
-from neuros.viewers.dashboard.server import Dashboard, Sources
+from neuros.viewers.dashboard.server import Dashboard
 
 TOKEN = "secret"
 
@@ -26,7 +26,7 @@ class Server:
         here, self._there = socket.socketpair()
         pages, link = Pages(), ControlLink(here, TO_OBSERVERS, "the supervisor")
         run = LiveRun(pages, link, ("a",), 0.0)
-        dashboard = Dashboard({}, Sources(lambda: None, dict), pages, run)  # type: ignore[arg-type]
+        dashboard = Dashboard({}, lambda: None, dict, pages, run)  # type: ignore[arg-type]
         self._app = dashboard.app(TOKEN, "0123456789abcdef")
         self._link = link
 
