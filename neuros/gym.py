@@ -141,6 +141,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         except BaseException:
             self.session.close()
             raise
+        self._outputs = {each.port: self.session[each.port] for each in self._observations}
         self._has_one_action = isinstance(action, str)
         self._has_one_observation = isinstance(observation, str)
         self.action_space = _space(self._actions, is_one=self._has_one_action)
@@ -161,9 +162,8 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         self.session.reset(seed=episode)
         if self._initial_action is not None:
             self._send(self._initial_action)
-        outputs = [self.session[each.port] for each in self._observations]
         for _ in range(_MOST_ROUNDS):
-            silent = [output for output in outputs if not output.count]
+            silent = [output for output in self._outputs.values() if not output.count]
             if not silent:
                 self.action, self.observation = None, self._observe()
                 return self.observation, self._info()
@@ -213,7 +213,8 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
                 self.session.send(end, message)
 
     def _observe(self) -> Any:
-        found = {n.name: n.read(self.session[n.port].packet) for n in self._observations}
+        packets = {name: output.packet for name, output in self._outputs.items()}
+        found = {each.name: each.read(packets[each.port]) for each in self._observations}
         return next(iter(found.values())) if self._has_one_observation else found
 
     def _info(self) -> dict[str, Any]:
@@ -288,14 +289,14 @@ class _Numbers:
         values = self._get(message)
         if self._is_flat:
             return np.array(values, self._dtype).reshape(self._shape)
-        parts = [np.asarray(value, self._dtype).ravel() for value in values]
+        parts = [np.array(value, self._dtype).reshape(-1) for value in values]
         for leaf, part, size in zip(self._leaves, parts, self._sizes, strict=True):
             if part.size != size:
                 raise UsageError(
                     f"{self.port}.{_path(leaf)} holds {part.size} numbers, not {size}: say so in"
                     " brackets"
                 )
-        return np.concatenate(parts).reshape(self._shape)
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(self._shape)
 
     def message(self, values: Any) -> Any:
         """A message with these numbers."""
@@ -303,8 +304,7 @@ class _Numbers:
         if flat.size != sum(self._sizes):
             raise UsageError(f"{self.name} takes {sum(self._sizes)} numbers, not {flat.size}")
         for leaf, size in zip(self._leaves, self._sizes, strict=True):
-            convert = _CONVERT[leaf.field.type.sort]
-            numbers = [convert(number) for number in flat[start : start + size].tolist()]
+            numbers = _CONVERT[leaf.field.type.sort](flat[start : start + size])
             owner = reduce(getattr, leaf.path[:-1], message)
             is_one = leaf.field.shape is Shape.SINGLE
             setattr(owner, leaf.path[-1][1:], numbers[0] if is_one else numbers)
@@ -312,11 +312,12 @@ class _Numbers:
         return message
 
 
-_CONVERT: Mapping[Sort, Callable[[float], Any]] = {
-    Sort.BOOL: bool,
-    Sort.INTEGER: round,
-    Sort.FLOAT: float,
+_CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
+    Sort.BOOL: lambda numbers: numbers.astype(bool).tolist(),
+    Sort.INTEGER: lambda numbers: [round(number) for number in numbers.tolist()],
+    Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
 }
+"""From an array of numbers to values of a field."""
 
 
 def _listed(names: str | Sequence[str]) -> Sequence[str]:

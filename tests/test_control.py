@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import MISSING, fields
+from itertools import accumulate
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from neuros import control
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
-    FROM_SESSION,
     TO_NODES,
     TO_OBSERVERS,
-    TO_SESSION,
     Ended,
     Finalising,
     HookDeclaration,
@@ -28,14 +31,13 @@ from neuros.control import (
     Report,
 )
 from neuros.control.link import ControlLink, decode, encode, kind_of
+from neuros.control.steps import Advance, Advanced, StepLink
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "control_channel.md"
-MESSAGES = dict.fromkeys(
-    [*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS, *FROM_SESSION, *TO_SESSION]
-)
+MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS])
 ACCEPTED = {kind_of(each): each for each in MESSAGES}
 METRICS: Any = {"state": {"state": "idle", "cause": ""}, "executing": None, "hooks": {}}
 METRICS |= {"outgoing": {"a.o -> b.x": {"sent": 1}}, "incoming": {}, "accounting": {}}
@@ -189,11 +191,64 @@ def table(kinds: Any) -> str:
         ("To node processes", TO_NODES),
         ("From an observer", FROM_OBSERVERS),
         ("To observers", TO_OBSERVERS),
-        ("From a session to its nodes", FROM_SESSION),
-        ("To a session from its nodes", TO_SESSION),
     ],
 )
 def test_the_page_shows_the_messages_as_they_are(title: str, kinds: Any) -> None:
     text = PAGE.read_text("utf-8")
     section = re.split(rf"^### {title}$", text, flags=re.MULTILINE)[1]
     assert section.split("\n### ")[0].split("\n## ")[0].strip() == table(kinds)
+
+
+STEPS = [
+    Advance(1, 1, {}, []),
+    Advance(7, 2, {"robot.imu": 3}, [("robot", "wheels", b"abcd"), ("robot", "arm", b"")]),
+    Advanced(7, {"robot": 0.25}, {"robot.imu": (4, b"12345678"), "robot.eye": (1, bytes(200_000))}),
+    Advanced(8, {}, {}),
+]
+
+
+def read_in_pieces(data: bytes, kind: Any, sizes: list[int]) -> list[Any]:
+    """The messages in these bytes, of which reads bring so many each."""
+    pieces = [data[end - size : end] for size, end in zip(sizes, accumulate(sizes), strict=True)]
+    stream: Any = SimpleNamespace(recv=lambda _: pieces.pop(0))
+    link: StepLink[Any] = StepLink(stream, kind, "the session")
+    return [message for _ in sizes for message in link.receive() or ()]
+
+
+@given(st.lists(st.sampled_from(STEPS), max_size=4), st.data())
+def test_a_step_comes_out_as_it_went_in_however_its_bytes_arrive(
+    steps: list[Any], data: st.DataObject
+) -> None:
+    for kind in (Advance, Advanced):
+        sent = [each for each in steps if type(each) is kind]
+        stream = b"".join(each.to_frame() for each in sent)
+        sizes, left = [], len(stream)
+        while left:
+            sizes.append(data.draw(st.integers(1, left)))
+            left -= sizes[-1]
+        assert read_in_pieces(stream, kind, sizes) == sent
+
+
+@pytest.mark.parametrize(
+    ("head", "body"),
+    [
+        (b"nothing", b""),
+        (b"[1, 1, {}]", b""),
+        (b"[1, 1, {}, [], 5]", b""),
+        (b'["1", 1, {}, []]', b""),
+        (b"[1, true, {}, []]", b""),
+        (b'[1, 1, {"a.x": "new"}, []]', b""),
+        (b'[1, 1, {}, [["a", "x", 3]]]', b"1234"),
+        (b'[1, 1, {}, [["a", "x", -4], ["a", "y", 8]]]', b"1234"),
+        (b'[1, 1, {}, [["a", 5, 4]]]', b"1234"),
+        (b'[1, 1, {}, [["a", 4]]]', b"1234"),
+        (b"[" * 100_000, b""),
+        (b"\xff", b""),
+    ],
+)
+def test_a_frame_that_is_no_step_is_refused_by_the_name_of_its_sender(
+    head: bytes, body: bytes
+) -> None:
+    frame = struct.pack("<II", len(head), len(body)) + head + body
+    with pytest.raises(ControlError, match=r"the session sent a frame that is no step: ."):
+        read_in_pieces(frame, Advance, [len(frame)])

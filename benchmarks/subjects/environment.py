@@ -1,15 +1,17 @@
 """A step of an environment: the half-cheetah as a project, against a bare environment.
 
-Both step the model of Gymnasium by five timesteps of 10 ms (``frame_skip``), with equal actions.
-The bare one does what Gymnasium's ``MujocoEnv`` does.
+All step the model of Gymnasium by five timesteps of 10 ms (``frame_skip``), with equal actions. The
+bare one does what Gymnasium's ``MujocoEnv`` does. The one by hand calls the hooks of the project
+with their messages, one after the other: no engine and no session could be faster than that.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ import numpy as np
 import neuros.gym
 from benchmarks.launching import project_of_plugins
 from benchmarks.measure import Case, Figure, Group, Subject
+from benchmarks.plugins import cheetah
+from neuros.testing import PluginHarness
 
-NEUROS, BARE = "in process", "a bare environment"
+NEUROS, BY_HAND, BARE = "in process", "by hand", "a bare environment"
 FRAME_SKIP = 5
 MODEL = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "half_cheetah.xml"
 JOINTS = ("rootx", "rootz", "rooty", "bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
@@ -36,11 +40,16 @@ def subject(is_quick: bool) -> Subject:
     steps = EPISODE if is_quick else 2 * EPISODE
     candidates = {
         NEUROS: functools.partial(times_of_neuros, steps),
+        BY_HAND: functools.partial(times_by_hand, steps),
         BARE: functools.partial(times, Bare, steps),
     }
     cases = tuple(
-        Case(name, "us", Figure(NEUROS, figure), Figure(BARE, figure), BARE)
-        for figure, name in (("step", "a step of a cheetah, in process"), ("reset", "its reset"))
+        Case(name, "us", Figure(candidate, figure), Figure(BARE, figure), BARE)
+        for name, candidate, figure in (
+            ("a step of a cheetah, in process", NEUROS, "step"),
+            ("its hooks and messages by hand", BY_HAND, "step"),
+            ("its reset", NEUROS, "reset"),
+        )
     )
     return Subject(
         "a step of an environment for learning, as a project and bare",
@@ -69,8 +78,55 @@ class Bare(gymnasium.Env[Any, Any]):
         return np.concatenate([self._data.qpos, self._data.qvel])
 
 
+class ByHand(gymnasium.Env[Any, Any]):
+    """The node of the project without an engine: its hooks, called with messages.
+
+    Args:
+        harness: gives its ``node`` to the hooks.
+    """
+
+    def __init__(self, harness: PluginHarness) -> None:
+        self._harness = harness
+        cheetah.start(harness.node)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._observed(cheetah.begin(self._harness.node)), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        torques = self._harness.make_packet("torques")
+        torques.data = action.tolist()
+        joints = cheetah.move(self._harness.node, torques)
+        return self._observed(joints), 0.0, False, False, {}
+
+    def _observed(self, joints: Any) -> Any:
+        return np.concatenate([joints.position, joints.velocity])
+
+
 def times_of_neuros(steps: int) -> dict[str, float]:
     """Of a session in a process beside this one."""
+    with project() as folder:
+        make = functools.partial(
+            neuros.gym.make,
+            folder,
+            action=f"cheetah.torques.data[{len(MOTORS)}]",
+            observation=[f"cheetah.joints.{part}[{len(JOINTS)}]" for part in _PARTS],
+            reward=lambda env: 0.0,
+            model=MODEL.name,
+            output=folder / "run",
+        )
+        return times(make, steps)
+
+
+def times_by_hand(steps: int) -> dict[str, float]:
+    """Of hooks and messages alone."""
+    with project() as folder, PluginHarness.from_project(folder, "cheetah") as harness:
+        return times(lambda: ByHand(harness), steps)
+
+
+@contextlib.contextmanager
+def project() -> Iterator[Path]:
+    """The folder of the project, with the model."""
     node = {
         "name": "cheetah",
         "plugin": "cheetah.py",
@@ -92,16 +148,7 @@ def times_of_neuros(steps: int) -> dict[str, float]:
     }
     with project_of_plugins({"nodes": [node]}) as folder:
         shutil.copy(MODEL, folder)
-        make = functools.partial(
-            neuros.gym.make,
-            folder,
-            action=f"cheetah.torques.data[{len(MOTORS)}]",
-            observation=[f"cheetah.joints.{part}[{len(JOINTS)}]" for part in _PARTS],
-            reward=lambda env: 0.0,
-            model=MODEL.name,
-            output=folder / "run",
-        )
-        return times(make, steps)
+        yield folder
 
 
 def times(make: Callable[[], Any], steps: int) -> dict[str, float]:

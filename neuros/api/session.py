@@ -8,7 +8,6 @@ control channel, so a packet that is sent before a step is there when the step b
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import html
 import math
@@ -30,20 +29,17 @@ from neuros.api.session_link import SessionLink
 from neuros.backends.control_sockets import connect
 from neuros.control import (
     TO_OBSERVERS,
-    AtRest,
-    Deliver,
     LookAll,
     Message,
-    NewestPacket,
     NodeStatus,
     Pause,
     Reset,
     Resume,
-    Settled,
     WasReset,
     Watch,
 )
 from neuros.control.link import ControlLink
+from neuros.control.steps import Advanced
 from neuros.errors import RunError, UsageError
 from neuros.project.graph_svg import graph_svg
 from neuros.project.model import Node, Port, Project
@@ -81,13 +77,14 @@ class Session:
         self._seed = seed
         self._packets = RosPackets()
         self._lock = threading.RLock()
-        self._newest: dict[str, NewestPacket] = {}
+        self._newest: dict[str, tuple[int, bytes]] = {}
         self.runs: list[Run] = []
         self._hold(start(seed))
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
         self._live, self._project, self._inputs = held.live, held.project, held.inputs
+        self._ports: dict[str, tuple[Node, Port]] = {}  # of inputs, by name
         self.folder = held.live.folder
         self._run: Run | None = None
         sys.path[:0] = [path for path in map(str, held.messages) if path not in sys.path]
@@ -101,7 +98,7 @@ class Session:
 
     def _begin(self) -> None:
         """Forget packets and times, and wait until the initialise hooks have run."""
-        self._newest = {name: NewestPacket(0, "") for name in self._newest}
+        self._newest = dict.fromkeys(self._newest, (0, b""))
         self._decoded: dict[str, tuple[int, Any]] = {}
         self._sim_times: Mapping[str, float] = {}
         self._settle()
@@ -251,7 +248,9 @@ class Session:
                 may send.
             RunError: if the run has ended.
         """
-        node, port = _port(self._project, input_name, is_input=True)
+        if input_name not in self._ports:
+            self._ports[input_name] = _port(self._project, input_name, is_input=True)
+        node, port = self._ports[input_name]
         name = f"{node.name}.{port.name}"
         if name not in self._inputs:
             raise UsageError(
@@ -260,10 +259,10 @@ class Session:
                 f" {_where(node)}"
             )
         packet = checked(port, message)
-        data = base64.b64encode(self._packets.encode(packet)).decode()
+        content = self._packets.encode(packet)
         with self._lock:
             self._check_running()
-            self._link.deliver(Deliver(node.name, port.name, data))
+            self._link.deliver(node.name, port.name, content)
 
     # ------------------------------------------------------------------ state
 
@@ -401,9 +400,9 @@ class Session:
 
     @property
     def _known(self) -> dict[str, int]:
-        return {name: each.number for name, each in self._newest.items()}
+        return {name: number for name, (number, _) in self._newest.items()}
 
-    def _note(self, settled: Settled | AtRest | None) -> bool:
+    def _note(self, settled: Advanced | None) -> bool:
         if settled is not None:
             self._sim_times = settled.sim_times
             self._newest.update(settled.packets)
@@ -420,12 +419,12 @@ class Session:
         self._end()
         return False
 
-    def _newest_of(self, output: str) -> NewestPacket:
+    def _newest_of(self, output: str) -> tuple[int, bytes]:
         """The newest packet of an output; number 0: there is none yet."""
         with self._lock:
             if output not in self._newest:
                 self._check_running()
-                self._newest[output] = NewestPacket(0, "")
+                self._newest[output] = (0, b"")
                 self._advance(0)
             return self._newest[output]
 
@@ -471,18 +470,19 @@ class SessionOutput:
     @property
     def count(self) -> int:
         """How many packets it has sent."""
-        return self._session._newest_of(self.name).number
+        return self._session._newest_of(self.name)[0]
 
     @property
     def packet(self) -> Any:
         """The newest packet, a message of its type; ``None`` before the first."""
-        newest = self._session._newest_of(self.name)
+        number, content = self._session._newest_of(self.name)
+        if not number:
+            return None
         decoded = self._session._decoded
-        if newest.number and decoded.get(self.name, (0,))[0] != newest.number:
-            data = base64.b64decode(newest.data)
-            packet = self._session._packets.decode(self._port.type, data)
-            decoded[self.name] = newest.number, packet
-        return decoded[self.name][1] if newest.number else None
+        if decoded.get(self.name, (0,))[0] != number:
+            packet = self._session._packets.decode(self._port.type, content)
+            decoded[self.name] = number, packet
+        return decoded[self.name][1]
 
     def wait(self, timeout_s: float | None = None) -> Any:
         """Step until it sends a further packet, and return that.

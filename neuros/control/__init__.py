@@ -252,7 +252,7 @@ class NewestPacket:
 
 @dataclass(frozen=True)
 class AtRest(Message):
-    """No event waits in a node process, and no hook may start: answer to ``settle``, ``advance``.
+    """No event waits in a node process, and no hook may start: answer to ``settle``.
 
     Attributes:
         has_begun: whether each node has found its receivers, so that its hooks may run.
@@ -367,22 +367,6 @@ class Deliver(Message):
     data: str
 
 
-# ---------------------------------------------------------------------- from a session
-
-
-@dataclass(frozen=True)
-class Advance(Message):
-    """While paused, take packets and run ``count`` steps; then answer ``at_rest``, and pause.
-
-    A session sends it to the process that holds all nodes, past the supervisor.
-    """
-
-    number: int
-    count: int
-    known: Mapping[str, int]
-    packets: tuple[Deliver, ...]
-
-
 # ---------------------------------------------------------------------- from observers
 
 
@@ -472,8 +456,6 @@ TO_NODES: Sequence[type[Message]] = (
     *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
     *(Settle, Deliver, Reset),
 )
-FROM_SESSION: Sequence[type[Message]] = (Advance,)
-TO_SESSION: Sequence[type[Message]] = (AtRest,)
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver, Reset),
 )

@@ -18,8 +18,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import neuros.control as control
-from neuros.control import ELSEWHERE_VARIABLE, FROM_SESSION, TO_NODES, Message
+from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
 from neuros.control.link import ControlLink
+from neuros.control.steps import Advance
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
 from neuros.errors import ControlError, NeurosError
@@ -28,6 +29,7 @@ from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
+from neuros.node.stepping import SessionSteps
 from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder
 from neuros.project.model import Connection, NodeFile
 from neuros.stacks import StackFile
@@ -71,15 +73,16 @@ class NodeProcess:
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._is_held = is_held
-        self._session = session
+        self._steps = None if session is None else SessionSteps(session, self._advance, self.post)
         self._own_logs = own_logs
         self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
+        self._by_name: dict[str, NodeRuntime] = {}
         self._middleware: Middleware | None = None
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
-        self._settling: control.Settle | control.Advance | None = None
+        self._settling: control.Settle | Advance | None = None
         self._is_draining = False
         self._has_been_reset = False
         self._stop_asked = threading.Event()
@@ -100,7 +103,7 @@ class NodeProcess:
         self._stack_file = StackFile(own_folder, plugins)
         self._tell(control.Hello(tuple(plugins)))
         with signals_as_socket() as signalled:
-            thread = ControlThread(self._link, signalled, self, self._session)
+            thread = ControlThread(self._link, signalled, self, self._steps)
             thread.start()
             self._guard(self._live)
             for node in self._nodes:
@@ -137,7 +140,7 @@ class NodeProcess:
             return
         if isinstance(message, control.Settle):
             self._settling = message
-            self._settle(message, self._tell)
+            self._settle(message)
             return
         if isinstance(message, control.Reset):
             self._reset(message.variables)
@@ -176,6 +179,8 @@ class NodeProcess:
                 self._early_events.append(event)
                 return
         self._middleware.loop.post_from_thread(event)
+        if self._steps is not None:
+            self._steps.wake()
 
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
@@ -195,42 +200,38 @@ class NodeProcess:
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
 
-    def advance(self, message: control.Advance, session: ControlLink) -> None:
-        """Do a step of the session, if the run is not at its end. Any thread."""
-        self.post(lambda: self._advance(message, session))
-
-    def _advance(self, message: control.Advance, session: ControlLink) -> None:
-        self._settling = message
-        for packet in message.packets:
-            self._obey_in_loop(packet)
-        if message.count:
+    def _advance(self, step: Advance) -> None:
+        """Do a step of the session, if the run is not at its end."""
+        self._settling = step
+        for name, input_name, content in step.packets:
+            self._by_name[name].deliver(input_name, content)
+        if step.rounds:
             engines = [node.engine for node in self._nodes if node.engine is not None]
             is_driven = any(engine.is_driving for engine in engines)
             for node in self._nodes:
-                node.step(message.count, is_driven=is_driven)
-        self._settle(message, session.send)
+                node.step(step.rounds, is_driven=is_driven)
+        self._settle(step)
 
-    def _settle(
-        self, message: control.Settle | control.Advance, answer: Callable[[Message], object]
-    ) -> None:
+    def _settle(self, asked: control.Settle | Advance) -> None:
         """Answer once no event waits: a hook that may start has a loop-back waiting.
 
         Of several questions the last one counts, else each would wait for the other.
         """
         assert self._middleware is not None
         loop = self._middleware.loop
-        if message is not self._settling:
+        if asked is not self._settling:
             return
         if loop.has_waiting_events or not loop.has_taken_in:
-            loop.post_loop_back(lambda: self._settle(message, answer))
-            return
-        if isinstance(message, control.Advance):
-            if self._is_draining:
-                return  # the session hears of the end from the supervisor
+            loop.post_loop_back(lambda: self._settle(asked))
+        elif isinstance(asked, control.Settle):
+            if not self.is_ending:
+                self._tell(_at_rest(self._nodes, asked))
+        elif not (self._is_draining or self.is_ending):  # else the supervisor tells of the end
             for node in self._nodes:
                 node.pause()  # takes back what hooks could not use of a step
-        if not self.is_ending:
-            answer(_at_rest(self._nodes, message))
+            assert self._steps is not None
+            self._steps.answer(asked, self._by_name)
+            loop.post_loop_back(self._steps.take)
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
         """Bring all nodes back to their start, if nothing of theirs is beyond reach."""
@@ -304,21 +305,21 @@ class NodeProcess:
 
     def _add(self, file: NodeFile) -> None:
         assert self._middleware is not None
-        self._nodes.append(
-            NodeRuntime(
-                file,
-                self._middleware,
-                self._contexts,
-                tell=self._tell,
-                fail=self._fail,
-                recorder=None if self._open_recorder is None else self._open_recorder(file),
-                make_engine=Engine if self._open_recorder is None else LoggedEngine,
-                log_file=_log_file(file) if self._own_logs else None,
-                duration_sim_s=self._duration_sim_s,
-                is_held=self._is_held,
-                on_initialised=self._keep_for_good,
-            )
+        node = NodeRuntime(
+            file,
+            self._middleware,
+            self._contexts,
+            tell=self._tell,
+            fail=self._fail,
+            recorder=None if self._open_recorder is None else self._open_recorder(file),
+            make_engine=Engine if self._open_recorder is None else LoggedEngine,
+            log_file=_log_file(file) if self._own_logs else None,
+            duration_sim_s=self._duration_sim_s,
+            is_held=self._is_held,
+            on_initialised=self._keep_for_good,
         )
+        self._nodes.append(node)
+        self._by_name[node.name] = node
 
     def _keep_for_good(self) -> None:
         """Leave what exists after initialisation to itself: modules, networks, figures.
@@ -381,14 +382,13 @@ class ControlThread(threading.Thread):
         link: ControlLink,
         signalled: socket.socket,
         process: NodeProcess,
-        session: ControlListener | None = None,
+        steps: SessionSteps | None = None,
     ) -> None:
         super().__init__(name="neuros-control", daemon=True)
         self._link = link
         self._signalled = signalled
         self._process = process
-        self._session = session
-        self._session_link: ControlLink | None = None
+        self._steps = steps
         self._ended = threading.Event()
 
     def run(self) -> None:
@@ -397,10 +397,9 @@ class ControlThread(threading.Thread):
         with selectors.DefaultSelector() as selector, contextlib.ExitStack() as stack:
             selector.register(self._link, selectors.EVENT_READ, self._on_messages)
             selector.register(self._signalled, selectors.EVENT_READ, self._on_signal)
-            if self._session is not None:
-                stack.callback(self._session.close)
-                join = functools.partial(self._on_session, self._session, selector, stack)
-                selector.register(self._session, selectors.EVENT_READ, join)
+            if self._steps is not None:
+                stack.callback(self._steps.close)
+                self._steps.listen(selector)
             while not self._ended.is_set():
                 ready = selector.select(max(0.0, next_report_s - time.monotonic()))
                 # What the supervisor has said comes before what the session has said since.
@@ -408,8 +407,8 @@ class ControlThread(threading.Thread):
                 for key, _ in ready:
                     if not key.data():
                         return
-                if self._session_link is not None and self._process.is_ending:
-                    _shut(self._session_link)
+                if self._steps is not None and self._process.is_ending:
+                    self._steps.shut()
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
                     self._try(self._process.report)
@@ -432,34 +431,6 @@ class ControlThread(threading.Thread):
             return False
         for message in messages:
             self._try(functools.partial(self._process.obey, message))
-        return True
-
-    def _on_session(
-        self,
-        listener: ControlListener,
-        selector: selectors.BaseSelector,
-        stack: contextlib.ExitStack,
-    ) -> bool:
-        """The session connects: one per run."""
-        stream = listener.accept()
-        if stream is None:
-            return True
-        selector.unregister(listener)
-        link = ControlLink(stream, FROM_SESSION, "the session")
-        stack.callback(link.close)
-
-        self._session_link = link
-
-        def take() -> bool:
-            messages = self._received(link)
-            if messages is None:
-                selector.unregister(link)
-            for message in messages or ():
-                if isinstance(message, control.Advance):
-                    self._process.advance(message, link)
-            return True
-
-        selector.register(link, selectors.EVENT_READ, take)
         return True
 
     def _received(self, link: ControlLink) -> list[Message] | None:
@@ -499,9 +470,7 @@ def signals_as_socket() -> Iterator[socket.socket]:
         writer.close()
 
 
-def _at_rest(
-    nodes: Sequence[NodeRuntime], asked: control.Settle | control.Advance
-) -> control.AtRest:
+def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtRest:
     """State of all nodes of a process at one moment."""
     names = tuple(node.name for node in nodes)
     engines = [node.engine for node in nodes if node.engine is not None]
@@ -530,14 +499,6 @@ def _at_rest(
         {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
         packets,
     )
-
-
-def _shut(link: ControlLink) -> None:
-    """Have a send return that waits for a session which does not read, in another thread."""
-    with contextlib.suppress(OSError):
-        end = socket.fromfd(link.fileno(), socket.AF_UNIX, socket.SOCK_STREAM)
-        with end:
-            end.shutdown(socket.SHUT_RDWR)
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

@@ -33,6 +33,7 @@ from neuros.analysis.run_pages import figures_of, report_page
 from neuros.analysis.run_record import open_for_review, open_run
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, encode, kind_of
+from neuros.control.steps import Advance, Advanced, StepLink
 from neuros.engine.replay import Script
 from neuros.errors import ControlError, NeurosError, ProtocolError
 from neuros.launcher.peers import RUNNING, PeerState, state_from
@@ -392,7 +393,6 @@ SENT: Sequence[control.Message] = (
     control.Step(1, is_driven=True),
     control.Look({"a": {"x": {}}}, 1),
     control.StepAll(3),
-    control.Advance(3, 1, {"a.x": 2}, (control.Deliver("a", "x", "AAAA"),)),
     control.End("done"),
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),
@@ -402,10 +402,28 @@ SENT: Sequence[control.Message] = (
 @target(lambda: [encode(each).rstrip() for each in SENT], change_json, change_bytes)
 def control_message(data: bytes, _: Path) -> None:
     for group in (control.FROM_NODES, control.TO_NODES, control.FROM_OBSERVERS,
-                  control.TO_OBSERVERS, control.FROM_SESSION):  # fmt: skip
+                  control.TO_OBSERVERS):  # fmt: skip
         accepted = {kind_of(each): each for each in group}
         with allowed(ControlError):
             assert decode(encode(decode(data, accepted, "a")), accepted, "a")
+
+
+STEPS: Sequence[Advance | Advanced] = (
+    Advance(3, 1, {"a.x": 2}, [("a", "y", b"12345678")]),
+    Advanced(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
+)
+
+
+@target(lambda: [each.to_frame() for each in STEPS], change_bytes)
+def step_frames(data: bytes, _: Path) -> None:
+    for kind in (Advance, Advanced):
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            ours.sendall(data[:50_000])  # what fits into the buffer of a socket
+            link: StepLink[Any] = StepLink(theirs, kind, "a")
+            with allowed(ControlError):
+                for message in link.receive() or ():
+                    assert message.to_frame() in data
 
 
 @target(

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, TimeoutError
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -245,9 +245,11 @@ class MuJoCo:
     # ---- inside -----------------------------------------------------------------------------
 
     def _set(self, controls: Callable[[], Controls]) -> None:
-        with self.paused():
+        # Where the plugin steps, nothing else does meanwhile.
+        with self.paused() if self.is_running else nullcontext():
+            ctrl = self.data.ctrl
             for actuator, value in controls():
-                self.data.ctrl[actuator] = value
+                ctrl[actuator] = value
 
     def _bout(self, steps: int) -> Mapping[str, Packet]:
         """Up to ``steps`` steps, ending at a firing; the packets that are due then."""
