@@ -35,6 +35,11 @@ class ControlLink:
         """For selectors."""
         return self.stream.fileno()
 
+    @property
+    def unfinished_bytes(self) -> int:
+        """How much has arrived of a line whose end has not."""
+        return sum(map(len, self._parts))
+
     def send(self, message: Message) -> bool:
         """Send one message; returns False if the other end is gone."""
         try:

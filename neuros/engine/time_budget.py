@@ -74,13 +74,13 @@ def time_budget_of(node: Mapping[str, Any], running_s: float | None) -> TimeBudg
     accounting = node.get("accounting")
     if not accounting:
         return None
-    executing = _without_initialising(accounting.get("executing", {}), node.get("hooks") or {})
+    executing = _without_initialising(accounting.get("executing") or {}, node.get("hooks") or {})
     rests = {
-        (state, name): s
+        (state, name): s or 0.0
         for state in ("waiting", "blocked")
-        for name, s in accounting.get(state, {}).items()
+        for name, s in (accounting.get(state) or {}).items()
     }
-    rests |= {(state, ""): accounting.get(state, 0.0) for state in ("idle", "scheduling")}
+    rests |= {(state, ""): accounting.get(state) or 0.0 for state in ("idle", "scheduling")}
     if running_s:
         surplus_s = sum(executing.values()) + sum(rests.values()) - running_s
         for cause in sorted(rests, key=lambda cause: rests[cause], reverse=True):
@@ -99,5 +99,6 @@ def _without_initialising(
     executing: Mapping[str, float], hooks: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
     """Seconds by hook without those of ``neuros_initialise``; a function may have other marks."""
-    rest = {name: s - hooks.get(name, {}).get("initialise_s", 0.0) for name, s in executing.items()}
+    initialising = {name: (hook or {}).get("initialise_s") or 0.0 for name, hook in hooks.items()}
+    rest = {name: (s or 0.0) - initialising.get(name, 0.0) for name, s in executing.items()}
     return {name: s for name, s in rest.items() if s > 0}

@@ -1,7 +1,8 @@
 """The supervisor's ends of the control channel: node processes, and observers of the run.
 
 Nothing here ever waits for a node: one that is stopped, or has forked children which keep its
-socket open, must not hold up the supervisor.
+socket open, must not hold up the supervisor. Nor may other programs, however many there are and
+whatever they say: they are heard for a moment at a time, a limited number at a time.
 
 Observers are programs that may pause, step and end a run. They see what nodes show when asked (they
 ask while a user looks), and take no part in the run: when the last one has gone, a run that was
@@ -16,7 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from neuros.control import (
     FROM_NODES,
@@ -43,7 +44,7 @@ from neuros.control import (
     WasReset,
     Watch,
 )
-from neuros.control.link import ControlLink, encode
+from neuros.control.link import ControlLink, encode, kind_of
 from neuros.errors import ControlError
 from neuros.launcher.outcome import Outcome, Output, Phase
 from neuros.ports import ControlListener
@@ -51,6 +52,10 @@ from neuros.ports import ControlListener
 STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
 _READS_AT_A_TIME = 64
+_MOST_OTHERS = 64
+_OTHERS_S = 0.05
+_SILENT_S = 1.0
+_LONGEST_GREETING_BYTES = 1 << 16
 _WAKING_BYTES = 1024
 
 _FIRST_LOOK_S = 0.0005
@@ -75,7 +80,12 @@ class Channels:
         self._listener = listener
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
+        self._is_listening = True
         self._unsent: dict[ControlLink, bytearray] = {}
+        # All but node processes, and since when each has been connected; the next one to be read
+        # comes first.
+        self._others: dict[ControlLink, float] = {}
+        self._strangers: set[ControlLink] = set()  # those that have not said who they are
         self._nodes: dict[ControlLink, tuple[str, ...]] = {}  # as they said hello
         self.parted: dict[tuple[str, ...], float] = {}
         self._waker: socket.socket | None = None
@@ -99,21 +109,16 @@ class Channels:
 
         A message that is not understood comes as the error that says why.
         """
-        self._accept()
-        for link in tuple(self._unsent):
-            for _ in range(_READS_AT_A_TIME):
-                try:
-                    lines = link.read_lines()
-                except BlockingIOError:
-                    break
-                for line in lines or ():
-                    yield link, self._message_in(line, link)
-                if lines is None:
-                    if link in self._nodes:
-                        self.parted[self._nodes[link]] = time.monotonic()
-                    self.hang_up(link)
-                if link not in self._unsent:
-                    break
+        self._let_in()
+        for link in tuple(self._nodes):
+            yield from self._read(link)
+        until_s = time.monotonic() + _OTHERS_S
+        for link in tuple(self._others):
+            if link in self._others:
+                self._others[link] = self._others.pop(link)
+                yield from self._read(link)
+            if time.monotonic() > until_s:
+                break
 
     def send(self, message: Message) -> None:
         """Send to all node processes."""
@@ -137,10 +142,17 @@ class Channels:
         return len(self._nodes)
 
     def send_to(self, link: ControlLink, message: Message) -> None:
-        """Send to one; what does not go through now goes with the next, or :meth:`flush`."""
-        if link in self._unsent and len(self._unsent[link]) < _MOST_UNSENT_BYTES:
-            self._unsent[link] += encode(message)
-            self._flush(link)
+        """Send to one; what does not go through now goes with the next, or :meth:`flush`.
+
+        What observers want and get is left out while too much waits; what ends a run never is.
+        """
+        if link not in self._unsent:
+            return
+        may_be_left_out = link not in self._nodes or isinstance(message, Look | Deliver)
+        if may_be_left_out and len(self._unsent[link]) >= _MOST_UNSENT_BYTES:
+            return
+        self._unsent[link] += encode(message)
+        self._flush(link)
 
     def is_node(self, link: ControlLink) -> bool:
         """Whether a node process is, or was, at the other end."""
@@ -158,6 +170,8 @@ class Channels:
 
     def hang_up(self, link: ControlLink) -> None:
         """Neither send to this one nor hear it any more."""
+        self._others.pop(link, None)
+        self._strangers.discard(link)
         if self._unsent.pop(link, None) is not None:
             self._selector.unregister(link)
             link.close()
@@ -169,12 +183,47 @@ class Channels:
         self._selector.close()
         self._listener.close()
 
-    def _accept(self) -> None:
-        while (stream := self._listener.accept()) is not None:
+    def _read(self, link: ControlLink) -> Iterator[tuple[ControlLink, Message | ControlError]]:
+        """All that a node process has said; of any other program, what comes first."""
+        for _ in range(_READS_AT_A_TIME):
+            if link not in self._unsent:
+                return
+            try:
+                lines = link.read_lines()
+            except BlockingIOError:
+                return
+            for line in lines or ():
+                yield link, self._message_in(line, link)
+            if lines is None:
+                if link in self._nodes:
+                    self.parted[self._nodes[link]] = time.monotonic()
+                self.hang_up(link)
+            elif link in self._strangers and link.unfinished_bytes > _LONGEST_GREETING_BYTES:
+                yield link, ControlError(f"{STRANGER} sent a line without an end")
+            if link not in self._nodes:
+                return
+
+    def _let_in(self) -> None:
+        """Accept those that wait, while there is room; what stays silent makes room for them."""
+        now_s = time.monotonic()
+        while len(self._others) < _MOST_OTHERS and (stream := self._listener.accept()) is not None:
             stream.setblocking(False)
             link = ControlLink(stream, (*FROM_NODES, *FROM_OBSERVERS), STRANGER)
             self._unsent[link] = bytearray()
+            self._others[link] = now_s
+            self._strangers.add(link)
             self._selector.register(link, selectors.EVENT_READ)
+        is_full = len(self._others) >= _MOST_OTHERS
+        if is_full:
+            silent = [each for each in self._strangers if now_s - self._others[each] > _SILENT_S]
+            for link in silent:
+                self.hang_up(link)
+        if is_full == self._is_listening:  # else whoever waits there would end each wait at once
+            if is_full:
+                self._selector.unregister(self._listener)
+            else:
+                self._selector.register(self._listener, selectors.EVENT_READ)
+            self._is_listening = not is_full
 
     def _message_in(self, line: bytes, link: ControlLink) -> Message | ControlError:
         """The message, after which it is known who is at the other end; else why there is none."""
@@ -182,7 +231,11 @@ class Channels:
             message = link.decode(line)
         except ControlError as error:
             return error
+        if link in self._strangers and not isinstance(message, Hello | Watch):
+            return ControlError(f"{STRANGER} sent '{kind_of(type(message))}' as its first message")
+        self._strangers.discard(link)
         if isinstance(message, Hello):
+            self._others.pop(link, None)
             self._nodes[link] = tuple(message.nodes)
             link.peer = f"the process of {' and '.join(message.nodes)}"
         elif isinstance(message, Watch):
@@ -260,18 +313,19 @@ class Observers:
     _links: dict[int, ControlLink] = field(default_factory=dict)  # numbers are not given out again
     _count: int = 0
     _told: PhaseChanged | None = None
+    _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
     def take(self, link: ControlLink, message: Message) -> None:
         """Take a message from or for an observer."""
         match message:
-            case Watch():
+            case Watch() if link not in self._links.values():
                 self._count += 1
                 self._links[self._count] = link
                 self._told = None
             case LookAll(wanted):
                 for number, each in self._links.items():
                     if each is link:
-                        self._channels.send(Look(wanted, number))
+                        self._asked[number] = wanted
             case NodeStatus(asker=asker):
                 if asker in self._links:
                     self._channels.send_to(self._links[asker], message)
@@ -299,7 +353,13 @@ class Observers:
             self._channels.send_to(link, message)
 
     def look_at(self, phase: Phase) -> None:
-        """Tell them of a change of phase; if the last one has gone, end a pause."""
+        """Ask nodes what they want to see, tell them of a change of phase; end a lonely pause.
+
+        One that has asked several times since is answered once.
+        """
+        for number, wanted in self._asked.items():
+            self._channels.send(Look(wanted, number))
+        self._asked.clear()
         if phase is not Phase.RUNNING and self._pause.is_on:
             self._pause.forget()
         if not self._links:

@@ -38,6 +38,7 @@ from neuros.stacks import remove_stack_files
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
+_MOST_REFUSED = 10
 _PARTED_S = 1.0
 """A process that has hung up ends within this time, or something has closed its descriptors."""
 _KEPT_STILL_S = 1.0
@@ -132,6 +133,7 @@ class Supervisor:
         )
         self._signals = signals
         self._refused: set[ControlLink] = set()
+        self._refused_count = 0
         self._looked_s = time.monotonic()
 
     def run(self) -> Outcome:
@@ -182,7 +184,11 @@ class Supervisor:
                 self._shutdown.fail(f"control channel: {error}")
         elif self._channels.has(link):
             self._channels.hang_up(link)
-            self._output.log("WARN", f"control channel: a connection was closed: {error}")
+            self._refused_count += 1
+            if self._refused_count <= _MOST_REFUSED:
+                text = f"control channel: a connection was closed: {error}"
+                is_last = self._refused_count == _MOST_REFUSED
+                self._output.log("WARN", text + "; further ones are not shown" * is_last)
 
     def _take(self, link: ControlLink, message: Message) -> None:
         match message:

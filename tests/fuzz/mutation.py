@@ -83,12 +83,17 @@ def change_text(data: bytes, chance: random.Random) -> bytes:
 
 
 def change_json(data: bytes, chance: random.Random) -> bytes:
-    """Replace, leave out, repeat or rename values in JSON; what is none is changed as bytes."""
+    """Replace, leave out, repeat or rename values in JSON.
+
+    What is none is changed as bytes, and so is what would be nested too deeply to be written.
+    """
     try:
-        root = [json.loads(data)]
-        _text(root[0])
+        return _changed_json([json.loads(data)], chance).encode("utf-8", "surrogatepass")
     except (ValueError, RecursionError):
         return change_bytes(data, chance)
+
+
+def _changed_json(root: list[Any], chance: random.Random) -> str:
     for _ in range(chance.randint(1, 3)):
         holders = [each for each in _holders(root) if each]
         holder = chance.choice(holders)
@@ -106,7 +111,7 @@ def change_json(data: bytes, chance: random.Random) -> bytes:
                 holder[key] = json.loads(_text(other[at])) if _is_plain(other[at]) else None
             case _:
                 holder[key] = chance.choice(_VALUES)
-    return _text(root[0]).encode("utf-8", "surrogatepass")
+    return _text(root[0])
 
 
 def _holders(value: Any) -> list[Any]:

@@ -105,8 +105,10 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
         observer.send(Watch())
         run.hear()
     for observer, wanted in ((first, {"a": {"x": {}}}), (second, {})):
-        observer.send(LookAll(wanted))
-        run.hear()
+        observer.send(LookAll({"b": {}}))
+        observer.send(LookAll(wanted))  # takes the place of what was not asked yet
+        run.hear(2)
+    run.observers.look_at(Phase.RUNNING)
     looks = told(node, 2)
     assert looks == [Look({"a": {"x": {}}}, 1), Look({}, 2)]
     for look in looks:
@@ -116,7 +118,7 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
     run.hear(2)
     for observer, samples in ((first, {"x": {}}), (second, {})):
         run.observers.tell(LogRecord("INFO", "that is all"))
-        found = told(observer, 2)
+        _, *found = told(observer, 3)
         assert isinstance(found[0], NodeStatus)
         assert found[0].samples == samples
         assert found[1] == LogRecord("INFO", "that is all")
@@ -127,6 +129,8 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
 def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> None:
     node, observer = run.join(is_node=True), run.join()
     node.send(Hello(("a",)))
+    run.hear()
+    observer.send(Watch())
     run.hear()
     for message in (
         StepAll(1),  # it is not paused: nothing happens
@@ -174,7 +178,8 @@ def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
 
 def test_an_observer_may_end_the_run(run: Run) -> None:
     observer = run.join()
+    observer.send(Watch())
     observer.send(End("enough"))
-    run.hear()
+    run.hear(2)
     assert run.ends == ["enough"]
     observer.close()

@@ -11,7 +11,18 @@ from typing import Any
 import pytest
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.control import TO_NODES, Explanation, Failed, Hello, Probe, Stop, Watch
+from neuros.control import (
+    TO_NODES,
+    End,
+    Explanation,
+    Failed,
+    Hello,
+    Look,
+    LookAll,
+    Probe,
+    Stop,
+    Watch,
+)
 from neuros.control.link import ControlLink, kind_of
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels
@@ -58,10 +69,11 @@ def test_what_was_said_before_hanging_up_is_heard_in_one_go(channels: Channels, 
 
 def test_several_hundred_kilobytes_are_one_go_too(channels: Channels, node: Node) -> None:
     node.socket.setblocking(False)
+    node.send(Hello(("a",)))
     count = 0
     while node.send(Explanation("a", ("x" * 1000,))):
         count += 1
-    assert kinds(channels)[:count] == ["explanation"] * count
+    assert kinds(channels)[1 : count + 1] == ["explanation"] * count
 
 
 def test_half_a_line_waits_for_its_other_half(channels: Channels, node: Node) -> None:
@@ -139,3 +151,74 @@ def test_a_signal_ends_the_wait(channels: Channels) -> None:
         channels.wait(60.0)
         with pytest.raises(BlockingIOError):
             reader.recv(1)  # or it would never wait again
+
+
+def test_other_programs_are_heard_a_few_at_a_time_and_nodes_in_full(
+    channels: Channels, tmp_path: Path
+) -> None:
+    crowd = [Node(tmp_path) for _ in range(100)]
+    for each in crowd:
+        each.send(Watch())
+    node = Node(tmp_path)
+    node.send(Hello(("a",)))
+    assert 0 < kinds(channels).count("watch") <= 64
+    for each in crowd:
+        each.close()
+    while "hello" not in kinds(channels):
+        pass
+    flood = Node(tmp_path)
+    flood.send(Watch())
+    flood.socket.setblocking(False)
+    while flood.send(LookAll({})):
+        pass
+    node.socket.setblocking(False)
+    count = 0
+    while node.send(Explanation("a", ("x" * 1000,))):
+        count += 1
+    heard = kinds(channels)
+    assert heard.count("explanation") >= count
+    assert heard.count("look_all") < 5000
+    for each in (node, flood):
+        each.close()
+
+
+def test_silent_programs_make_room_for_nodes(channels: Channels, tmp_path: Path) -> None:
+    silent = [Node(tmp_path) for _ in range(70)]
+    node = Node(tmp_path)
+    node.send(Hello(("a",)))
+    heard: list[Any] = []
+    deadline_s = time.monotonic() + 20.0
+    while "hello" not in heard and time.monotonic() < deadline_s:
+        channels.wait(0.1)
+        heard = kinds(channels)
+    assert heard == ["hello"]
+    for each in (*silent, node):
+        each.close()
+
+
+def test_a_line_without_an_end_is_refused(channels: Channels, node: Node) -> None:
+    node.socket.sendall(b"x" * (1 << 17))
+    assert {"refused"} == {*kinds(channels), *kinds(channels)}
+
+
+def test_only_hello_and_watch_are_greetings(channels: Channels, node: Node) -> None:
+    node.send(End("enough"))
+    node.send(Watch())
+    node.send(End("enough"))
+    assert kinds(channels) == ["refused", "watch", "end"]
+
+
+def test_the_end_of_a_run_reaches_a_node_to_which_much_is_to_be_sent(
+    channels: Channels, node: Node
+) -> None:
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
+    for _ in range(300):
+        channels.send(Look({"a": {"x" * 10_000: {}}}, 1))
+    channels.send(Stop())
+    got: list[Any] = []
+    node.socket.settimeout(5.0)
+    while Stop() not in got:
+        got += node.receive() or []
+        channels.flush()
+    assert len(got) < 300, "what observers want is left out"

@@ -218,6 +218,18 @@ def test_what_is_none_of_ours_on_the_socket_is_hung_up_on(run: Run) -> None:
     )
 
 
+def test_many_of_them_are_not_shown_one_by_one(run: Run) -> None:
+    outcome = run(
+        a="import socket\nfor _ in range(200):\n    s = socket.socket(socket.AF_UNIX)\n"
+        "    s.connect('control.sock')\n    s.sendall(b'1\\n')\n    assert s.recv(1) == b''\n"
+        + SHUTS_DOWN
+    )
+    assert outcome.exit_code == 0
+    said = [text for text in run.output.said if text.startswith("control channel")]
+    assert len(said) == 10
+    assert said[-1].endswith("; further ones are not shown")
+
+
 @pytest.mark.parametrize(
     ("message", "complaint"),
     [
