@@ -143,7 +143,7 @@ def _connection(
     in_flight, lost, running_s = None, None, ended.running_s
     if is_known and sent is not None and received is not None:
         in_flight, lost = in_flight_and_lost(
-            sent, received, connection.is_reliable, ended.has_drained
+            sent, received, outgoing["outstanding"], ended.has_drained
         )
     figures = {
         "connection": key,

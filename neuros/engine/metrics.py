@@ -46,18 +46,17 @@ PAUSED = Rest(State.PAUSED)
 
 
 def in_flight_and_lost(
-    sent: int, received: int, is_reliable: bool, has_drained: bool
+    sent: int, received: int, outstanding: int, has_drained: bool
 ) -> tuple[int, int]:
     """Packets of a connection that had not arrived when a run ended: in flight, and lost.
 
     Nodes of a run that is not drained stop one after the other, and what one sends to another that
-    has stopped arrives nowhere. A reliable connection loses nothing else. On one of best effort
-    nobody can tell the two apart, and all of them count as lost.
+    has stopped arrives nowhere. Only outstanding packets can be among these: all others of a
+    reliable connection have arrived, and on one of best effort nobody can tell the two apart.
     """
     missing = sent - received
-    if is_reliable and not has_drained and missing > 0:
-        return missing, 0
-    return 0, missing
+    in_flight = 0 if has_drained else max(0, min(missing, outstanding))
+    return in_flight, missing - in_flight
 
 
 class TickIntervals:

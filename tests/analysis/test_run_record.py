@@ -17,7 +17,7 @@ from neuros.project.split import split
 PROJECT = Path(__file__).parents[2] / "examples/1_tick/clock/project.json"
 CONNECTION = "clock.time -> display.time"
 ROWS = {
-    "clock": {"outgoing": {CONNECTION: {"sent": 7}}, "incoming": {}},
+    "clock": {"outgoing": {CONNECTION: {"sent": 7, "outstanding": 2}}, "incoming": {}},
     "display": {"outgoing": {}, "incoming": {CONNECTION: {"received": 5}}},
 }
 

@@ -1,10 +1,10 @@
-"""The intervals of a timed hook, counted as they pass."""
+"""Metrics: intervals of a timed hook, counted as they pass; what has not arrived at the end."""
 
 from __future__ import annotations
 
 import pytest
 
-from neuros.engine.metrics import TickIntervals
+from neuros.engine.metrics import TickIntervals, in_flight_and_lost
 
 MS = 1_000_000
 
@@ -53,3 +53,13 @@ def test_an_interval_that_is_too_short_can_be_the_worst() -> None:
 def test_its_memory_does_not_grow_with_the_length_of_an_interval() -> None:
     figures = book(0, 1e5, 3e5).figures()
     assert figures["histogram"] == [[2000.0, 2]]
+
+
+@pytest.mark.parametrize(
+    ("outstanding", "has_drained", "in_flight", "lost"),
+    [(2, False, 2, 0), (3, False, 2, 0), (1, False, 1, 1), (0, False, 0, 2), (2, True, 0, 2)],
+)
+def test_what_has_not_arrived_is_in_flight_if_it_was_outstanding_and_nobody_waited_for_it(
+    outstanding: int, has_drained: bool, in_flight: int, lost: int
+) -> None:
+    assert in_flight_and_lost(7, 5, outstanding, has_drained) == (in_flight, lost)

@@ -240,7 +240,7 @@ class LiveMetrics:
             lost = None
             if {"sent", "received"} <= {*final}:
                 _, lost = in_flight_and_lost(
-                    final["sent"], final["received"], bool(final["is_reliable"]), has_drained
+                    final["sent"], final["received"], final["outstanding"], has_drained
                 )
             shown |= {
                 "is_blocked": False,

@@ -158,7 +158,7 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     nothing = dict.fromkeys(STATES, 0.0) | {"executing": {}, "waiting": {}, "blocked": {}}
     ends = {
         "a": (
-            {LINK: {"sent": 8, "outstanding": 0, "is_reliable": True}},
+            {LINK: {"sent": 8, "outstanding": 2}},
             {},
             {"executing": {"f": 1.0}, "idle": 3.0},
         ),
