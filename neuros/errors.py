@@ -22,6 +22,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+_Result = TypeVar("_Result")
 
 
 class NeurosError(Exception):
@@ -150,3 +156,13 @@ class ModelError(NodeError):
 
 class ProtocolError(NodeError):
     """A neighbour broke the rules of a connection (for instance a lossless one lost a packet)."""
+
+
+def results_of(work: Sequence[Future[_Result]]) -> tuple[list[_Result], BaseException | None]:
+    """The results of what has ended well, and, if something has not, one error for all of that."""
+    errors = [error for each in work if (error := each.exception())]
+    results = [each.result() for each in work if not each.exception()]
+    others = [error for error in errors if not isinstance(error, EnvironmentFault)]
+    if others or not errors:
+        return results, next(iter(others), None)
+    return results, EnvironmentFault("\n".join(dict.fromkeys(map(str, errors))))

@@ -24,7 +24,7 @@ from viewers.dashboard.visitor import address
 
 from neuros.backends.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
-from neuros.installation.packages import find_uv, run_installs
+from neuros.installation.packages import Installer, find_uv
 from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -230,7 +230,8 @@ def test_three_commands_lead_to_a_robot_that_moves(
     progress = Progress(sys.stdout)
     uv = find_uv(Path(sys.executable), environ)
     log = tmp_path / "log"
-    assert not run_installs(made / "bin" / "python", uv, wanted, made, log, progress, environ)
+    installer = Installer(made / "bin" / "python", made, log, progress, environ)
+    assert installer.install(wanted, uv) is None
     run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
     see_a_robot_that_turns(
         tmp_path / "whiskeye", environ, SCREENSHOTS / ".".join(map(str, version))

@@ -26,10 +26,10 @@ from neuros.installation.machine import NEWEST, OLDEST, clean_environment, dotte
 from neuros.installation.packages import (
     LOCKS,
     UV,
+    Installer,
     explain_failure,
     find_uv,
     install,
-    run_installs,
     uv_settings,
 )
 from neuros.installation.progress import Progress
@@ -234,9 +234,8 @@ class TestFallback:
 
     def run(self, python: Path, uv: Path | None, environ: dict[str, str]) -> tuple[str | None, str]:
         stream, folder = StringIO(), python.parent.parent
-        output = run_installs(
-            *(python, uv, [["neuros_colour"]], folder, folder / "log", Progress(stream), environ)
-        )
+        installer = Installer(python, folder, folder / "log", Progress(stream), environ)
+        output = installer.install([["neuros_colour"]], uv)
         return output, stream.getvalue()
 
     def is_installed(self, python: Path) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from contextlib import closing
 
 from benchmarks.measure import Case, Figure, Group, Subject, Unavailable
 from benchmarks.subjects.start_up import whiskeye_s
@@ -57,9 +58,11 @@ def subject(is_quick: bool) -> Subject:
 
 def _in_containers(measure: Callable[..., dict[str, float]]) -> dict[str, float]:
     try:
-        from neuros.backends.docker.launcher import find_containers
+        from neuros.backends.docker.engine import connect
+        from neuros.backends.docker.images import images_for
 
-        find_containers(IMAGES, None).engine.close()
+        with closing(connect()) as engine:
+            images_for(IMAGES, None, engine)
     except (EnvironmentFault, ModuleNotFoundError) as error:
         raise Unavailable(str(error)) from error
     return measure(backend="docker")

@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -39,6 +38,7 @@ from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     NEWEST,
     OLDEST,
+    answer_of,
     clean_environment,
     dotted,
 )
@@ -98,19 +98,9 @@ def _candidates(name: str, environ: Mapping[str, str]) -> Iterator[Path]:
 
 
 def _is_version(path: Path, version: Version, environ: Mapping[str, str]) -> bool:
-    try:
-        answer = subprocess.run(
-            [str(path), "-I", "-S", "-c", _ASK],
-            env=clean_environment(environ),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_ANSWER_TIMEOUT_S,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return answer.stdout.split() == ["cpython", *map(str, version)]
+    command = [str(path), "-I", "-S", "-c", _ASK]
+    answer = answer_of(command, clean_environment(environ), _ANSWER_TIMEOUT_S)
+    return answer is not None and answer.stdout.split() == ["cpython", *map(str, version)]
 
 
 def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) -> Choice:

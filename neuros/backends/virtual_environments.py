@@ -43,7 +43,7 @@ from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
 from neuros.distribution import PACKAGE, install_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted, system_install
-from neuros.installation.packages import explain_machine, find_uv, run_installs
+from neuros.installation.packages import Installer, explain_machine, find_uv
 from neuros.installation.progress import Progress
 
 if TYPE_CHECKING:
@@ -296,9 +296,8 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
     # uv does not see what a layer finds in this environment, and would install all of it again.
     uv = None if choice.is_layered else find_uv(Path(sys.executable), environ)
     entry.log.unlink(missing_ok=True)
-    output = run_installs(
-        entry.future_python, uv, calls, entry.folder, entry.log, progress, environ
-    )
+    installer = Installer(entry.future_python, entry.folder, entry.log, progress, environ)
+    output = installer.install(calls, uv)
     if output is not None:
         cause = why_pip_failed(output, dotted(choice.version), needs)
         raise _fault(choice, f"{cause} (log: {entry.log})")

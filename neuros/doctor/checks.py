@@ -27,7 +27,7 @@ from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.installation.machine import Machine, install_opengl, offscreen_opengl
+from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
 from neuros.ports import Finding, SimulatorKind, State
 from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
@@ -220,17 +220,8 @@ def prove_rendering(environ: Mapping[str, str]) -> Finding:
     if find_spec("mujoco") is None:
         return Finding.absent(subject, "not tried without MuJoCo")
     program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
-    command = [sys.executable, "-c", program]
-    try:
-        done = subprocess.run(
-            command,
-            env=dict(environ),
-            capture_output=True,
-            text=True,
-            timeout=_RENDERING_TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
+    done = answer_of([sys.executable, "-c", program], environ, _RENDERING_TIMEOUT_S)
+    if done is None:
         return Finding.bad(
             subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl()
         )

@@ -10,7 +10,6 @@ import hashlib
 import re
 import shutil
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -22,6 +21,7 @@ from typing import Any
 
 from neuros.errors import EnvironmentFault
 from neuros.executors.executor import Job, Jobs, SweepExecutor, SweepPlan, not_installed
+from neuros.installation.machine import answer_of
 
 FOLDER = ".slurm"
 """Logs, jobs and results, in the folder of the sweep."""
@@ -183,13 +183,8 @@ class _SlurmJobs:
 
 def _slurm(*command: str) -> str | None:
     """What a command of Slurm says; ``None`` if it fails."""
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=_TIMEOUT_S
-        )
-    except subprocess.TimeoutExpired:
-        return None
-    return done.stdout if done.returncode == 0 else None
+    done = answer_of(command, timeout_s=_TIMEOUT_S)
+    return None if done is None or done.returncode else done.stdout
 
 
 def _run_in_job(job: Job) -> Any:

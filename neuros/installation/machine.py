@@ -7,8 +7,9 @@ import os
 import platform
 import re
 import shutil
+import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from neuros.errors import EnvironmentFault
@@ -85,6 +86,25 @@ def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
     foreign |= {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "RMW_IMPLEMENTATION"}
     foreign |= {"PIP_TARGET", "PIP_PREFIX", "PIP_USER", "PIP_ROOT"}
     return {key: value for key, value in environment.items() if key not in foreign}
+
+
+def answer_of(
+    command: Sequence[str], environ: Mapping[str, str] | None = None, timeout_s: float | None = None
+) -> subprocess.CompletedProcess[str] | None:
+    """What a program says that gets no input; ``None`` if it cannot be started, or goes on."""
+    try:
+        return subprocess.run(
+            command,
+            env=environ,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
 
 
 def explain_missing_library(text: str) -> str:

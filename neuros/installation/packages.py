@@ -10,10 +10,11 @@ import shutil
 import ssl
 import subprocess
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import IN_DOCKER, other_python, system_install
+from neuros.installation.machine import IN_DOCKER, answer_of, other_python, system_install
 from neuros.installation.progress import Progress
 
 LOG = "neuros-install.log"
@@ -96,14 +97,15 @@ def install(
             f"{root} has {free_bytes / 1e9:.1f} GB free and the packages need "
             f"{need_bytes / 1e9:.1f} GB: make room (df -h)"
         )
-    log, names = folder / LOG, f"[{','.join(extras)}]"
-    log.write_text("", "utf-8")
+    installer = Installer(python, root, folder / LOG, progress, environ)
+    installer.log.write_text("", "utf-8")
+    names = f"[{','.join(extras)}]"
     is_without_index = bool(environ.get("PIP_NO_INDEX"))
     source = environ.get("PIP_FIND_LINKS", "a folder") if is_without_index else "PyPI"
-    progress.step(f"installing neuros{names} from {source} (log: {log})")
+    progress.step(f"installing neuros{names} from {source} (log: {installer.log})")
     is_locked = not newest and not is_without_index
     get_uv = [*_locked(root, "uv")] if is_locked else [UV]
-    uv = find_uv(python, environ) or _install_uv(python, get_uv, log, progress, environ)
+    uv = find_uv(python, environ) or _install_uv(installer, get_uv)
     calls = [["--editable", f".{names}"]]
     if newest:
         calls[0].append("--upgrade")
@@ -114,9 +116,9 @@ def install(
             ["--no-build-isolation", *_locked(root, "core", *extras)],
             ["--no-build-isolation", "--no-deps", "--editable", "."],
         ]
-    output = run_installs(python, uv, calls, root, log, progress, environ)
+    output = installer.install(calls, uv)
     if output is not None:
-        raise _fault(output, log, progress)
+        raise installer.fault(output)
 
 
 def _locked(root: Path, *names: str) -> list[str]:
@@ -125,131 +127,119 @@ def _locked(root: Path, *names: str) -> list[str]:
     return ["--require-hashes", "--no-deps", *files]
 
 
-def _fault(output: str, log: Path, progress: Progress) -> EnvironmentFault:
-    rows = [row.strip() for row in output.splitlines()]
-    errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
-    for row in (errors or rows)[-4:]:
-        progress.step(f"  {row[:300]}")
-    return EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {log})")
-
-
 def find_uv(python: Path, environ: Mapping[str, str]) -> Path | None:
     """The uv beside ``python``, else one on ``PATH`` that is new enough, else ``None``."""
     beside = python.with_name("uv")
     if os.access(beside, os.X_OK):
         return beside
     on_path = shutil.which("uv", path=environ.get("PATH"))
-    if on_path is None:
-        return None
-    try:
-        answer = subprocess.run(
-            [on_path, "--version"],
-            env=environ,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_UV_TIMEOUT_S,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    match = re.match(r"uv (\d+)\.(\d+)", answer.stdout)
-    return Path(on_path) if match and (int(match[1]), int(match[2])) >= _OLDEST_UV else None
+    answer = answer_of([on_path, "--version"], environ, _UV_TIMEOUT_S) if on_path else None
+    match = re.match(r"uv (\d+)\.(\d+)", answer.stdout if answer else "")
+    is_new = match is not None and (int(match[1]), int(match[2])) >= _OLDEST_UV
+    return Path(on_path) if on_path and is_new else None
 
 
-def _install_uv(
-    python: Path, what: Sequence[str], log: Path, progress: Progress, environ: Mapping[str, str]
-) -> Path | None:
-    """Install uv beside ``python``; ``None``, and a line for the user, where it cannot be had.
+def _install_uv(installer: Installer, what: Sequence[str]) -> Path | None:
+    """Install uv beside Python; ``None``, and a line for the user, where it cannot be had.
 
     Raises:
         EnvironmentFault: where nothing else could be installed either.
     """
-    progress.detail("installing uv")
-    output = run_logged([str(python), *PIP_INSTALL, *what], log.parent, log, progress, environ)
+    installer.progress.detail("installing uv")
+    output = installer.run([str(installer.python), *PIP_INSTALL, *what])
     if output is None:
-        return find_uv(python, environ)
+        return find_uv(installer.python, installer.environ)
     if explain_machine(output):
-        raise _fault(output, log, progress)
-    progress.step("there is no uv for this machine: using pip, which takes longer")
+        raise installer.fault(output)
+    installer.progress.step("there is no uv for this machine: using pip, which takes longer")
     return None
 
 
-def run_installs(
-    python: Path,
-    uv: Path | None,
-    calls: Sequence[Sequence[str]],
-    folder: Path,
-    log: Path,
-    progress: Progress,
-    environ: Mapping[str, str],
-) -> str | None:
-    """Install for ``python``, once for each of ``calls`` (arguments that uv and pip share).
+@dataclass(frozen=True)
+class Installer:
+    """Installs packages for a Python.
 
-    Where uv fails, pip tries: it gets through some proxies that stop uv, and what pip says is what
-    callers explain.
-
-    Returns:
-        ``None``, or all that the program wrote that failed.
-
-    Raises:
-        OSError: if a program cannot be started, or the log cannot be written.
+    Attributes:
+        python: of a virtual environment.
+        folder: where uv and pip run.
+        log: what they write.
+        environ: their environment.
     """
-    in_uv = uv_settings(_settings_of_pip(python, environ), environ) if uv else None
-    if uv and in_uv is None:
-        progress.step("uv does not know all settings that pip has here: using pip")
-    elif uv and in_uv is not None:
-        command = [str(uv), *_UV_INSTALL, "--python", str(python)]
-        output = _run_each(command, calls, folder, log, progress, {**environ, **in_uv})
-        if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
-            return output  # pip would not find more
-        progress.step(f"uv failed: trying pip (log: {log})")
-    return _run_each([str(python), *PIP_INSTALL], calls, folder, log, progress, environ)
 
+    python: Path
+    folder: Path
+    log: Path
+    progress: Progress
+    environ: Mapping[str, str]
 
-def _run_each(
-    command: Sequence[str],
-    calls: Sequence[Sequence[str]],
-    folder: Path,
-    log: Path,
-    progress: Progress,
-    environ: Mapping[str, str],
-) -> str | None:
-    outputs = (run_logged([*command, *c], folder, log, progress, environ) for c in calls)
-    return next((output for output in outputs if output is not None), None)
+    def install(self, calls: Sequence[Sequence[str]], uv: Path | None) -> str | None:
+        """Install once for each of ``calls`` (arguments that uv and pip share).
 
+        Where uv fails, pip tries: it gets through some proxies that stop uv, and what pip says is
+        what callers explain.
 
-def run_logged(
-    command: Sequence[str], folder: Path, log: Path, progress: Progress, environ: Mapping[str, str]
-) -> str | None:
-    """Run pip or uv in ``folder`` and show what it does; ``None``, or its output if it failed.
+        Returns:
+            ``None``, or all that the program wrote that failed.
 
-    Raises:
-        OSError: if it cannot be started, or the log cannot be written.
-    """
-    rows: list[str] = []
-    with (
-        log.open("a", encoding="utf-8") as file,
-        subprocess.Popen(
-            command,
-            cwd=folder,
-            env=environ,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-        ) as process,
-    ):
-        try:
-            for row in process.stdout or ():
-                file.write(row)
-                rows.append(row)
-                _show(row, progress)
-        except BaseException:
-            process.terminate()
-            raise
-    return "".join(rows) if process.returncode else None
+        Raises:
+            OSError: if a program cannot be started, or the log cannot be written.
+        """
+        if uv:
+            listing = answer_of([str(self.python), "-m", "pip", "config", "list"], self.environ)
+            in_uv = uv_settings(listing.stdout if listing else "", self.environ)
+            if in_uv is None:
+                self.progress.step("uv does not know all settings that pip has here: using pip")
+            else:
+                command = [str(uv), *_UV_INSTALL, "--python", str(self.python)]
+                output = self._run_each(command, calls, {**self.environ, **in_uv})
+                if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
+                    return output  # pip would not find more
+                self.progress.step(f"uv failed: trying pip (log: {self.log})")
+        return self._run_each([str(self.python), *PIP_INSTALL], calls, self.environ)
+
+    def fault(self, output: str) -> EnvironmentFault:
+        """The error for what the program that failed has written, of which it shows the end."""
+        rows = [row.strip() for row in output.splitlines()]
+        errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
+        for row in (errors or rows)[-4:]:
+            self.progress.step(f"  {row[:300]}")
+        return EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {self.log})")
+
+    def _run_each(
+        self, command: Sequence[str], calls: Sequence[Sequence[str]], environ: Mapping[str, str]
+    ) -> str | None:
+        outputs = (self.run([*command, *arguments], environ) for arguments in calls)
+        return next((output for output in outputs if output is not None), None)
+
+    def run(self, command: Sequence[str], environ: Mapping[str, str] | None = None) -> str | None:
+        """Run pip or uv and show what it does; ``None``, or its output if it failed.
+
+        Raises:
+            OSError: if it cannot be started, or the log cannot be written.
+        """
+        rows: list[str] = []
+        with (
+            self.log.open("a", encoding="utf-8") as file,
+            subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env=environ or self.environ,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+            ) as process,
+        ):
+            try:
+                for row in process.stdout or ():
+                    file.write(row)
+                    rows.append(row)
+                    _show(row, self.progress)
+            except BaseException:
+                process.terminate()
+                raise
+        return "".join(rows) if process.returncode else None
 
 
 def _show(row: str, progress: Progress) -> None:
@@ -259,19 +249,6 @@ def _show(row: str, progress: Progress) -> None:
         progress.step(f"unpacking {prepared[1]} packages")
     elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
         progress.detail(row.partition(" (from ")[0].strip())
-
-
-def _settings_of_pip(python: Path, environ: Mapping[str, str]) -> str:
-    """What ``pip config list`` says: settings of its files and of the environment."""
-    answer = subprocess.run(
-        [str(python), "-m", "pip", "config", "list"],
-        env=environ,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return answer.stdout
 
 
 def uv_settings(listing: str, environ: Mapping[str, str]) -> dict[str, str] | None:

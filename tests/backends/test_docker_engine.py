@@ -21,8 +21,8 @@ from docker.errors import APIError
 from urllib3.exceptions import ProtocolError
 
 from neuros.backends.docker import engine as engine_module
-from neuros.backends.docker.back_end import without_limits
 from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_name, explain
+from neuros.backends.docker.launcher import without_limits
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 from neuros.project.resources import Resources

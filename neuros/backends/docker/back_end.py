@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neuros.backends.containers import STANDARD, find_container
-from neuros.backends.docker.settings import as_here, inside, outside
+from neuros.backends.docker.settings import outside
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, Notice
+from neuros.ports import BackEnd, Deployment, Finding
 from neuros.project.model import Folders, Node, NodeFile, Project
-
-if TYPE_CHECKING:
-    from neuros.backends.docker.launcher import Containers
 
 # What faults of the engine end with; it is no news where nodes run without containers.
 _WITHOUT = ", or run without containers: --backend process"
@@ -41,10 +37,9 @@ class Docker(BackEnd):
             )
         _check_modules(nodes, project.folder)
         # The Docker SDK is slow to import.
-        from neuros.backends.docker.launcher import find_containers
+        from neuros.backends.docker.launcher import Containers
 
-        names = dict.fromkeys(node.container for node in nodes)
-        return _Containers(find_containers(names, project.folder), nodes)
+        return Containers(nodes, project.folder)
 
     def why_not(self, fault: EnvironmentFault) -> str:
         reason, *others = super().why_not(fault).split(" (and ")
@@ -70,35 +65,6 @@ class Docker(BackEnd):
 BACK_END = Docker()
 
 
-class _Containers(Deployment):
-    """Containers for nodes: the engine and their images."""
-
-    def __init__(self, containers: Containers, nodes: Sequence[Node]) -> None:
-        self._containers = containers
-        self.notices = [
-            *(("WARN", each.notice) for each in containers.images.values() if each.notice),
-            *without_limits(nodes, containers.abilities.unkept),
-            *_without_display(nodes, os.environ),
-        ]
-
-    def launcher(self, program: NodeProgram) -> Launcher:
-        from neuros.backends.docker.launcher import DockerLauncher
-
-        return DockerLauncher(self._containers, program)
-
-    def as_seen(self, file: NodeFile) -> NodeFile:
-        return inside(file)
-
-    def as_here(self, text: str, folders: Folders) -> str:
-        return as_here(text, folders)
-
-    def record(self) -> Mapping[str, Any]:
-        try:
-            return {"docker": self._containers.record()}
-        except EnvironmentFault:  # the engine has gone away, of which the run has ended
-            return {"docker": None}
-
-
 def _check_modules(nodes: Sequence[Node], project: Path) -> None:
     """Check that no plugin is a module that its node's container cannot have.
 
@@ -115,32 +81,6 @@ def _check_modules(nodes: Sequence[Node], project: Path) -> None:
                 f" containers/{package}/requirements.txt beside the project file, and write"
                 f' "container": "{package}" in the node{_WITHOUT}'
             )
-
-
-def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[Notice]:
-    """One line on limits that the engine does not keep."""
-    asking = [
-        node.name
-        for node in nodes
-        if any(getattr(node.resources, limit) is not None for limit in unkept)
-    ]
-    if not asking:
-        return ()
-    return [
-        (
-            "WARN",
-            f"resources of {', '.join(asking)} have no effect: this Docker engine has no control"
-            " groups for them (docker info)",
-        )
-    ]
-
-
-def _without_display(nodes: Sequence[Node], environ: Mapping[str, str]) -> Sequence[Notice]:
-    """One line on nodes that ask for a display where there is none."""
-    asking = [node.name for node in nodes if node.access.display]
-    if not asking or environ.get("DISPLAY"):
-        return ()
-    return [("WARN", f"no windows of {', '.join(asking)}: DISPLAY is not set")]
 
 
 def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:

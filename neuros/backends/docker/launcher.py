@@ -8,7 +8,7 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +32,10 @@ from neuros.backends.docker.settings import (
     NETWORK_MODE,
     NO_NETWORK,
     X11,
+    as_here,
     container_name,
     container_settings,
+    inside,
     mount,
     shared_memory,
     user_for,
@@ -49,10 +51,10 @@ from neuros.backends.node_command import (
 from neuros.backends.run_processes import RUN_ID, RunProcesses
 from neuros.backends.shared_memory import hold
 from neuros.distribution import build_command
-from neuros.errors import EnvironmentFault
-from neuros.ports import NodeProgram, Reaper
+from neuros.errors import EnvironmentFault, results_of
+from neuros.ports import Deployment, NodeProgram, Notice, Reaper
 from neuros.project.load import PROJECT_FILE
-from neuros.project.model import NodeFile
+from neuros.project.model import Folders, Node, NodeFile
 from neuros.project.resources import memory_text
 
 TOOL_IMAGE = "neuros_tools"
@@ -66,39 +68,64 @@ _STOPPED = "the Docker engine stopped it: by `docker stop`, or because the engin
 _REMOVAL_S = 2.0
 
 
-@dataclass(frozen=True)
-class Containers:
-    """The engine, what it can do, and the image of every container that nodes name."""
-
-    engine: DockerClient
-    images: Mapping[str, Image]
-    abilities: Abilities
-
-    def record(self) -> dict[str, Any]:
-        """The engine's version and the images, ready for JSON. Raises ``EnvironmentFault``."""
-        with engine_faults("Docker"):
-            version = engine_name(self.engine.version())
-        images = {
-            container: {"name": image.name, "id": image.id}
-            for container, image in self.images.items()
-        }
-        return {"engine": version, "images": images}
-
-
-def find_containers(names: Iterable[str], project_folder: Path | None) -> Containers:
-    """The engine and the images for containers of these names.
+class Containers(Deployment):
+    """Containers for nodes: the engine, what it can do, and the image of each container.
 
     Raises:
         EnvironmentFault: if there is no engine, or an image is not there.
     """
-    engine = connect()
-    try:
-        with engine_faults("Docker"):
-            abilities = Abilities.of(engine.info())
-        return Containers(engine, images_for(names, project_folder, engine), abilities)
-    except BaseException:
-        engine.close()
-        raise
+
+    def __init__(self, nodes: Sequence[Node], project_folder: Path) -> None:
+        self.engine = connect()
+        try:
+            with engine_faults("Docker"):
+                self.abilities = Abilities.of(self.engine.info())
+            names = [node.container for node in nodes]
+            self.images = images_for(names, project_folder, self.engine)
+        except BaseException:
+            self.engine.close()
+            raise
+        self.notices = [
+            *(("WARN", each.notice) for each in self.images.values() if each.notice),
+            *without_limits(nodes, self.abilities.unkept),
+        ]
+        blind = [node.name for node in nodes if node.access.display]
+        if blind and not os.environ.get("DISPLAY"):
+            self.notices.append(("WARN", f"no windows of {', '.join(blind)}: DISPLAY is not set"))
+
+    def launcher(self, program: NodeProgram) -> DockerLauncher:
+        return DockerLauncher(self, program)
+
+    def as_seen(self, file: NodeFile) -> NodeFile:
+        return inside(file)
+
+    def as_here(self, text: str, folders: Folders) -> str:
+        return as_here(text, folders)
+
+    def record(self) -> Mapping[str, Any]:
+        try:
+            with engine_faults("Docker"):
+                version = engine_name(self.engine.version())
+        except EnvironmentFault:  # the engine has gone away, of which the run has ended
+            return {"docker": None}
+        images = {name: {"name": each.name, "id": each.id} for name, each in self.images.items()}
+        return {"docker": {"engine": version, "images": images}}
+
+
+def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[Notice]:
+    """One line on limits that the engine does not keep."""
+    asking = [
+        node.name
+        for node in nodes
+        if any(getattr(node.resources, limit) is not None for limit in unkept)
+    ]
+    if not asking:
+        return ()
+    text = (
+        f"resources of {', '.join(asking)} have no effect: this Docker engine has no control"
+        " groups for them (docker info)"
+    )
+    return [("WARN", text)]
 
 
 class DockerLauncher:
@@ -109,16 +136,16 @@ class DockerLauncher:
     """
 
     def __init__(self, containers: Containers, program: NodeProgram) -> None:
+        self._containers = containers
         self._engine = containers.engine
-        self._images = containers.images
         self._program = program
-        self._is_rootless = containers.abilities.is_rootless
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningContainer]:
         """Start a container per node, side by side, all or none. Raises ``EnvironmentFault``."""
-        folder = shared_memory(environment.get(RUN_ID, ""))
+        run_id = environment.get(RUN_ID, "")
+        folder = shared_memory(run_id)
         socket = engine_socket(self._engine)
         if self._program.reaper:
             self._program.reaper.clean_with(leftovers.__name__, socket)
@@ -129,87 +156,59 @@ class DockerLauncher:
         except OSError as error:
             raise EnvironmentFault(f"no shared memory for containers: {error}") from error
         with engine_faults("the engine's events cannot be listened to"):
-            events = ContainerEvents(self._engine, environment.get(RUN_ID, ""))
+            events = ContainerEvents(self._engine, run_id)
         events.start()
         in_run_folder = _in_run_folder(nodes)
+
+        def start(file: NodeFile, network: str) -> RunningContainer:
+            name = file.node.name
+            settings = container_settings(
+                file,
+                self._image(file),
+                user_for(
+                    file, self._program.environ, is_rootless=self._containers.abilities.is_rootless
+                ),
+                self._program,
+                environment,
+                others=[path for path in in_run_folder if path != node_folder(file)],
+                launcher_pid=os.getpid(),
+                network=network,
+            )
+            with engine_faults(f"the container of node '{name}' cannot be started"):
+                container = self._engine.containers.create(**settings)
+                container.start()
+            return RunningContainer(file, str(container.id), self._engine, events)
+
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
-            networks = self._networks(nodes, environment)
             work = []
-            for node, network in zip(nodes, networks, strict=True):
-                work.append(
-                    threads.submit(
-                        self._start_one, node, environment, events, in_run_folder, network
-                    )
-                )
+            for node, network in zip(nodes, self._networks(nodes, run_id), strict=True):
+                work.append(threads.submit(start, node, network))
                 if network == NO_NETWORK and work[0].exception():  # the others need it
                     break
-        faults = [fault for each in work if (fault := each.exception())]
-        started = [each.result() for each in work if not each.exception()]
-        if not faults:
-            return started
-        events.close()
-        for container in started:
-            container.kill()
-        others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
-        if others:
-            raise others[0]
-        raise EnvironmentFault("\n".join(dict.fromkeys(map(str, faults))))
+        started, failed = results_of(work)
+        if failed is not None:
+            events.close()
+            for container in started:
+                container.kill()
+            raise failed
+        return started
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
         """One line per container."""
         return [self._description(node) for node in nodes]
 
-    def _networks(self, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> Sequence[str]:
+    def _networks(self, nodes: Sequence[NodeFile], run_id: str) -> Sequence[str]:
         """The network of each container: this machine's, or one of the run's own."""
         if not self._program.is_isolated:
             return [NETWORK_MODE] * len(nodes)
         first, *others = nodes
-        shared = f"container:{container_name(first, environment.get(RUN_ID, ''))}"
-        return [NO_NETWORK, *(shared for _ in others)]
+        return [NO_NETWORK, *[f"container:{container_name(first, run_id)}"] * len(others)]
 
-    def _start_one(
-        self,
-        file: NodeFile,
-        environment: Mapping[str, str],
-        events: ContainerEvents,
-        in_run_folder: Sequence[Path],
-        network: str,
-    ) -> RunningContainer:
-        name, mem_bytes = file.node.name, file.node.resources.mem_bytes
-        with engine_faults(f"the container of node '{name}' cannot be started"):
-            container = self._engine.containers.create(
-                **self._settings(file, environment, in_run_folder, network)
-            )
-            container.start()
-        return RunningContainer(
-            name,
-            str(container.id),
-            self._engine,
-            events,
-            log=log_file(file),
-            mem_bytes=mem_bytes,
-        )
-
-    def _settings(
-        self,
-        file: NodeFile,
-        environment: Mapping[str, str],
-        in_run_folder: Sequence[Path],
-        network: str,
-    ) -> dict[str, Any]:
-        return container_settings(
-            file,
-            self._images[file.node.container],
-            user_for(file, self._program.environ, is_rootless=self._is_rootless),
-            self._program,
-            environment,
-            others=[path for path in in_run_folder if path != node_folder(file)],
-            launcher_pid=os.getpid(),
-            network=network,
-        )
+    def _image(self, file: NodeFile) -> Image:
+        return self._containers.images[file.node.container]
 
     def _description(self, file: NodeFile) -> str:
-        node, image = file.node, self._images[file.node.container]
+        node, image = file.node, self._image(file)
         command = shlex.join(self._program.command(image.start))
         facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
         where = on_cores(self._program.cores.get(node.name))
@@ -252,27 +251,18 @@ class RunningContainer:
     """
 
     def __init__(
-        self,
-        name: str,
-        container_id: str,
-        engine: DockerClient,
-        events: ContainerEvents,
-        *,
-        log: Path,
-        mem_bytes: int | None,
+        self, file: NodeFile, container_id: str, engine: DockerClient, events: ContainerEvents
     ) -> None:
-        self._name = name
+        self._file = file
         self._id = container_id
         self._engine = engine
         self._events = events
-        self._log = log
-        self._mem_bytes = mem_bytes
         self._is_told = False
         events.add(container_id)
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (self._name,)
+        return (self._file.node.name,)
 
     @property
     def id(self) -> str:
@@ -283,10 +273,10 @@ class RunningContainer:
         """``None`` while it runs, then how it ended, in words."""
         end = self._events.end_of(self._id)
         if end is not None:
-            words = how_it_ended(*end, self._log, self._mem_bytes)
+            words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
             is_stopped = self._events.is_signalled(self._id) and not self._is_told
             return f"{words}: {_STOPPED}" if is_stopped else words
-        if self._events.lost and not self._events.has_processes(self._name):
+        if self._events.lost and not self._events.has_processes(self._file.node.name):
             return f"the Docker engine went away ({self._events.lost}): start it again"
         return None
 
@@ -303,7 +293,7 @@ class RunningContainer:
     def _signal(self, number: signal.Signals) -> None:
         self._is_told = True
         if self._events.lost:
-            self._events.signal_all(number, self._name)
+            self._events.signal_all(number, self._file.node.name)
         else:
             threading.Thread(target=self._tell_engine, args=(number,), daemon=True).start()
 

@@ -21,7 +21,7 @@ from neuros.backends.machines.machine import Log, Machine, agent_command, ssh_co
 from neuros.control import CONTROL_VARIABLE
 from neuros.control.machines import Finished, Ready, Start
 from neuros.distribution import WORKSPACE
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, results_of
 from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
 from neuros.project.deployment import DeploymentFile, Host
 from neuros.project.model import Folders, NodeFile, Project
@@ -126,12 +126,11 @@ class Machines(Deployment):
                 for each in tuple(held):
                     each.close()
                 raise
-        faults = [fault for each in work if (fault := each.exception())]
-        self.sides = [side for each in work if not each.exception() for side in each.result()]
-        if faults:
+        sides, failed = results_of(work)
+        self.sides = [side for of_host in sides for side in of_host]
+        if failed is not None:
             self.close()
-            others = [fault for fault in faults if not isinstance(fault, EnvironmentFault)]
-            raise others[0] if others else EnvironmentFault("\n".join(map(str, faults)))
+            raise failed
         for side in self.sides:
             clock = side.machine.clock
             ahead_s = clock.unix_s

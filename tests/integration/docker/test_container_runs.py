@@ -21,7 +21,7 @@ from virtual_display import virtual_display
 from containers import require_containers, wait_until
 from neuros.backends.control_sockets import SOCKET_NAME
 from neuros.backends.docker.engine import engine_socket
-from neuros.backends.docker.launcher import DockerLauncher, find_containers
+from neuros.backends.docker.launcher import Containers, DockerLauncher
 from neuros.backends.docker.settings import container_name, shared_memory
 from neuros.backends.run_processes import RUN_ID, environ_of
 from neuros.backends.sessions import Session, reaper_environment
@@ -485,7 +485,7 @@ def test_a_name_that_is_taken_is_said_and_nothing_is_left(
     for node in (a, b):
         (tmp_path / node.node.name).mkdir()
         (tmp_path / node.node.name / "node.json").touch()
-    containers = find_containers(["neuros_python"], None)
+    containers = Containers([a.node, b.node], tmp_path)
     launcher = DockerLauncher(containers, NodeProgram())
     taken = containers.engine.containers.create(
         containers.images["neuros_python"].id, ["true"], name=container_name(b, run_id)
