@@ -97,7 +97,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "tf": {"geometry_msgs"},
     "snn.nest": {"numpy", "nest"},
     "simulators.convert": {"mujoco", "numpy"},
-    "simulators.convert.building": {"mujoco", "numpy", "trimesh"},
+    "simulators.convert.mjcf": {"mujoco", "numpy", "trimesh"},
     "backends.docker": {"docker", "requests"},
     "backends.console": {"tqdm"},
     "backends.virtual_environments": {"packaging"},

@@ -9,9 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.simulators.convert.building import Building, set_first
 from neuros.simulators.convert.elements import Element
 from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector
+from neuros.simulators.convert.mjcf import Building, set_first
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL = mujoco.mjtJoint.mjJNT_BALL

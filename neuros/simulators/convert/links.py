@@ -14,9 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.simulators.convert.building import Building, put
 from neuros.simulators.convert.elements import Element
 from neuros.simulators.convert.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
+from neuros.simulators.convert.mjcf import Building
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom
@@ -113,14 +113,13 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
     if shape.type == _GEOMS.mjGEOM_PLANE and not link.is_static:
         element.note("MuJoCo has planes only where nothing moves")
         return None
-    geom = building.body(link).add_geom(type=shape.type)
+    pose = link.scope.read_pose(element, link.pose) @ shape.pose
+    name = f"{link.name}/{element.name}"
+    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
+    geom = building.add("geom", link, pose, name, noting, type=shape.type)
     geom.size[: len(shape.size)] = shape.size
     if shape.mesh:
         geom.meshname = shape.mesh
-    pose = link.scope.read_pose(element, link.pose)
-    put(geom, pose @ shape.pose, link.pose)
-    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
-    geom.name = building.name("geom", f"{link.name}/{element.name}", noting)
     mesh = element.child("geometry", "mesh")
     if shape.mesh and mesh is not None and element.tag == "collision":
         building.colliding_meshes[geom.name] = mesh
@@ -340,10 +339,9 @@ def _add_camera(building: Building, link: Link, element: Element, pose: Pose) ->
     if across >= math.pi:
         settings.problem(f"the field of view must be below pi, not {across:g}")
         return
-    camera = building.body(link).add_camera(resolution=[int(width), int(height)])
-    camera.name = building.name("camera", f"{link.name}/{element.name}", element)
+    name, size = f"{link.name}/{element.name}", [int(width), int(height)]
+    camera = building.add("camera", link, pose @ _TO_CAMERA, name, element, resolution=size)
     camera.fovy = math.degrees(2 * math.atan(math.tan(across / 2) * height / width))
-    put(camera, pose @ _TO_CAMERA, link.pose)
     if remark := _CAMERAS[element.type]:
         element.remark(remark)
 
@@ -395,20 +393,16 @@ def add_frames(building: Building, scope: Scope) -> None:
             continue
         link = inner.body(element.name, element)
         if link is not None:
-            site = building.body(link).add_site()
-            site.name = building.name("site", inner.prefix + element.name, element)
-            put(site, inner.pose @ inner.place(element.name, element), link.pose)
+            pose = inner.pose @ inner.place(element.name, element)
+            building.add("site", link, pose, inner.prefix + element.name, element)
 
 
 def _add_site(
     building: Building, link: Link, element: Element, pose: Pose, wanted: str = ""
 ) -> str:
     """Add a site to a link, where ``pose`` is in the world; returns its name."""
-    site = building.body(link).add_site(group=4)
-    name = building.name("site", wanted or f"{link.name}/{element.name}", element)
-    site.name = name
-    put(site, pose, link.pose)
-    return name
+    name = wanted or f"{link.name}/{element.name}"
+    return str(building.add("site", link, pose, name, element, group=4).name)
 
 
 def _add_sensor(building: Building, name: str, kind: Any, site: str, element: Element) -> Any:
@@ -432,12 +426,11 @@ def _add_light(building: Building, element: Element, pose: Pose, link: Link | No
     if kind not in _LIGHTS:
         element.problem(f"'{kind}' is not a light", f"there are: {', '.join(_LIGHTS)}")
         return
-    local = (Pose() if link is None else link.pose).inverse() @ pose
-    light: Any = building.body(link).add_light(pos=local.position, type=_LIGHTS[kind])
-    light.name = building.name("light", element.name, element)
+    light = building.add("light", link, pose, element.name, element, type=_LIGHTS[kind])
     direction = np.array(element.vector("direction", (0.0, 0.0, -1.0)))
     if direction.any():
-        light.dir = local.rotation @ (direction / np.linalg.norm(direction))
+        turned = pose.rotation @ (direction / np.linalg.norm(direction))
+        light.dir = turned if link is None else link.pose.rotation.T @ turned
     light.diffuse = _light_colour(element, "diffuse", 1.0)
     light.specular = _light_colour(element, "specular", 0.1)
     light.castshadow = element.is_true("cast_shadows")

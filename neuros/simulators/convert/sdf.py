@@ -10,21 +10,12 @@ import mujoco
 import numpy as np
 
 from neuros.simulators.convert import joints, links
-from neuros.simulators.convert.building import (
-    Building,
-    Converted,
-    Meshes,
-    compile_boxed,
-    put,
-    said_by,
-)
 from neuros.simulators.convert.elements import Element, Report
 from neuros.simulators.convert.find import Finder, Includer
 from neuros.simulators.convert.frames import (
     Branch,
     Joint,
     Link,
-    Pose,
     Scope,
     Tree,
     Vector,
@@ -32,6 +23,13 @@ from neuros.simulators.convert.frames import (
     place_all,
     read_pose,
     read_scope,
+)
+from neuros.simulators.convert.mjcf import (
+    Building,
+    Converted,
+    Meshes,
+    compile_boxed,
+    said_by,
 )
 
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
@@ -126,10 +124,8 @@ def _build(building: Building, scope: Scope, tree: Tree) -> None:
 
 def _add_body(building: Building, branch: Branch) -> None:
     link, inertial = branch.link, branch.link.element.child("inertial")
-    body = building.body(branch.parent).add_body()
+    body = building.add("body", branch.parent, link.pose, link.name, link.element)
     building.bodies[id(link)] = body
-    body.name = building.name("body", link.name, link.element)
-    put(body, link.pose, Pose() if branch.parent is None else branch.parent.pose)
     # Since SDF 1.11 the mass may be computed from shapes and densities.
     is_solid = inertial is not None and inertial.has("auto") and not link.is_static
     if not link.is_static and not is_solid:

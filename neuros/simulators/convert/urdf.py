@@ -15,7 +15,10 @@ from typing import Any
 import mujoco
 
 from neuros.errors import Problem
-from neuros.simulators.convert.building import (
+from neuros.simulators.convert.elements import Element, Report, parse
+from neuros.simulators.convert.find import Finder, NotFound
+from neuros.simulators.convert.joints import follow_joint
+from neuros.simulators.convert.mjcf import (
     Converted,
     Triangles,
     compile_boxed,
@@ -25,9 +28,6 @@ from neuros.simulators.convert.building import (
     triangles_of,
     why_unread,
 )
-from neuros.simulators.convert.elements import Element, Report, parse
-from neuros.simulators.convert.find import Finder, NotFound
-from neuros.simulators.convert.joints import follow_joint
 
 _DRIVES = "declare drives in the node file: `joint` and `drive`"
 _UNSUPPORTED_ELEMENTS = {

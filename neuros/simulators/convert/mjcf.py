@@ -53,6 +53,29 @@ class Building:
         """The body of a link; the world without one."""
         return self.spec.worldbody if link is None else self.bodies[id(link)]
 
+    def add(
+        self,
+        sort: str,
+        link: Link | None,
+        pose: Pose,
+        name: str,
+        element: Element | None,
+        **has: Any,
+    ) -> Any:
+        """Add a geom, site, camera or light, whose ``pose`` is in the world, to a link's body.
+
+        Args:
+            element: what a change of its name is noted of.
+            has: further attributes.
+        """
+        thing = getattr(self.body(link), f"add_{sort}")(**has)
+        thing.name = self.name(sort, name, element)
+        local = (Pose() if link is None else link.pose).inverse() @ pose
+        thing.pos = local.position
+        if hasattr(thing, "quat"):
+            thing.quat = local.quaternion
+        return thing
+
     def name(self, sort: str, wanted: str, element: Element | None) -> str:
         """A name that no other element of its sort (geom, site, ...) has; a change is noted."""
         name, number = wanted, self._names.get((sort, wanted), 0) + 1
@@ -63,12 +86,6 @@ class Building:
         if number > 1 and element is not None:
             element.remark(f"called '{name}': the name is taken")
         return name
-
-
-def put(thing: Any, pose: Pose, seen_from: Pose) -> None:
-    """Place an element of the spec whose pose in the world is ``pose``."""
-    local = seen_from.inverse() @ pose
-    thing.pos, thing.quat = local.position, local.quaternion
 
 
 def set_first(thing: Any, attribute: str, value: float) -> None:
