@@ -176,11 +176,10 @@ def time_figure(run: PastRun) -> Any | None:
     figure = new_figure(3.4)
     left, right = (plain(axes) for axes in figure.subplots(1, 2))
     for place, (name, points) in enumerate(timelines.items()):
-        sims, walls = zip(*points, strict=True)
+        sims, walls = np.transpose(points)
         left.plot(walls, sims, color=colour(place), label=name, marker="o", markersize=3)
-        factors = [
-            (b[0] - a[0]) / (b[1] - a[1]) for a, b in itertools.pairwise(points) if b[1] > a[1]
-        ]
+        passed_s = np.diff(walls)
+        factors = np.diff(sims)[passed_s > 0] / passed_s[passed_s > 0]
         right.step(range(1, len(factors) + 1), factors, where="mid", color=colour(place))
     low, high = left.get_xlim()
     left.axline((low, low), slope=1, color=GREY, linestyle="--", linewidth=1, label="real time")
@@ -203,10 +202,10 @@ def load_figure(run: PastRun) -> Any | None:
     groups = [name.removesuffix(suffix) for name in series if name.endswith(suffix)]
     for place, name in enumerate(groups):
         left.plot(series["time_s"], series[name + suffix], color=colour(place), **marker)
-        memory = [each / 1e6 for each in series[f"{name}.memory_bytes"]]
-        right.plot(series["time_s"], memory, color=colour(place), label=name, **marker)
+        memory_mb = np.divide(series[f"{name}.memory_bytes"], 1e6)
+        right.plot(series["time_s"], memory_mb, color=colour(place), label=name, **marker)
     cores = [name for name in series if name.startswith("core")]
-    whole = [sum(each) for each in zip(*(series[core] for core in cores), strict=True)]
+    whole = np.sum([series[core] for core in cores], axis=0)
     label = f"whole machine, {len(cores)} core{'' if len(cores) == 1 else 's'}"
     left.plot(series["time_s"], whole, color=GREY, linestyle="--", label=label)
     left.set(xlabel="wall time / s", ylabel="processor time / % of one core", ylim=(0, None))
@@ -479,14 +478,15 @@ def _draw_packets(
         return
     side = 1 if receiver > sender else -1
     away, towards = sender + side * _HALF, receiver - side * _HALF
-    for times, segments, shade, dashes in (
+    for times, ends, shade, dashes in (
         (_flights(run, name, window), (away, towards), BLUE, "solid"),
         (_answers(run, name, window), (towards, away), ORANGE, _DASHES),
     ):
         if times is not None:
             is_crowd = len(times) > _CROWD
+            segments: Any = np.stack([times, np.broadcast_to(ends, times.shape)], axis=2)
             lines = LineCollection(
-                _segments(times, *segments), colors=shade, linestyles=[dashes], zorder=3,
+                segments, colors=shade, linestyles=[dashes], zorder=3,
                 linewidth=0.35 if is_crowd else 0.9, alpha=0.6 if is_crowd else 1,
             )  # fmt: skip
             axes.add_collection(lines)
@@ -525,12 +525,6 @@ def _within(times_ns: Numbers, window: tuple[int, int]) -> Numbers:
     is_here = (times_ns[:, 1] >= start_ns) & (times_ns[:, 0] < start_ns + length_ns)
     found: Numbers = (times_ns[is_here][:_MOST_LINES] - start_ns) / 1e6
     return found
-
-
-def _segments(times: Numbers, from_row: float, to_row: float) -> Any:
-    """Line segments, (n, 2, 2)."""
-    rows = np.broadcast_to(np.array([from_row, to_row]), times.shape)
-    return np.stack([times, rows], axis=2)
 
 
 def _legend(figure: Any, run: PastRun, colours: _Colours) -> None:

@@ -18,7 +18,6 @@ from neuros.analysis.packets import Numbers, Packets, read_packets
 from neuros.analysis.run_record import PastRun, consumed_percent
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
-from neuros.project.model import Connection
 from neuros.recording.recording_plan import PLAN_NAME
 from neuros.recording.stored import stored_messages
 
@@ -337,24 +336,15 @@ def _packets(
     ]
     if not any(lacks):
         return packets[0], packets[1]
-    connection = runs[0].ends[name]
     bags = [recorded.digests(run.folder, name) for run in runs]
-    if bags[0] is not None and bags[1] is not None:
-        return (
-            _recorded(packets[0], bags[0], connection),
-            _recorded(packets[1], bags[1], connection),
-        )
-    for place, run in enumerate(runs):
-        bag = bags[place]
-        if lacks[place] and bag is not None and recorded.are_as_of_nodes(run.folder, name):
-            packets[place] = _recorded(packets[place], bag, connection)
+    have_both = all(bag is not None for bag in bags)
+    for place, (run, bag) in enumerate(zip(runs, bags, strict=True)):
+        stands_beside = lacks[place] and recorded.are_as_of_nodes(run.folder, name)
+        if bag is not None and (have_both or stands_beside):
+            # On a reliable connection all of it arrives.
+            received = bag if runs[0].ends[name].is_reliable else packets[place].received
+            packets[place] = replace(packets[place], sent=bag, received=received)
     return packets[0], packets[1]
-
-
-def _recorded(packets: Packets, digests: Numbers, connection: Connection) -> Packets:
-    """With the digests of what was recorded; on a reliable connection all of that arrives."""
-    received = digests if connection.is_reliable else packets.received
-    return replace(packets, sent=digests, received=received)
 
 
 def _lacks_digests(sent: int | None, packets: Packets) -> bool:

@@ -7,7 +7,6 @@ run that was cut off or of an older version, too, and says what is missing. :fun
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,8 +39,6 @@ def run_record(
     """Everything that is known about a run, ready for JSON. Times are in seconds."""
     sim_times = [r.sim_time for r in ended.reports.values() if r.sim_time is not None]
     sim_s, running_s = max(sim_times, default=None), ended.running_s
-    foreign = sum((Counter(r.foreign) for r in ended.reports.values()), Counter[str]())
-    compressed = {name: n for r in ended.reports.values() for name, n in r.compressed.items()}
     all_metrics = {**ended.elsewhere, **{n: r.metrics or {} for n, r in ended.reports.items()}}
     return {
         "format": FORMAT,
@@ -58,10 +55,7 @@ def run_record(
             name: _timeline(points, ended) for name, points in ended.timelines.items() if points
         },
         "connections": [
-            {
-                **_connection(c, all_metrics, ended, run_folder, foreign[str(c)]),
-                **_compressed(compressed.get(str(c))),
-            }
+            _connection(c, all_metrics, ended, run_folder)
             for c in sorted({c for file in files for c in file.connections}, key=lambda c: c.index)
         ],
         "nodes": {
@@ -129,7 +123,6 @@ def _connection(
     all_metrics: Mapping[str, Mapping[str, Any]],
     ended: Outcome,
     run_folder: Path,
-    foreign: int,
 ) -> dict[str, Any]:
     from neuros.analysis.packets import may_have_lost, packet_figures, read_packets
 
@@ -139,8 +132,9 @@ def _connection(
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
     # Counts that a node has last reported before it was killed are older than those of the other.
-    is_known = not {connection.source_node, connection.destination_node} & set(_cut_off(ended))
-    in_flight, lost, running_s = None, None, ended.running_s
+    in_flight, lost, running_s, reports = None, None, ended.running_s, ended.reports
+    nodes = {connection.source_node, connection.destination_node} & {*reports}
+    is_known = all(reports[node].is_final for node in nodes)
     if is_known and sent is not None and received is not None:
         in_flight, lost = in_flight_and_lost(
             sent, received, outgoing["outstanding"], ended.has_drained
@@ -155,19 +149,14 @@ def _connection(
         "in_flight": in_flight,
         "lost": lost,
         **{field: incoming.get(field) for field in fields},
-        "foreign": foreign,
+        "foreign": sum(report.foreign.get(key, 0) for report in reports.values()),
     }
     packets = read_packets(run_folder, connection)
-    return figures | packet_figures(packets, may_lose=may_have_lost(figures))
-
-
-def _compressed(counted: Sequence[int] | None) -> dict[str, int]:
-    return {} if counted is None else {"bytes": counted[0], "compressed_bytes": counted[1]}
-
-
-def _cut_off(ended: Outcome) -> list[str]:
-    """The nodes that have not reported their end."""
-    return [name for name, report in ended.reports.items() if not report.is_final]
+    figures |= packet_figures(packets, may_lose=may_have_lost(figures))
+    for report in reports.values():
+        if key in report.compressed:
+            figures["bytes"], figures["compressed_bytes"] = report.compressed[key]
+    return figures
 
 
 def _node(name: str, ended: Outcome) -> dict[str, Any]:
@@ -490,14 +479,14 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
     if limit_ms is None:
         return
     for node, metrics in record["nodes"].items():
-        if _has_ticks(metrics) and not _is_known(metrics):
+        ticks_of = {hook: each.get("ticks") for hook, each in (metrics.get("hooks") or {}).items()}
+        if any(ticks_of.values()) and not _is_known(metrics):
             yield (
                 f"it is not known how far ticks of {node} were off their period; the limit is"
                 f" {limit_ms:g} ms"
             )
             continue
-        for hook, figures in (metrics.get("hooks") or {}).items():
-            ticks = figures.get("ticks")
+        for hook, ticks in ticks_of.items():
             if ticks and ticks["largest_error_ms"] > limit_ms:
                 yield (
                     f"a tick of '{hook}' of {node} was off its period by"
@@ -517,7 +506,3 @@ def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool
 def _is_known(node: Mapping[str, Any]) -> bool:
     """Whether the figures of a node are those of its end."""
     return bool(node.get("report") == "final")
-
-
-def _has_ticks(node: Mapping[str, Any]) -> bool:
-    return any(figures.get("ticks") for figures in (node.get("hooks") or {}).values())

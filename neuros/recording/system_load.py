@@ -340,8 +340,9 @@ class LoadMonitor(threading.Thread):
     def run(self) -> None:
         """Write rows until the end, or until there is no room for them."""
         try:
-            with open(self._path, "w", newline="", encoding="utf-8") as file:
-                self._write(csv.writer(file), file.flush)
+            # Line by line, so that it can be read while the run goes on.
+            with open(self._path, "w", 1, "utf-8", newline="") as file:
+                self._write(csv.writer(file))
         except OSError as error:
             self.failure = (
                 f"{self._path} could not be written to ({error.strerror}): the system load was not"
@@ -354,9 +355,8 @@ class LoadMonitor(threading.Thread):
         self.join()
         return self._table.summary()
 
-    def _write(self, writer: Any, flush: Callable[[], None]) -> None:
+    def _write(self, writer: Any) -> None:
         writer.writerow(self._table.header)
-        flush()
         start_s = time.monotonic()
         self._table.begin(start_s, self._meter.machine(), self._meter.groups())
         due_s = start_s + self._period_s
@@ -364,5 +364,4 @@ class LoadMonitor(threading.Thread):
             now_s = time.monotonic()
             cells = self._table.row(now_s, self._meter.machine(), self._meter.groups())
             writer.writerow([f"{now_s - start_s:.3f}", f"{time.time():.3f}", *cells])
-            flush()
             due_s = max(due_s + self._period_s, now_s)

@@ -14,7 +14,7 @@ import os
 import warnings
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -30,12 +30,8 @@ from neuros.snn.coding import (
 )
 
 LARGEST_SEED = 2**32 - 1
-
-
-class _Owner:
-    """Count of resets: NEST has one kernel per process, so this is one per process, too."""
-
-    resets = 0
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
 
 
 def import_nest() -> ModuleType:
@@ -127,33 +123,9 @@ def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> 
             stacklevel=2,
         )
     nest.ResetKernel()
-    _Owner.resets += 1
+    Stepper.resets += 1
     nest.set(resolution=resolution_ms, local_num_threads=threads, rng_seed=seed, print_time=False)
     return nest
-
-
-class KernelInUse:
-    """Notices when another node resets the kernel, which two nodes of a process cannot share."""
-
-    def __init__(self) -> None:
-        self._resets = _Owner.resets
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether :func:`reset_kernel` has not been called since."""
-        return self._resets == _Owner.resets
-
-    def check(self) -> None:
-        """Raise ``NodeError`` once it has been."""
-        if not self.is_ours:
-            raise NodeError(
-                "NEST's kernel has been reset, and there is one per process: two nodes with "
-                "NEST need a process each (--backend process), and a node has one network at a time"
-            )
-
-
-NS_PER_S = 1_000_000_000
-NS_PER_MS = 1_000_000
 
 
 class PartialDelayWarning(UserWarning):
@@ -255,10 +227,13 @@ class Stepper:
         strict: refuse steps that are no whole number of ``min_delay``.
     """
 
+    resets: ClassVar[int] = 0
+    """Of the kernel: there is one per process."""
+
     def __init__(self, *, strict: bool = False) -> None:
         self._nest: ModuleType = import_nest()
         self._strict = strict
-        self._kernel = KernelInUse()
+        self._resets = Stepper.resets
         self._is_prepared = self._is_closed = self._knows_delays = False
         self._look_at_delays()
         # Not from zero: the network may have been simulated before.
@@ -310,7 +285,7 @@ class Stepper:
         self._advance(duration_ns)
 
     def _advance(self, duration_ns: int) -> None:
-        self._kernel.check()
+        self._check_kernel()
         if self._is_closed:
             raise ValueError("the stepper is closed")
         self._look_at_delays()
@@ -341,7 +316,7 @@ class Stepper:
 
     def close(self) -> None:
         """Release the kernel for good. A kernel that was reset elsewhere is left alone."""
-        if not self._is_closed and self._kernel.is_ours:
+        if not self._is_closed and self._resets == Stepper.resets:
             self._clean_up()
         self._is_closed = True
 
@@ -351,8 +326,16 @@ class Stepper:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _check_kernel(self) -> None:
+        """Raise ``NodeError`` where another node has reset the kernel: two cannot share it."""
+        if self._resets != Stepper.resets:
+            raise NodeError(
+                "NEST's kernel has been reset, and there is one per process: two nodes with "
+                "NEST need a process each (--backend process), and a node has one network at a time"
+            )
+
     def _clean_up(self) -> None:
-        self._kernel.check()
+        self._check_kernel()
         if self._is_prepared:
             self._is_prepared = False
             self._nest.Cleanup()

@@ -209,9 +209,7 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
             {
                 "name": node.name,
                 "container": node.container,
-                "plugin": node.plugin_name,
                 "is_here": node.name in names,
-                "owns_time": node.owns_time,
             }
             for node in project.nodes
         ],
@@ -234,7 +232,6 @@ def _connection(connection: Connection) -> dict[str, Any]:
         "to": connection.destination_node,
         "input": connection.destination_input,
         "discard_limit": connection.discard_limit,
-        "queue_size": connection.queue_size,
         "window": connection.window,
         "guarantee": guarantee(connection),
     }

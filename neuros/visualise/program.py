@@ -297,8 +297,17 @@ class Canvas:
     """
 
     def __init__(self, title: str, environ: Mapping[str, str]) -> None:
-        self._title = title
-        self._figure, self.is_window, self.remark = _figure(title, environ)
+        self._title, self.remark = title, ""
+        wish, window = environ.get("NEUROS_GUI", ""), None
+        if wish != "0" and _has_display(environ):
+            window = _window(title)
+            self.remark = _NO_TOOLKIT if window is None else ""
+        elif wish not in ("", "0"):
+            self.remark = _NO_DISPLAY
+        self.is_window = window is not None
+        self._figure: Any = window or Figure(layout="constrained")
+        if not self.is_window:
+            FigureCanvasAgg(self._figure)
         self._figure.canvas.mpl_connect("close_event", self._on_closed)
 
     def draw(self, panels: Sequence[Panel]) -> list[str]:
@@ -344,22 +353,8 @@ class Canvas:
             FigureCanvasAgg(self._figure)
 
 
-def _figure(title: str, environ: Mapping[str, str]) -> tuple[Any, bool, str]:
-    """A figure, whether it is a window, and a remark."""
-    wish, remark = environ.get("NEUROS_GUI", ""), ""
-    if wish != "0" and _has_display(environ):
-        window = _window(title)
-        if window is not None:
-            return window, True, ""
-        remark = _NO_TOOLKIT
-    elif wish not in ("", "0"):
-        remark = _NO_DISPLAY
-    figure = Figure(layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, False, remark
-
-
 def _window(title: str) -> Any:
+    """A figure in a window; ``None`` where there is no toolkit for one."""
     from matplotlib import pyplot
 
     for toolkit in _TOOLKITS:

@@ -20,6 +20,7 @@ from virtual_display import virtual_display
 pytest.importorskip("matplotlib")
 from matplotlib.image import imread
 
+import neuros.visualise as figure_files
 from neuros.visualise import (
     VisualiseImages,
     VisualiseLines,
@@ -27,7 +28,6 @@ from neuros.visualise import (
     VisualiseRotations,
     VisualiseSpikes,
 )
-from neuros.visualise import figures as figure_files
 
 DEADLINE_S = 30.0
 HAS_TOOLKIT = importlib.util.find_spec("_tkinter") is not None

@@ -350,19 +350,14 @@ class Branch:
     is_turned: bool = False
 
 
-@dataclass
-class Tree:
-    """Branches in an order in which a parent comes before what hangs on it."""
+def grow(links: Sequence[Link], joints: Sequence[Joint]) -> tuple[list[Branch], list[Joint]]:
+    """The tree of all links, parents before what hangs on them, and the joints that close loops.
 
-    branches: list[Branch] = field(default_factory=list)
-    loops: list[Joint] = field(default_factory=list)
-
-
-def grow(links: Sequence[Link], joints: Sequence[Joint]) -> Tree:
-    """The tree of all links. Those of static models hang on the world, without a joint."""
-    tree, used = Tree(), set[int]()
+    Links of static models hang on the world, without a joint.
+    """
+    loops, used = list[Joint](), set[int]()
     seen = {id(link) for link in links if link.is_static}
-    tree.branches += [Branch(link) for link in links if link.is_static]
+    branches = [Branch(link) for link in links if link.is_static]
     at: dict[int | None, list[Joint]] = {}
     for joint in joints:
         for end in {_key(joint.parent), _key(joint.child)}:
@@ -379,10 +374,10 @@ def grow(links: Sequence[Link], joints: Sequence[Joint]) -> Tree:
                 is_turned = _key(joint.parent) != _key(link)
                 other = joint.parent if is_turned else joint.child
                 if other is None or other.is_static or id(other) in seen:
-                    tree.loops.append(joint)
+                    loops.append(joint)
                     continue
                 seen.add(id(other))
-                tree.branches.append(Branch(other, link, joint, is_turned))
+                branches.append(Branch(other, link, joint, is_turned))
                 waiting.append(other)
 
     spread(None)
@@ -390,9 +385,9 @@ def grow(links: Sequence[Link], joints: Sequence[Joint]) -> Tree:
     for link in sorted(links, key=lambda link: id(link) in children):
         if id(link) not in seen:
             seen.add(id(link))
-            tree.branches.append(Branch(link))
+            branches.append(Branch(link))
             spread(link)
-    return tree
+    return branches, loops
 
 
 def _key(link: Link | None) -> int | None:

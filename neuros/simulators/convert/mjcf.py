@@ -60,15 +60,14 @@ class Building:
         pose: Pose,
         name: str,
         element: Element | None,
-        **has: Any,
+        **attributes: Any,
     ) -> Any:
-        """Add a geom, site, camera or light, whose ``pose`` is in the world, to a link's body.
+        """Add a geom, site, camera, light or body, whose ``pose`` is in the world, to a link.
 
         Args:
-            element: what a change of its name is noted of.
-            has: further attributes.
+            element: is told if its name is changed.
         """
-        thing = getattr(self.body(link), f"add_{sort}")(**has)
+        thing = getattr(self.body(link), f"add_{sort}")(**attributes)
         thing.name = self.name(sort, name, element)
         local = (Pose() if link is None else link.pose).inverse() @ pose
         thing.pos = local.position

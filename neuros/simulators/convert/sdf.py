@@ -17,7 +17,6 @@ from neuros.simulators.convert.frames import (
     Joint,
     Link,
     Scope,
-    Tree,
     Vector,
     grow,
     place_all,
@@ -56,7 +55,7 @@ def convert_sdf(file: Path, finder: Finder) -> Converted:
     spec.compiler.degree = False
     spec.modelname = (scope.element.name or next(iter(scope.models), "")) or "sdf"
     building = Building(spec, Meshes(spec, finder))
-    _build(building, scope, _grow(scope))
+    _build(building, scope, *_grow(scope))
     report.raise_any()
     model = _compiled(building, root)
     report.note_unread(includer.roots)
@@ -79,7 +78,7 @@ def _read(root: Element) -> Scope:
     return scope
 
 
-def _grow(scope: Scope) -> Tree:
+def _grow(scope: Scope) -> tuple[list[Branch], list[Joint]]:
     every_link = [link for inner in scope.and_models() for link in inner.links.values()]
     movable = []
     for inner, element in scope.each("joint"):
@@ -104,16 +103,16 @@ def _end(scope: Scope, joint: Element, side: str) -> Link | None:
     return scope.body(name, joint.child(side) or joint)
 
 
-def _build(building: Building, scope: Scope, tree: Tree) -> None:
+def _build(building: Building, scope: Scope, branches: list[Branch], loops: list[Joint]) -> None:
     if scope.element.tag == "world":
         _read_world(building, scope)
-    for branch in tree.branches:
+    for branch in branches:
         _add_body(building, branch)
     links.share_masks(building)
-    for branch in tree.branches:
+    for branch in branches:
         if branch.joint is not None:
             links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
-    for joint in tree.loops:
+    for joint in loops:
         joints.close_loop(building, joint)
     joints.add_mimics(building, scope)
     joints.add_actuators(building, scope)

@@ -199,9 +199,9 @@ class LiveMetrics:
                 self._losses[name].received(now_s, taken_in_s, incoming["received"])
                 shown["lost"] = self._losses[name].count
         for name, (last, times_ns) in counters.sent_ns.items():
-            self._latency(name).sent(last, times_ns)
+            self._latencies.setdefault(name, Latency()).sent(last, times_ns)
         for name, (position, time_ns) in counters.taken_ns.items():
-            self._latency(name).taken(position, time_ns)
+            self._latencies.setdefault(name, Latency()).taken(position, time_ns)
         for name, latency in self._latencies.items():
             self.connections[name]["latency_ms"] = latency.ms
 
@@ -268,16 +268,12 @@ class LiveMetrics:
         self.nodes[name] = {
             **metrics["state"],
             "executing": executing["name"] if executing else None,
-            "executing_s": executing["for_s"] if executing else 0.0,
             "shares": shares,
             "hooks": {
                 hook: _hook(each, self._speed(f"hook {hook}", name, now_s, each["executions"]))
                 for hook, each in metrics["hooks"].items()
             },
         }
-
-    def _latency(self, name: str) -> Latency:
-        return self._latencies.setdefault(name, Latency())
 
     def _speed(self, kind: str, name: str, now_s: float, value: float) -> float:
         speed = self._speeds.setdefault((kind, name), Speed())
