@@ -23,7 +23,7 @@ from typing import Any
 from tutorial_files import files_of, steps
 
 from neuros.installation.machine import offscreen_opengl
-from neuros.project.graph_svg import graph_svg
+from neuros.project.graph import graph_svg
 from neuros.project.load import load_project
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,9 +12,8 @@ import numpy as np
 
 from neuros.analysis.packets import Numbers
 from neuros.analysis.run_record import PastRun
-from neuros.engine.time_budget import TimeBudget
-from neuros.project.graph import guarantee, port_names
-from neuros.project.layout import Place, lay_out
+from neuros.engine.metrics import TimeBudget
+from neuros.project.graph import Place, guarantee, lay_out, port_names
 from neuros.recording.system_load import FILE_NAME
 
 # Okabe and Ito, Color Universal Design (2008).

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from neuros.analysis.run_record import PastRun
-from neuros.engine.time_budget import TimeBudget
+from neuros.engine.metrics import TimeBudget
 from neuros.project.model import Connection
 
 WORTH_NAMING = 0.02

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.choice import ran_in_one_process
-from neuros.engine.metrics import in_flight_and_lost
-from neuros.engine.time_budget import TimeBudget, time_budget_of
+from neuros.engine.metrics import TimeBudget, in_flight_and_lost, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, Connection, NodeFile, Project
 from neuros.project.split import project_to_json

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
-from neuros.api.loading import load_with_messages, seed_variables
+from neuros.api.loading import load_with_messages, model_problems, seed_variables
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request
 from neuros.api.run import Run
-from neuros.api.validation import model_problems
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.options import option, takes

@@ -41,13 +41,12 @@ from neuros.control import (
 from neuros.control.link import ControlLink
 from neuros.control.steps import Advanced
 from neuros.errors import RunError, UsageError
-from neuros.project.graph_svg import graph_svg
+from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
 from neuros.project.scanner import display_name, place_of
 from neuros.project.suggest import did_you_mean
-from neuros.transport.copying import RosPackets
-from neuros.transport.messages import checked
+from neuros.transport.messages import RosPackets, checked
 
 _CONNECT_S = 0.01
 _MOST_ROUNDS_AT_REST = 1000

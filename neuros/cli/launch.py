@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request, SweepOptions
 from neuros.cli import EXIT_CODES
-from neuros.cli.output import JSON, add_format, print_json
-from neuros.cli.projects import add_project, load_with_messages
+from neuros.cli.common import JSON, add_format, add_project, load_with_messages, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
 from neuros.registry import AUTO, BACK_ENDS

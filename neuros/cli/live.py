@@ -1,7 +1,7 @@
-"""``neuros topic`` and ``neuros logs``: look into a run from another terminal, without ROS 2.
+"""``neuros ps``, ``stop``, ``topic`` and ``logs``: runs in progress, from another terminal.
 
-What packets hold is sampled by the nodes, as for the dashboard, and comes over the control channel:
-so it is the same on every back end, with --isolate, too.
+None of them needs ROS 2. What packets hold is sampled by the nodes, as for the dashboard, and comes
+over the control channel: so it is the same on every back end, with --isolate, too.
 """
 
 from __future__ import annotations
@@ -9,19 +9,21 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pwd
 import select
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.sessions import Session, sessions
-from neuros.cli.output import JSON, add_format, print_json
-from neuros.cli.runs import chosen_runs
+from neuros.backends.shared_memory import remove_dead_runs
+from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.options import positive_number
 from neuros.project.suggest import did_you_mean, listed
@@ -33,8 +35,193 @@ if TYPE_CHECKING:
 _RUN = "the id that `neuros ps` shows (its first digits are enough), or the name of a project"
 _ECHO_PERIOD_S = 0.1
 _HZ_PERIOD_S = 1.0
-_POLL_S = 0.1
+_POLL_S = 0.05
+_SHOWN = 8  # digits of a run's id
+_AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
+_GIVE_UP_S = 30.0
+_FILTERS = ("run", "project", "node", "backend", "state")
 _LIVES_S = 1.0
+
+
+# ---------------------------------------------------------------------- ps and stop
+
+
+def add_ps(ps: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    ps.description = (
+        "Show the nodes of all runs of this user on this machine; for root, of all users."
+    )
+    ps.add_argument("-q", "--quiet", action="store_true", help="only the ids of runs")
+    ps.add_argument(
+        "-f",
+        "--filter",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="show only nodes with this value; KEY is run, project, node, backend or state"
+        " (repeatable)",
+    )
+    add_format(ps)
+    ps.set_defaults(command=_ps)
+
+
+def add_stop(stop: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    stop.description = (
+        "Stop runs of this user, as Ctrl+C in their terminal does, and wait until they have ended."
+        " Root can stop a run of another user, but only by its id."
+    )
+    stop.add_argument(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help=f"{_RUN}; not needed if there is only one run",
+    )
+    stop.add_argument("--all", action="store_true", help="stop all runs of this user")
+    stop.set_defaults(command=_stop)
+
+
+@dataclass(frozen=True)
+class _RunningNode:
+    """A row of ``neuros ps``."""
+
+    run: str
+    user: str
+    project: str
+    node: str
+    backend: str
+    since: float
+    state: str
+    folder: str
+
+
+def _ps(options: argparse.Namespace) -> int:
+    found = sessions()
+    wanted = [_filter(text) for text in options.filter]
+    rows = [
+        row
+        for session in found
+        for row in _rows(session)
+        if all(getattr(row, key).startswith(value) for key, value in wanted)
+    ]
+    if options.quiet:
+        for run in dict.fromkeys(row.run for row in rows):
+            print(run[:_SHOWN])
+    elif options.format == JSON:
+        print_json(rows)
+    elif not rows:
+        print("no running node matches" if found else "nothing is running")
+    else:
+        print(_table(rows, shows_users=not all(session.is_own for session in found)))
+    return 0
+
+
+def _filter(text: str) -> tuple[str, str]:
+    key, separator, value = text.partition("=")
+    if not separator or key not in _FILTERS:
+        raise UsageError(f"ps: --filter {text}: it must be KEY=VALUE, with {listed(_FILTERS)}")
+    return key, value
+
+
+def _rows(session: Session) -> Iterator[_RunningNode]:
+    prefix = f"{session.namespace}/" if session.namespace else ""
+    for node, state in session.states().items():
+        yield _RunningNode(
+            session.run,
+            _user_name(session.user),
+            session.project,
+            prefix + node,
+            _where(session, node),
+            session.since,
+            state,
+            session.folder,
+        )
+
+
+def _where(session: Session, node: str) -> str:
+    machine = session.elsewhere.get(node)
+    return f"{session.backend} on {machine}" if machine else session.backend
+
+
+def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:
+    from tabulate import tabulate
+
+    cells = []
+    for row in rows:
+        since = datetime.fromtimestamp(row.since).strftime("%Y-%m-%d %H:%M:%S")
+        users = [row.user] if shows_users else []
+        head = [row.run[:_SHOWN], *users, row.project]
+        cells.append([*head, row.node, row.backend, since, row.state])
+    users = ["user"] if shows_users else []
+    header = ["run", *users, "project", "node", "back end", "since", "state"]
+    return str(tabulate(cells, headers=header))
+
+
+def _user_name(user: int) -> str:
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return str(user)
+
+
+def _stop(options: argparse.Namespace) -> int:
+    found = sessions()
+    chosen = _chosen_runs(options.runs, found, is_all=options.all)
+    if not chosen:
+        print("you have no run in progress" if found else "nothing is running")
+    for session in chosen:
+        session.interrupt()
+    _await_end(chosen)
+    for session in chosen:
+        print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
+    for name in remove_dead_runs():
+        print(f"removed {name} from shared memory: its run was killed, and its reaper, too")
+    return 0
+
+
+def _chosen_runs(
+    names: Sequence[str], found: Sequence[Session], *, is_all: bool
+) -> Sequence[Session]:
+    """The runs that are named, among those that there are; without a name, the only one.
+
+    Raises:
+        UsageError: if there is none of a name, or several and no name.
+    """
+    own = [session for session in found if session.is_own]
+    if is_all or (not names and len(own) <= 1):
+        return own
+    shown = ", ".join(f"{session.run[:_SHOWN]} ({session.project})" for session in own)
+    if not names:
+        raise UsageError(f"several runs are in progress: name one of {shown}, or give --all")
+    for name in names:
+        if not any(_is_named(session, name) for session in found):
+            raise UsageError(f"you have no run called '{name}'; yours are: {shown or 'none'}")
+    return [session for session in found if any(_is_named(session, name) for name in names)]
+
+
+def _is_named(session: Session, name: str) -> bool:
+    is_project = session.project == name and session.is_own
+    return is_project or (bool(name) and session.run.startswith(name))
+
+
+def _await_end(chosen: Sequence[Session]) -> None:
+    """Until the reapers have gone, and with them all that they guard."""
+    begin_s = time.monotonic()
+    waiting, has_insisted = {session.run for session in chosen}, False
+    while waiting := waiting & {session.run for session in sessions()}:
+        waited_s = time.monotonic() - begin_s
+        if waited_s > _AGAIN_S and not has_insisted:
+            has_insisted = True
+            for session in chosen:
+                if session.run in waiting:
+                    session.interrupt()  # the second one kills at once
+        if waited_s > _GIVE_UP_S:
+            left = ", ".join(sorted(run[:_SHOWN] for run in waiting))
+            raise EnvironmentFault(f"not ended after {_GIVE_UP_S:g} s: {left}: see `neuros ps`")
+        time.sleep(_POLL_S)
+
+
+# ---------------------------------------------------------------------- topic
 
 
 @dataclass(frozen=True)
@@ -57,9 +244,6 @@ class _Topic:
     def calls(self) -> set[str]:
         """What it may be called."""
         return {self.name, self.connection or self.name, f"{self.node}.{self.port}"}
-
-
-# ---------------------------------------------------------------------- topic
 
 
 def add_topic(topic: argparse.ArgumentParser) -> None:
@@ -188,7 +372,7 @@ def _watch(
 
 def _run(name: str) -> Session:
     """The run of that name. Raises ``UsageError`` if there is not one of it."""
-    found = chosen_runs([name], sessions(), is_all=False)
+    found = _chosen_runs([name], sessions(), is_all=False)
     if len(found) > 1:
         several = ", ".join(session.run[:8] for session in found)
         raise UsageError(f"several runs are called '{name}': name one of {several}")

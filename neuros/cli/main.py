@@ -48,15 +48,15 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "new": Command("copies", "make a small project to start with"),
-    "example": Command("copies", "list the examples, or copy one"),
+    "new": Command("projects", "make a small project to start with"),
+    "example": Command("projects", "list the examples, or copy one"),
     "launch": Command("launch", "run a project"),
     "validate": Command("projects", "check a project without running it"),
     "graph": Command("projects", "show the nodes and connections of a project"),
     "types": Command("projects", "let editors know the fields of a project's messages"),
     "build": Command("setup", "build message packages"),
-    "ps": Command("runs", "show the runs of this user"),
-    "stop": Command("runs", "stop a run, as Ctrl+C does"),
+    "ps": Command("live", "show the runs of this user"),
+    "stop": Command("live", "stop a run, as Ctrl+C does"),
     "topic": Command("live", "show the topics and packets of a run in progress"),
     "logs": Command("live", "show what the nodes of a run have logged"),
     "sweep": Command("launch", "run a project with many values and seeds, and make one table"),

@@ -1,71 +1,38 @@
-"""``neuros validate``, ``graph`` and ``types``, and the project that a command names.
-
-What reads projects is imported late: ``--help`` and completion read this module, too.
-"""
+"""``neuros new`` and ``example``, ``validate``, ``graph`` and ``types``: projects, and no runs."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import re
+import shutil
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.api.request import ProjectOptions
-from neuros.cli.output import JSON, add_format, print_json
+from neuros.cli.common import (
+    JSON,
+    add_format,
+    add_project,
+    count,
+    load_with_messages,
+    print_json,
+    project_path,
+)
+from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError
-from neuros.options import add_options, options_of
+from neuros.project.suggest import did_you_mean
 
 if TYPE_CHECKING:
-    from neuros.messages.needed import Messages
     from neuros.project.model import Project
+
 
 EXIT_NODE = 1
 EXIT_PROJECT = 3
 _GRAPH_SUFFIXES = {".svg": "svg", ".mmd": "mermaid", ".mermaid": "mermaid"}
-
-
-def add_project(command: argparse.ArgumentParser, declared_in: type = ProjectOptions) -> None:
-    """Add what names a project, and the options that a dataclass declares."""
-    command.add_argument(
-        "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
-    )
-    command.add_argument(
-        "-p", "--project", dest="project_option", metavar="PROJECT", help="another way to name it"
-    )
-    add_options(command, options_of(declared_in))
-
-
-def project_path(parsed: argparse.Namespace) -> Path:
-    """The project that was named, once.
-
-    Raises:
-        UsageError: if none or two were named.
-    """
-    named = {path for path in (parsed.project, parsed.project_option) if path is not None}
-    if not named:
-        raise UsageError("name a project: a file, or a folder with a project.json")
-    if len(named) > 1:
-        raise UsageError(f"two projects are named: {' and '.join(sorted(named))}")
-    return Path(named.pop())
-
-
-def load_with_messages(
-    parsed: argparse.Namespace, *, reads_plugins: bool = True
-) -> tuple[Project, Messages]:
-    """Load the project and find its message packages; warnings go to standard error.
-
-    Raises:
-        ProjectError: with all its problems, and those of its message files.
-    """
-    from neuros.api.loading import load_with_messages as load
-
-    path = project_path(parsed)
-    changes = (parsed.set, parsed.namespace, parsed.remap)
-    loaded, messages = load(path, *changes, reads_plugins=reads_plugins)
-    for warning in loaded.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
-    return loaded.project, messages
 
 
 def add_validate(validate: argparse.ArgumentParser) -> None:
@@ -91,8 +58,8 @@ def _validate(parsed: argparse.Namespace) -> int:
         return _validate_for_programs(parsed)
     project = _validated(parsed)
     print(
-        f"{project.file}: valid: {_count(len(project.nodes), 'node')},"
-        f" {_count(len(project.connections), 'connection')}"
+        f"{project.file}: valid: {count(len(project.nodes), 'node')},"
+        f" {count(len(project.connections), 'connection')}"
     )
     return 0
 
@@ -109,7 +76,7 @@ def _validate_for_programs(parsed: argparse.Namespace) -> int:
 
 def _validated(parsed: argparse.Namespace) -> Project:
     """The project, without a problem. Raises ``ProjectError``."""
-    from neuros.api.validation import import_problems, model_problems
+    from neuros.api.loading import import_problems, model_problems
 
     project, messages = load_with_messages(parsed)
     problems = model_problems(project)
@@ -140,10 +107,6 @@ def _import_plugin(options: argparse.Namespace) -> int:
             answer.write(str(error))
             return EXIT_NODE
     return 0
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def add_graph(graph: argparse.ArgumentParser) -> None:
@@ -193,14 +156,13 @@ def _types(options: argparse.Namespace) -> int:
         files = write_stubs({port.type for port in ports}, folder)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
-    print(f"{folder}: {_count(len(files), 'package')} of messages")
+    print(f"{folder}: {count(len(files), 'package')} of messages")
     return 0
 
 
 def _graph(options: argparse.Namespace) -> int:
     """Write the graph of a project. Raises ``UsageError`` if the file cannot be written."""
-    from neuros.project.graph import graph_mermaid, graph_text
-    from neuros.project.graph_svg import graph_svg
+    from neuros.project.graph import graph_mermaid, graph_svg, graph_text
 
     makers = {"text": graph_text, "mermaid": graph_mermaid, "svg": graph_svg}
     kind = options.format or _GRAPH_SUFFIXES.get(Path(options.output or "").suffix, "text")
@@ -213,3 +175,114 @@ def _graph(options: argparse.Namespace) -> int:
     except OSError as error:
         raise UsageError(f"-o {options.output}: cannot be written ({error.strerror})") from error
     return 0
+
+
+_TEMPLATE = PACKAGE / "cli" / "template"
+# Relative to the folder that a project is copied from.
+_SCHEMA = re.compile(r'(?<="\$schema": ")[./]*/schema/')
+_IN_GALLERY = re.compile(r"^## \[.*\]\((.*)/README\.md\)\n\n([^.]*\.(?=\s))", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class _Example:
+    """A row of ``neuros example``."""
+
+    name: str
+    description: str
+    folder: Path
+
+
+def add_new(new: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    new.description = (
+        "Make a folder with a small project that runs: two plugins in a closed loop, and a test."
+    )
+    new.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    new.set_defaults(command=_new)
+
+
+def _new(options: argparse.Namespace) -> int:
+    _copy(_TEMPLATE, options.folder, {})
+    print(f"made {options.folder}; the next command: neuros launch {options.folder}")
+    return 0
+
+
+def add_example(example: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    example.description = (
+        "List the examples, or copy one into a folder, where it can be run and changed."
+    )
+    example.add_argument("name", nargs="?", metavar="NAME", help="the example to copy")
+    example.add_argument(
+        "folder",
+        nargs="?",
+        type=Path,
+        metavar="FOLDER",
+        help="a new or empty folder (default: NAME, in the current folder)",
+    )
+    add_format(example)
+    example.set_defaults(command=_example)
+
+
+def _example(options: argparse.Namespace) -> int:
+    found = _examples()
+    if options.name is None and options.format == JSON:
+        print_json([*found.values()])
+    elif options.name is None:
+        for each in found.values():
+            print(f"{each.name:18} {each.description}")
+        print("\nneuros example NAME copies one into a folder of its own")
+    elif options.name in found:
+        _copy_example(found[options.name], options.folder or Path(options.name))
+    else:
+        hint = did_you_mean(options.name, found) or f"there are {', '.join(found)}"
+        raise UsageError(f"there is no example '{options.name}' ({hint})")
+    return 0
+
+
+def _examples() -> Mapping[str, _Example]:
+    """By name, in the order of the gallery, with the first sentence that it says on them."""
+    gallery = (EXAMPLES / "README.md").read_text("utf-8")
+    found = {}
+    for inside, sentence in _IN_GALLERY.findall(gallery):
+        folder = EXAMPLES / inside
+        found[folder.name] = _Example(folder.name, " ".join(sentence.split()), folder)
+    return found
+
+
+def _copy_example(example: _Example, folder: Path) -> None:
+    """Copy it, with its commands as they are to be given beside the copy."""
+    inside = example.folder.relative_to(EXAMPLES.parent)
+    renamed = {f"{inside}": f"{folder}", "./launch.py": "neuros launch", ".venv/bin/": ""}
+    _copy(example.folder, folder, renamed)
+    others = sorted(file.name for file in folder.glob("*.json") if _is_variant(file))
+    print(f"copied to {folder}; the next command: neuros launch {folder}")
+    if others:
+        print(f"variants of it, as neuros launch {folder / others[0]}: {', '.join(others)}")
+
+
+def _is_variant(file: Path) -> bool:
+    return file.name != "project.json" and "nodes" in json.loads(file.read_text("utf-8"))
+
+
+def _copy(source: Path, folder: Path, renamed: Mapping[str, str]) -> None:
+    """Copy a project folder; ``renamed`` holds for its pages and Python files.
+
+    Raises:
+        UsageError: if there is something in the folder already, or it cannot be written.
+    """
+    try:
+        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+            raise UsageError(f"{folder} exists already: name another folder")
+        skipped = shutil.ignore_patterns("__pycache__", "runs")
+        shutil.copytree(
+            source, folder, ignore=skipped, copy_function=shutil.copyfile, dirs_exist_ok=True
+        )
+        for file in (*folder.rglob("*.json"), *folder.rglob("*.md"), *folder.rglob("*.py")):
+            text = _SCHEMA.sub(f"{(PACKAGE / 'schema').as_uri()}/", file.read_text("utf-8"))
+            for old, new in renamed.items():
+                text = text.replace(old, new)
+            file.write_text(text, "utf-8")
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error

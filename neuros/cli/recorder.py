@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, Topic, load
 from neuros.recording.spool import ListenedSpool
 
 if TYPE_CHECKING:
-    from neuros.transport.listening import FoundTopic
+    from neuros.transport.ros_topics import RosTopic
 
 _POLL_S = 0.1
 # The launcher was killed: its reaper kills what is left of the run after 4.5 s.
@@ -100,12 +101,6 @@ def _is_told_to_end(wait_s: float, recorder: Recorder) -> bool:
     return True
 
 
-def _in_bag(topic: FoundTopic) -> Topic:
-    return Topic(
-        topic.name, topic.type, topic.is_reliable, topic.depth, is_latched=topic.is_latched
-    )
-
-
 @contextlib.contextmanager
 def _listening(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object]
@@ -114,15 +109,15 @@ def _listening(
     if not plan.listen:
         yield list
         return
-    from neuros.transport.listening import Listener
+    from neuros.transport.ros_topics import Listener
 
     spool = ListenedSpool(run)
     unheard = list(plan.wanted)
 
-    def found(topic: FoundTopic) -> Callable[[int, bytes], None]:
+    def found(topic: RosTopic) -> Callable[[int, bytes], None]:
         if topic.name in unheard:
             unheard.remove(topic.name)
-        number = spool.add(_in_bag(topic))
+        number = spool.add(Topic(**asdict(topic)))
         return lambda wall_ns, data: spool.keep(number, wall_ns, data)
 
     def refused(name: str, reason: str) -> None:

@@ -124,7 +124,7 @@ def _replay(options: argparse.Namespace) -> int:
         raise UsageError("replay: --rate must be above 0; --delay and -w must be 0 or more")
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
-    from neuros.transport.playing import PlayedTopic, play
+    from neuros.transport.ros_topics import RosTopic, play
 
     find_messages_of(Path(options.run))
     with open_bag(options.run) as bag:
@@ -137,7 +137,7 @@ def _replay(options: argparse.Namespace) -> int:
             for packet in topic.raw()
         )
         count = play(
-            {t.name: PlayedTopic(t.type, t.is_reliable, t.depth, t.is_latched) for t in chosen},
+            [RosTopic(t.name, t.type, t.is_reliable, t.depth, t.is_latched) for t in chosen],
             packets,
             rate=options.rate,
             delay_s=options.delay,

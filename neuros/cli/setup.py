@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.backends.containers import OWN_FOLDER, STANDARD
-from neuros.cli.output import JSON, add_format, print_json
+from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
 if TYPE_CHECKING:

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from neuros.errors import Problem
-from neuros.project.message_fields import misfit
-from neuros.project.message_types import normalised
+from neuros.project.message_types import misfit, normalised
 from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean, listed

@@ -19,8 +19,14 @@ from typing import Any, TypeAlias
 from neuros.analysis.comparison import differing_fields
 from neuros.analysis.recorded_node import RecordedNode
 from neuros.engine.engine import Engine
-from neuros.engine.event_log import is_whole
-from neuros.engine.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
+from neuros.engine.event_log import (
+    Player,
+    ReplayedEngine,
+    ReplayOver,
+    ReplayParted,
+    Script,
+    is_whole,
+)
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.hooks import HookSpec
 from neuros.node.context import ContextSwitch
@@ -28,7 +34,7 @@ from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.transport.compression import Traffic
-from neuros.transport.messages import decode, message_class
+from neuros.transport.messages import RosPackets
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
 _LOOK_S = 0.1
@@ -214,7 +220,7 @@ class ReplayedNode:
             )
             self._is_cut_off = True
             raise ReplayOver
-        packet = decode((message_class(self._types[str(key)]), data))
+        packet = RosPackets().decode(self._types[str(key)], data)
         if isinstance(key, Connection) and key.is_jpeg:
             from neuros.transport.jpeg import JpegCodec
 

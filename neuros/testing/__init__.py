@@ -6,7 +6,6 @@ passes.
 """
 
 from neuros.testing.harness import PluginHarness
-from neuros.testing.stand_ins import Record
-from neuros.testing.wiring import wire
+from neuros.testing.stand_ins import Record, wire
 
 __all__ = ["PluginHarness", "Record", "wire"]

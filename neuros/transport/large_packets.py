@@ -1,7 +1,7 @@
 """Large packets between processes of one machine: their buffers go through shared memory.
 
 DDS copies a large message six or seven times on its way from one Python to another. Here the sender
-copies each buffer once, into a slot of a :mod:`segment <neuros.transport.packet_segment>`, and
+copies each buffer once, into a slot of a :mod:`segment <neuros.transport.message_buffers>`, and
 publishes on the data topic a *parcel*: the serialised message with empty buffers, and
 behind it a note of where they are. The receiver copies them out, as it takes the parcel, before
 it acknowledges anything.
@@ -28,16 +28,17 @@ from weakref import ReferenceType, ref
 from neuros.errors import ProtocolError
 from neuros.project.model import Connection, NodeFile
 from neuros.transport.codecs import PARCEL_MARK, Decoder, Encoder, message_codec
-from neuros.transport.message_buffers import MessageBuffers, message_buffers
-from neuros.transport.messages import message_class
-from neuros.transport.packet_segment import (
+from neuros.transport.message_buffers import (
     SHARED_MEMORY,
+    MessageBuffers,
     Overwritten,
     Place,
     SegmentReader,
     SegmentWriter,
     StoredBuffer,
+    message_buffers,
 )
+from neuros.transport.messages import message_class
 
 LARGE_BYTES = 64 * 1024
 """Buffers of together this size or more leave the message: below, DDS is as fast."""
@@ -248,7 +249,7 @@ def machine_token(folder: Path = SHARED_MEMORY) -> str:
 
     Empty where large packets had better go through DDS.
     """
-    if platform.machine() not in ("x86_64", "AMD64"):  # see packet_segment on the order of stores
+    if platform.machine() not in ("x86_64", "AMD64"):  # see message_buffers on the order of stores
         return ""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()

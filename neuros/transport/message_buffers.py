@@ -7,12 +7,19 @@ once, from its class: its own, and those of messages within it (not of *sequence
 
 from __future__ import annotations
 
+import fcntl
+import mmap
+import os
+import re
+import stat
 from array import array
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from neuros.transport.packet_segment import StoredBuffer
+from neuros.errors import ProtocolError
 from neuros.transport.schema import Shape, getter, schema
 
 
@@ -155,3 +162,257 @@ def _property(name: str, complete: Callable[[Any], None]) -> property:
         setattr(message, name, value)
 
     return property(get, put)
+
+
+# ---------------------------------------------------------------------- shared memory
+#
+# A ring of slots in shared memory, by which a large packet reaches other processes in one copy.
+#
+# A *segment* is a file in ``/dev/shm`` that its sender writes and its receivers map. It is divided
+# into slots of equal size, used in turn, so that a slot keeps its content until as many packets
+# have followed. Each slot begins with its *generation*, the number of the packet in it: 0 while
+# the slot is being written. A reader looks at it before and after its copy, and so never takes a
+# packet that was written meanwhile for the one that it wanted.
+#
+# That needs stores and loads to be seen in the order of the program, which x86 guarantees for
+# ordinary memory (Intel SDM, volume 3, "Memory Ordering"); elsewhere it is not used
+# (:func:`neuros.transport.large_packets.machine_token`).
+
+
+SHARED_MEMORY = Path("/dev/shm")
+NAME_PREFIX = "neuros"
+"""Prefix of the names of segments: ``neuros_<run id>_``; a run's own are removed by that."""
+
+_NAME = re.compile(rf"{NAME_PREFIX}_[\w.-]+")
+_ALIGNMENT = 64  # a cache line: buffers begin where vector instructions like it
+_HEADER_BYTES = _ALIGNMENT  # the generation, as 8 bytes
+_GROWTH = 1.5  # at least, from a segment to its successor
+
+
+@dataclass(frozen=True)
+class Place:
+    """Place of the buffers of one packet; ``lengths`` are theirs, in bytes."""
+
+    segment: str
+    slot_bytes: int
+    slot: int
+    generation: int
+    lengths: tuple[int, ...]
+
+
+class Overwritten(ProtocolError):
+    """A slot holds a later packet than the one that was asked for."""
+
+
+class SegmentWriter:
+    """The sender's end: creates segments, and a larger one when a packet does not fit.
+
+    Args:
+        owner: what the name tells people that look into the folder: run, node, output.
+        slots: how many packets, the newest ones, stay readable.
+    """
+
+    def __init__(self, owner: str, slots: int, folder: Path = SHARED_MEMORY) -> None:
+        self._owner = owner
+        self._slots = slots
+        self._folder = folder
+        self._generation = 0
+        self._current: _Mapping | None = None
+        # With the generation from which on no receiver opens it any more.
+        self._former: list[tuple[int, _Mapping]] = []
+
+    def write(self, buffers: Sequence[array[Any]]) -> Place:
+        """Copy the buffers into the next slot.
+
+        Raises:
+            OSError: if there is no room for a segment.
+        """
+        lengths = tuple(len(buffer) * buffer.itemsize for buffer in buffers)
+        mapping = self._with_room_for(_span(lengths))
+        self._generation += 1
+        self._let_go_of_former()
+        slot = self._generation % self._slots
+        start = slot * mapping.slot_bytes
+        mapping.generations[start // 8] = 0
+        at = start + _HEADER_BYTES
+        for buffer, length in zip(buffers, lengths, strict=True):
+            mapping.bytes[at : at + length] = memoryview(buffer).cast("B")
+            at += _aligned(length)
+        mapping.generations[start // 8] = self._generation
+        return Place(mapping.name, mapping.slot_bytes, slot, self._generation, lengths)
+
+    def close(self) -> None:
+        """Remove all segments; who has mapped one keeps what it has."""
+        mappings = [mapping for _, mapping in self._former]
+        if self._current is not None:
+            mappings.append(self._current)
+        self._current, self._former = None, []
+        for mapping in mappings:
+            self._remove(mapping)
+
+    def _with_room_for(self, slot_bytes: int) -> _Mapping:
+        current = self._current
+        if current is not None:
+            if slot_bytes <= current.slot_bytes:
+                return current
+            slot_bytes = max(slot_bytes, int(current.slot_bytes * _GROWTH))
+        created = _create(self._folder, self._owner, self._slots, slot_bytes)
+        if current is not None:
+            self._former.append((self._generation + self._slots, current))
+        self._current = created
+        return created
+
+    def _let_go_of_former(self) -> None:
+        while self._former and self._former[0][0] < self._generation:
+            self._remove(self._former.pop(0)[1])
+
+    def _remove(self, mapping: _Mapping) -> None:
+        mapping.release()
+        (self._folder / mapping.name).unlink(missing_ok=True)
+
+
+class SegmentReader:
+    """A receiver's end: maps the segment that its sender writes to now."""
+
+    def __init__(self, folder: Path = SHARED_MEMORY) -> None:
+        self._folder = folder
+        self._mapping: _Mapping | None = None
+
+    def find(self, place: Place, typecodes: Sequence[str]) -> list[StoredBuffer] | None:
+        """The buffers at a place, of these types, still in shared memory.
+
+        ``None`` if the whole segment is gone: its sender has ended, or uses a larger one.
+
+        Raises:
+            OSError: if the segment cannot be mapped.
+            ValueError: if the place is not within the segment.
+        """
+        mapping = self._mapping
+        if mapping is None or mapping.name != place.segment:
+            # What was found in the former one keeps that mapped for as long as it needs it.
+            try:
+                mapping = self._mapping = _open(self._folder, place)
+            except FileNotFoundError:
+                return None
+        start = place.slot * place.slot_bytes
+        if start + _span(place.lengths) > mapping.bytes.nbytes:
+            raise ValueError(f"{place} ends beyond its segment")
+        found: list[StoredBuffer] = []
+        at = start + _HEADER_BYTES
+        for typecode, length in zip(typecodes, place.lengths, strict=True):
+            if length % array(typecode).itemsize:
+                raise ValueError(f"{place} has parts of numbers")
+            found.append(StoredBuffer(mapping, start // 8, place.generation, at, length, typecode))
+            at += _aligned(length)
+        return found
+
+    def close(self) -> None:
+        """Give up the mapping."""
+        self._mapping = None
+
+
+class StoredBuffer:
+    """A buffer in shared memory, copied out when it is first asked for, and then kept."""
+
+    __slots__ = ("__weakref__", "_array", "_at", "_generation", "_index", "_length", "_mapping")
+
+    def __init__(
+        self, mapping: _Mapping, index: int, generation: int, at: int, length: int, typecode: str
+    ) -> None:
+        self._mapping: _Mapping | None = mapping
+        self._index = index
+        self._generation = generation
+        self._at = at
+        self._length = length
+        self._array: array[Any] = array(typecode)
+
+    def fetch(self) -> array[Any]:
+        """The buffer as an array, always one object.
+
+        Raises:
+            Overwritten: if its slot has been used again.
+        """
+        mapping = self._mapping
+        if mapping is None:
+            return self._array
+        if mapping.generations[self._index] == self._generation:
+            self._array.frombytes(mapping.bytes[self._at : self._at + self._length])
+            if mapping.generations[self._index] == self._generation:
+                self._mapping = None
+                return self._array
+            del self._array[:]
+        raise Overwritten(f"packet {self._generation} of {mapping.name} has been overwritten")
+
+    def view(self) -> memoryview:
+        """The bytes where they are: nothing is copied, and they may be overwritten."""
+        if self._mapping is None:
+            return memoryview(self._array).cast("B")
+        return self._mapping.bytes[self._at : self._at + self._length]
+
+
+class _Mapping:
+    """A segment in this process's memory."""
+
+    def __init__(self, name: str, memory: mmap.mmap, slot_bytes: int) -> None:
+        self.name = name
+        self.slot_bytes = slot_bytes
+        self.bytes = memoryview(memory)
+        self.generations = self.bytes.cast("Q")
+        self._memory = memory
+
+    def release(self) -> None:
+        """Unmap it."""
+        self.generations.release()
+        self.bytes.release()
+        self._memory.close()
+
+
+def _create(folder: Path, owner: str, slots: int, slot_bytes: int) -> _Mapping:
+    name = f"{NAME_PREFIX}_{owner}_{os.urandom(4).hex()}"
+    slot_bytes = -(-slot_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    size = slots * slot_bytes
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    descriptor = os.open(folder / name, flags, 0o600)
+    try:
+        # Until this process unmaps it, or ends: the search for leftovers sees it.
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        # Room that is only promised would be missed later, by a SIGBUS in the midst of a copy.
+        os.posix_fallocate(descriptor, 0, size)
+        memory = mmap.mmap(descriptor, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+    except OSError:
+        (folder / name).unlink()
+        raise
+    finally:
+        os.close(descriptor)
+    return _Mapping(name, memory, slot_bytes)
+
+
+def _open(folder: Path, place: Place) -> _Mapping:
+    if not _NAME.fullmatch(place.segment):
+        raise ValueError(f"'{place.segment}' is the name of no segment")
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(folder / place.segment, flags)
+    try:
+        status = os.fstat(descriptor)
+        if status.st_uid != os.getuid() or not stat.S_ISREG(status.st_mode):
+            raise PermissionError(f"{place.segment} in shared memory is somebody else's")
+        if status.st_size % 8:
+            raise ValueError(f"{place.segment} has {status.st_size} bytes")
+        memory = mmap.mmap(
+            descriptor,
+            status.st_size,
+            flags=mmap.MAP_SHARED | mmap.MAP_POPULATE,
+            prot=mmap.PROT_READ,
+        )
+    finally:
+        os.close(descriptor)
+    return _Mapping(place.segment, memory, place.slot_bytes)
+
+
+def _span(lengths: Sequence[int]) -> int:
+    """Bytes of a slot that buffers of these lengths need."""
+    return _HEADER_BYTES + sum(map(_aligned, lengths))
+
+
+def _aligned(length: int) -> int:
+    return -(-length // _ALIGNMENT) * _ALIGNMENT

@@ -1,17 +1,30 @@
-"""ROS message classes by their type name, and messages to bytes and back by rclpy."""
+"""ROS messages: their classes by type name, new ones, copies, their check and their bytes.
+
+A copy is equal to what a receiver of the packet's bytes gets.
+
+The plain way is to serialise and to deserialise. For a small message that takes long (an ``Imu``
+30 µs), mostly for looking up Python classes from C. A message that has been checked
+(:mod:`neuros.transport.values`) holds what its receivers see already, so its copy shares
+its values, except those that can be changed. A new message is a copy of the first one of its class,
+so that its constructor runs once.
+"""
 
 from __future__ import annotations
 
 import importlib
 import warnings
-from functools import cache
-from typing import Any
+from array import array
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, TypeAlias
 
-from rclpy.serialization import deserialize_message, serialize_message
+import numpy
 from rclpy.type_support import check_for_type_support
 
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.project.model import Port
+from neuros.transport.codecs import message_codec
+from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import checker
 
 
@@ -54,12 +67,108 @@ def checked(port: Port, packet: Any) -> Any:
         raise ValueError(f"packet for input '{port.name}': {error}") from None
 
 
-def encode(packet: Any) -> tuple[type, bytes]:
-    """The class of a packet, and its bytes as DDS would carry them."""
-    return type(packet), serialize_message(packet)
+Copy: TypeAlias = Callable[[Any], Any]
 
 
-def decode(parcel: tuple[type, bytes]) -> Any:
-    """The packet in a parcel; it shares nothing with the one that was sent."""
-    kind, data = parcel
-    return deserialize_message(data, kind)
+class RosPackets:
+    """What NeuROS does with ROS messages (:class:`neuros.ports.Packets`)."""
+
+    def message_class(self, type_name: str) -> type:
+        return message_class(type_name)
+
+    def make(self, type_name: str) -> Any:
+        return make_packet(type_name)
+
+    def checker(self, kind: type, *, for_jpeg: bool = False) -> Copy:
+        if for_jpeg:
+            from neuros.transport.jpeg import jpeg_checker
+
+            return jpeg_checker()
+        return checker(kind)
+
+    def copy(self, packet: Any) -> Any:
+        return copy_packet(packet)
+
+    def encode(self, packet: Any) -> bytes:
+        kind: type = type(packet)
+        return message_codec(kind).encode(packet)
+
+    def decode(self, type_name: str, data: bytes) -> Any:
+        return message_codec(message_class(type_name)).decode(data)
+
+
+def copy_packet(packet: Any) -> Any:
+    """A message that shares nothing with ``packet``, which has been checked."""
+    kind: Any = type(packet)
+    return _copier(kind)(packet)
+
+
+def make_packet(type_name: str) -> Any:
+    """A new message of a type in ROS notation, as its class without arguments would make it."""
+    return _factory(message_class(type_name))()
+
+
+@cache
+def _factory(kind: Any) -> Callable[[], Any]:
+    default = kind()
+    values = [(slot, getattr(default, slot)) for slot in kind.__slots__]
+    changeable = {
+        field.slot: _factory_of(field) for field in schema(kind).fields if _can_change(field)
+    }
+    shared = tuple((slot, value) for slot, value in values if slot not in changeable)
+    made = tuple((slot, changeable[slot](value)) for slot, value in values if slot in changeable)
+
+    def make() -> Any:
+        message: Any = object.__new__(kind)
+        for slot, value in shared:
+            setattr(message, slot, value)
+        for slot, make_value in made:
+            setattr(message, slot, make_value())
+        return message
+
+    return make
+
+
+def _factory_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
+    """A function from a default value to the factory of its copies."""
+    if field.is_message:
+        return lambda _: _factory(field.type.message)
+    copy = _copier_of(field)
+    return lambda value: partial(copy, value)
+
+
+@cache
+def _copier(kind: Any) -> Copy:
+    layout = schema(kind)
+    changeable = tuple((f.slot, _copier_of(f)) for f in layout.fields if _can_change(f))
+    names = tuple(f.slot for f in layout.fields if not _can_change(f))
+    switches = tuple((slot, value) for owner, slot, value in layout.switches if not owner)
+
+    def copy(message: Any) -> Any:
+        twin: Any = object.__new__(kind)
+        for slot in names:
+            setattr(twin, slot, getattr(message, slot))
+        for slot, value in switches:
+            setattr(twin, slot, value)
+        for slot, copy_value in changeable:
+            setattr(twin, slot, copy_value(getattr(message, slot)))
+        return twin
+
+    return copy
+
+
+def _can_change(field: Field) -> bool:
+    return field.shape is not Shape.SINGLE or field.type.sort is Sort.MESSAGE
+
+
+def _copier_of(field: Field) -> Copy:
+    if field.is_message:
+        return _copier(field.type.message)
+    if field.shape is Shape.ARRAY:
+        return numpy.ndarray.copy
+    if field.shape is Shape.BUFFER:
+        return array.__copy__
+    if field.type.sort is not Sort.MESSAGE:
+        return list.copy
+    copy = _copier(field.type.message)
+    return lambda messages: list(map(copy, messages))

@@ -18,9 +18,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import HookFunction, Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.copying import RosPackets
-from neuros.transport.lean_node import lean_node, without_spinning
-from neuros.transport.teardown import give_up
+from neuros.transport.lean_node import give_up, lean_node, without_spinning
+from neuros.transport.messages import RosPackets
 
 Event = Callable[[], None]
 

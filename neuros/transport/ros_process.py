@@ -26,21 +26,21 @@ from std_msgs.msg import String
 from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.names import INTERNAL
-from neuros.transport.copying import RosPackets
 from neuros.transport.dds_profile import dds_environment
 from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.lean_node import (
     Fail,
     LeanNode,
     PluginCallbacks,
+    give_up,
     lean_node,
     without_spinning,
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
+from neuros.transport.messages import RosPackets
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.teardown import give_up
 
 _LINGER_S = 0.05
 LEASE_S = 3.0

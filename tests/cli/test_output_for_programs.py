@@ -11,7 +11,7 @@ import pytest
 from run_folders import accounting, run_folder
 
 from neuros.backends.sessions import Session
-from neuros.cli import runs
+from neuros.cli import live
 from neuros.cli.main import main
 
 WIRE = "a.out -> b.in"
@@ -40,7 +40,7 @@ def sessions(monkeypatch: pytest.MonkeyPatch) -> None:
         Session("a" * 16, "demo", "process", ("x", "y"), "/runs/1", 5.0, (0, 1), namespace="/left"),
         Session("b" * 16, "other", "docker", ("x",), "/runs/2", 6.0, (0, 1)),
     ]
-    monkeypatch.setattr(runs, "sessions", lambda: found)
+    monkeypatch.setattr(live, "sessions", lambda: found)
 
 
 @pytest.mark.usefixtures("sessions")

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import pytest
 
 from neuros.backends.sessions import Session
-from neuros.cli import runs
+from neuros.cli import live
 from neuros.cli.main import main
 
 NOBODY = 65534
@@ -17,8 +17,8 @@ NOBODY = 65534
 def test_what_killed_runs_have_left_is_removed_and_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(runs, "sessions", list)
-    monkeypatch.setattr(runs, "remove_dead_runs", lambda: ("neuros_12", "neuros_34_image"))
+    monkeypatch.setattr(live, "sessions", list)
+    monkeypatch.setattr(live, "remove_dead_runs", lambda: ("neuros_12", "neuros_34_image"))
     assert main(["stop"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "nothing is running",
@@ -54,8 +54,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Machine]:
     machine.add("a" * 16, "demo", os.getuid())
     machine.add("b" * 16, "demo", NOBODY)
     machine.add("c" * 16, "other", NOBODY)
-    monkeypatch.setattr(runs, "sessions", lambda: list(machine.there))
-    monkeypatch.setattr(runs, "remove_dead_runs", tuple)
+    monkeypatch.setattr(live, "sessions", lambda: list(machine.there))
+    monkeypatch.setattr(live, "remove_dead_runs", tuple)
     return machine
 
 

@@ -12,8 +12,18 @@ from engine_bench import Bench, function, initialise, tick, wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.engine.event_log import EventKind, LoggedEngine, events_of, is_whole, starts_of
-from neuros.engine.replay import Player, ReplayedEngine, ReplayOver, ReplayParted, Script
+from neuros.engine.event_log import (
+    EventKind,
+    LoggedEngine,
+    Player,
+    ReplayedEngine,
+    ReplayOver,
+    ReplayParted,
+    Script,
+    events_of,
+    is_whole,
+    starts_of,
+)
 from neuros.hooks import HookSpec, Optional
 from neuros.project.model import Connection
 

@@ -17,10 +17,10 @@ from launching import Finished, launch
 from machines import require_machines
 
 from neuros.project.model import Connection, NodeFile
+from neuros.testing.stand_ins import wire
 from neuros.testing.transports import SERIES, TransportBench
-from neuros.testing.wiring import wire
-from neuros.transport.copying import make_packet
 from neuros.transport.large_packets import LargeCodecs
+from neuros.transport.messages import make_packet
 
 STREAM = Path(__file__).parent / "network" / "stream"
 NEUROS = Path(sys.executable).with_name("neuros")

@@ -18,8 +18,8 @@ from test_transports import RosNetwork
 
 from neuros.backends.domain import choose_domain
 from neuros.project.model import NodeFile
+from neuros.testing.stand_ins import wire
 from neuros.testing.transports import TransportBench
-from neuros.testing.wiring import wire
 
 LATCHED = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 VOLATILE = QoSProfile(depth=100)

@@ -16,10 +16,10 @@ from test_transports import RosNetwork
 
 from neuros.backends.domain import choose_domain
 from neuros.project.model import NodeFile
+from neuros.testing.stand_ins import wire
 from neuros.testing.transports import SERIES, TransportBench
-from neuros.testing.wiring import wire
 from neuros.transport import large_packets
-from neuros.transport.copying import make_packet
+from neuros.transport.messages import make_packet
 
 PROJECT = Path(__file__).parent / "large_packets"
 SHARED_MEMORY = Path("/dev/shm")

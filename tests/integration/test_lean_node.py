@@ -9,9 +9,8 @@ import rclpy
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
-from neuros.transport.lean_node import LeanNode
+from neuros.transport.lean_node import LeanNode, give_up
 from neuros.transport.messages import message_class
-from neuros.transport.teardown import give_up
 
 message_class("std_msgs/msg/Int32")  # loads parts of ROS that warn, where warnings are errors
 

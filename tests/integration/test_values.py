@@ -26,8 +26,7 @@ from neuros.errors import WrongValue
 from neuros.project.model import Node, Port
 from neuros.testing.harness import provide_messages, workspaces_of
 from neuros.transport.codecs import message_codec
-from neuros.transport.copying import copy_packet
-from neuros.transport.messages import message_class
+from neuros.transport.messages import copy_packet, message_class
 from neuros.transport.values import checker
 
 PROJECT = Path(__file__).parent / "values"

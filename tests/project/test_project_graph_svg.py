@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from neuros.project.graph_svg import graph_svg
+from neuros.project.graph import graph_svg
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Node, Port, Project
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import struct
 
 import pytest
+from rclpy.serialization import deserialize_message
 
 from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import PARCEL_MARK, message_codec
 from neuros.transport.large_packets import is_parcel
-from neuros.transport.messages import decode, message_class
+from neuros.transport.messages import message_class
 
 Int32 = message_class("std_msgs/msg/Int32")
 Numbers = message_class("std_msgs/msg/UInt64MultiArray")
@@ -66,7 +67,7 @@ def test_a_tag_is_of_no_use_for_another_number_or_again(number: int) -> None:
 def test_ros_reads_a_tagged_packet() -> None:
     sender, codec = DataTags(KEY), message_codec(Int32)
     for value in range(50):
-        assert decode((Int32, sender.add(codec.encode(Int32(data=value))))).data == value
+        assert deserialize_message(sender.add(codec.encode(Int32(data=value))), Int32).data == value
 
 
 def test_the_bits_that_count_padding_stay_zero() -> None:
@@ -91,7 +92,7 @@ def test_another_launcher_has_no_keys() -> None:
 
 
 def test_ros_reads_a_tagged_acknowledgement() -> None:
-    position, tag = decode((Numbers, Positions(KEY).encode(7))).data
+    position, tag = deserialize_message(Positions(KEY).encode(7), Numbers).data
     assert position == 7
     assert tag
 

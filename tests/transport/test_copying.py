@@ -11,6 +11,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseStamped, PoseWithCovariance, Vector3Stamped
 from nav_msgs.msg import Odometry, Path
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, Image, Imu, JointState, LaserScan, PointCloud2, PointField
 from std_msgs.msg import (
     Bool,
@@ -30,8 +31,7 @@ from std_msgs.msg import (
     UInt64,
 )
 
-from neuros.transport.copying import copy_packet, make_packet
-from neuros.transport.messages import decode, encode, message_class
+from neuros.transport.messages import copy_packet, make_packet, message_class
 from neuros.transport.ownership import unshared_check
 from neuros.transport.values import checker
 
@@ -93,7 +93,7 @@ def loaded_classes() -> None:
 
 
 def travelled(packet: Any) -> Any:
-    return decode(encode(packet))
+    return deserialize_message(serialize_message(packet), type(packet))
 
 
 def parts(packet: Any) -> list[tuple[type, Any]]:

@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 
 from neuros.errors import ProtocolError
-from neuros.testing.wiring import wire
+from neuros.testing.stand_ins import wire
 from neuros.transport.large_packets import (
     LARGE_BYTES,
     LargeInput,
@@ -144,7 +144,7 @@ def test_what_is_kept_is_copied_before_its_slot_is_free_to_be_written(ends: Ends
 
 
 def test_what_nobody_keeps_is_never_copied(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neuros.transport.packet_segment import StoredBuffer
+    from neuros.transport.message_buffers import StoredBuffer
 
     fetched: list[int] = []
     fetch: Callable[[Any], Any] = StoredBuffer.fetch

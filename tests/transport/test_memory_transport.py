@@ -7,9 +7,8 @@ from typing import Any
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench
+from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench, wire
 from neuros.testing.transports import TransportBench, TransportChecks
-from neuros.testing.wiring import wire
 
 
 class MemoryNetwork:

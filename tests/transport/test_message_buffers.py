@@ -16,10 +16,8 @@ from sensor_msgs.msg import Image, Imu, JointState, LaserScan, PointCloud2
 from std_msgs.msg import ByteMultiArray, Float64MultiArray, String
 from stereo_msgs.msg import DisparityImage
 
-from neuros.transport.copying import copy_packet
-from neuros.transport.message_buffers import message_buffers
-from neuros.transport.messages import message_class
-from neuros.transport.packet_segment import SegmentReader, SegmentWriter
+from neuros.transport.message_buffers import SegmentReader, SegmentWriter, message_buffers
+from neuros.transport.messages import copy_packet, message_class
 from neuros.transport.values import checker
 
 message_class("sensor_msgs/msg/Image")  # loads what ROS needs for its first message

@@ -17,8 +17,7 @@ from nav_msgs.msg import Path
 from sensor_msgs.msg import Image, Imu, JointState
 from std_msgs.msg import Float64MultiArray, Header, String
 
-from neuros.transport.copying import copy_packet
-from neuros.transport.messages import message_class
+from neuros.transport.messages import copy_packet, message_class
 from neuros.transport.ownership import unheld, unshared_check
 
 

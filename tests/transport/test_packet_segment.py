@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.transport.packet_segment import Overwritten, Place, SegmentReader, SegmentWriter
+from neuros.transport.message_buffers import Overwritten, Place, SegmentReader, SegmentWriter
 
 TYPES = "B", "d"
 

@@ -23,8 +23,8 @@ from std_msgs.msg import Bool, Byte, Float32, Float64, Header, Int32, String, UI
 
 from neuros.errors import WrongValue
 from neuros.transport.codecs import message_codec
-from neuros.transport.copying import copy_packet
 from neuros.transport.digests import digest_for, digest_of
+from neuros.transport.messages import copy_packet
 from neuros.transport.ownership import unshared_check
 from neuros.transport.values import checker
 

@@ -27,8 +27,7 @@ from neuros.control import (
     Watch,
 )
 from neuros.control.link import ControlLink
-from neuros.engine.metrics import in_flight_and_lost
-from neuros.engine.time_budget import time_budget_of
+from neuros.engine.metrics import in_flight_and_lost, time_budget_of
 from neuros.errors import ControlError
 from neuros.viewers.dashboard.pages import Pages, data_url
 

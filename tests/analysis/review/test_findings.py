@@ -11,7 +11,7 @@ from run_folders import accounting, run_folder
 
 from neuros.analysis.findings import Bottleneck, Findings, find_bottleneck, findings_of
 from neuros.analysis.run_record import open_for_review
-from neuros.engine.time_budget import TimeBudget
+from neuros.engine.metrics import TimeBudget
 from neuros.project.model import Connection
 
 TEN_S = 10.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from test_findings import wires
 
-from neuros.project.layout import Layout, lay_out
+from neuros.project.graph import Layout, lay_out
 
 
 def places_are_apart(layout: Layout) -> bool:
