@@ -15,8 +15,14 @@ from typing import Any, Protocol, TextIO
 from neuros.analysis.run_record import broken_budgets, losses, run_record, run_table
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
-from neuros.api.recording import Recording, log_of, recording_of, summary
-from neuros.api.run_folder import make_run_folder, write_node_files
+from neuros.api.run_folder import (
+    Recording,
+    log_of,
+    make_run_folder,
+    recording_of,
+    summary,
+    write_node_files,
+)
 from neuros.backends.console import (
     LAYOUT,
     LogTail,
@@ -155,7 +161,7 @@ class Execution:
 
     def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:
         started_s = time.monotonic()
-        observation = self._observation()
+        observation = Observation(self._plan, self._run_id, self.folder)
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         recording = None
         try:
@@ -281,17 +287,6 @@ class Execution:
             with contextlib.suppress(OSError):
                 spare.mkdir(0o700)
                 write_run_file(record, spare)
-
-    def _observation(self) -> Observation:
-        names = [file.node.name for file in self._files]
-        return Observation(
-            self._run_id,
-            self.folder,
-            self._plan.project,
-            names,
-            monitors_load=self._plan.request.monitor_system_load,
-            is_one_process=self._plan.back_end.is_one_process,
-        )
 
     def _as_here(self, text: str) -> str:
         """With the names that paths have on this machine."""

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RUN_ID
 from neuros.errors import EnvironmentFault
-from neuros.project.model import Project
 
 if TYPE_CHECKING:
+    from neuros.api.plan import Plan
     from neuros.recording.system_load import LoadMonitor
 
 HOST = "host"
@@ -29,33 +29,21 @@ def check_observation(*, monitors_load: bool) -> None:
 
 
 class Observation:
-    """Watches one run.
+    """Watches one run, and writes what it takes of the machine where the plan asks for that."""
 
-    Args:
-        monitors_load: whether to write what it takes of the machine.
-        names: the nodes that are started.
-        is_one_process: whether they share a process, so that no figure is one node's alone.
-    """
-
-    def __init__(
-        self,
-        run_id: str,
-        run_folder: Path,
-        project: Project,
-        names: Sequence[str],
-        *,
-        monitors_load: bool,
-        is_one_process: bool,
-    ) -> None:
-        self._run_id = run_id
-        self._run_folder = run_folder
-        self._project = project
+    def __init__(self, plan: Plan, run_id: str, run_folder: Path) -> None:
         from neuros.recording.provenance import GitState
 
-        self._git = GitState(project.folder)
+        self._run_id = run_id
+        self._run_folder = run_folder
+        self._project = plan.project
+        self._git = GitState(plan.project.folder)
         self._monitor: LoadMonitor | None = None
-        if monitors_load:
-            self._monitor = load_monitor(run_id, run_folder, names, is_one_process=is_one_process)
+        if plan.request.monitor_system_load:
+            is_one_process = plan.back_end.is_one_process
+            self._monitor = load_monitor(
+                run_id, run_folder, plan.names, is_one_process=is_one_process
+            )
             self._monitor.start()
 
     def finish(self) -> tuple[dict[str, Any], list[str]]:
@@ -77,7 +65,12 @@ class Observation:
 def load_monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
-    """What writes the system load of a run of this machine."""
+    """What writes the system load of a run of this machine.
+
+    Args:
+        names: the nodes that are started.
+        is_one_process: whether they share a process, so that no figure is one node's alone.
+    """
     from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadMonitor, LoadTable
 
     groups = [HOST] if is_one_process else list(names)

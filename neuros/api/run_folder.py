@@ -12,20 +12,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import platform
 import secrets
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from neuros.api.plan import Plan
-from neuros.distribution import WORKSPACE
+from neuros.backends.reaper import Reaper
+from neuros.backends.sidecars import Recorded, RecorderProcess
+from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import UsageError
-from neuros.project.model import Folders, NodeFile
+from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_to_json, project_to_json
+from neuros.recording.provenance import seeds
+from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
 
 
 def run_folder_path(
@@ -111,3 +120,175 @@ def _with_keys(files: Sequence[NodeFile]) -> list[NodeFile]:
 
 def _text(content: Mapping[str, Any]) -> str:
     return json.dumps(content, indent=2) + "\n"
+
+
+# ---------------------------------------------------------------------- recording
+#
+# The recording of a run: planned before the start, reported after the end.
+
+
+_PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")
+
+
+class Recording:
+    """What is recorded of one run, and the process that does it.
+
+    Raises:
+        UsageError: if the run folder cannot be written to.
+        EnvironmentFault: if the recorder cannot be started.
+    """
+
+    def __init__(
+        self,
+        plan: RecordingPlan,
+        run_id: str,
+        run: Path,
+        environment: Mapping[str, str],
+        reaper: Reaper,
+    ) -> None:
+        self._plan = replace(plan, custom={**plan.custom, "run_id": run_id})
+        self._run = run
+        try:
+            self._plan.save(run)
+        except OSError as error:
+            raise UsageError(
+                f"{run} cannot be written to ({error.strerror}): name another folder with -o"
+            ) from error
+        command = [sys.executable, "-m", "neuros.cli", "recorder", str(run)]
+        self._process = RecorderProcess(command, run, log_of(run), environment)
+        reaper.watch(self._process.pid)
+
+    def finish(self, signals: Sequence[int]) -> Recorded:
+        """Have the bag completed; who has no patience for that sends another signal."""
+        before = len(signals)
+        return self._process.finish(lambda: len(signals) > before)
+
+    def report(self, recorded: Recorded, record: dict[str, Any]) -> list[str]:
+        """Put into the record what was recorded; returns what is missing, a sentence each."""
+        topics = self._topics(recorded, record)
+        problems = list(recorded.problems)
+        if recorded.counts:  # else the recorder has stopped, and said so
+            problems += _missing(
+                {n: t for n, t in topics.items() if not _is_named(n, recorded.problems)}
+            )
+        record["recording"] = {
+            "bag": str(self._run / BAG_NAME),
+            "storage": self._plan.storage,
+            "topics": topics,
+            "problems": problems,
+        }
+        return problems
+
+    def _topics(self, recorded: Recorded, record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Per topic the packets in the bag, and those that passed this run."""
+        passed = {c["connection"]: _passed(c) for c in record["connections"]}
+        planned = {topic.name: topic for topic in self._plan.topics}
+        topics = {}
+        for name in dict.fromkeys([*planned, *recorded.counts]):
+            topic = planned.get(name)
+            connection = None if topic is None else topic.connection
+            topics[name] = {
+                "connection": connection,
+                "recorded": recorded.counts.get(name, 0),
+                "passed": None if connection is None else passed.get(connection),
+                "is_lossy": bool(connection and topic and not topic.is_reliable),
+            }
+        return topics
+
+
+def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None:
+    """What is recorded of a run, ``None``: nothing.
+
+    Raises:
+        UsageError: if something is to be recorded that is not there, or not in that folder.
+    """
+    wanted = plan.request.recording
+    if wanted is None:
+        return None
+    run = run_folder_path(plan.request.output, plan.project.name)
+    _check_folder(wanted.storage, run)
+    is_open = plan.needs_known_domain or plan.request.domain_id is not None
+    return plan_recording(
+        plan.project,
+        plan.names,
+        wanted,
+        is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
+        custom=_custom_data(plan.project),
+    )
+
+
+def _check_folder(storage: str, run: Path) -> None:
+    """Raise ``UsageError`` where the bag would be written elsewhere: SQLite is given an address."""
+    odd = [character for character in "#?%" if character in str(run)]
+    if storage == "sqlite3" and odd:
+        raise UsageError(
+            f"--storage sqlite3 cannot write to {run}, which has {' and '.join(odd)} in its name:"
+            " name another folder with -o, or record as mcap"
+        )
+
+
+def log_of(run: Path) -> Path:
+    """Where the recorder writes what it has to say."""
+    return run / "recorder.log"
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """One or two lines for the end of a run."""
+    topics = report["topics"].values()
+    count = sum(topic["recorded"] for topic in topics)
+    noun = "topic" if len(topics) == 1 else "topics"
+    packets = "packet" if count == 1 else "packets"
+    lines = [f"recorded {count} {packets} on {len(topics)} {noun}: {report['bag']}"]
+    lossy = [topic for topic in topics if topic["is_lossy"]]
+    if lossy:
+        seen = sum(topic["recorded"] for topic in lossy)
+        passed = [topic["passed"] for topic in lossy]
+        of = "?" if None in passed else sum(passed)
+        lines.append(f"recorded {seen} of {of} packets of connections that may lose any number")
+    return "\n".join(lines)
+
+
+def _is_named(topic: str, problems: Sequence[str]) -> bool:
+    """Whether one of the problems is that this topic was left out."""
+    return any(problem.startswith(f"{topic} ") for problem in problems)
+
+
+def _missing(topics: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What has passed this run and is not in the bag, a sentence each."""
+    return [
+        f"{topic['passed'] - topic['recorded']} of {topic['passed']} packets of {name} are not in"
+        " the bag"
+        for name, topic in topics.items()
+        if topic["passed"] is not None and topic["recorded"] < topic["passed"]
+    ]
+
+
+def _passed(connection: Mapping[str, Any]) -> int | None:
+    """The packets that passed this run on a connection: sent, or received from elsewhere."""
+    sent = connection["sent"]
+    found: int | None = connection["received"] if sent is None else sent
+    return found
+
+
+def _custom_data(project: Project) -> dict[str, str]:
+    """What the metadata of the bag says about the run; each value is text."""
+    content = json.dumps(project_to_json(project), sort_keys=True)
+    versions = {"neuros": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "project": project.name,
+        "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": json.dumps(versions),
+        "seeds": json.dumps(
+            {
+                f"{node}.{name}": value
+                for node, variables in seeds(project.nodes).items()
+                for name, value in variables.items()
+            }
+        ),
+    }

@@ -89,8 +89,3 @@ def load_with_messages(
     for warning in loaded.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return loaded.project, messages
-
-
-def count(number: int, what: str) -> str:
-    """A number of things: ``1 node``, ``2 nodes``."""
-    return f"{number} {what}{'' if number == 1 else 's'}"

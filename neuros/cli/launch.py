@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from neuros.viewers.viewer import Views
 
 EXIT_FAILED = 1
-SUBJECTS = {"--node-graph": "graph", "--visualisations": "packets"}
 
 # <linux/sched.h>, <linux/sockios.h>, <net/if.h>
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
@@ -162,8 +161,8 @@ def _enter_own_network() -> None:
 
 def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
     """What the run is to be looked at with; ``None``: nothing."""
-    flags = {"--node-graph": options.node_graph, "--visualisations": options.visualisations}
-    subjects = {flag: SUBJECTS[flag] for flag, is_given in flags.items() if is_given}
+    subjects = {"--node-graph": "graph"} if options.node_graph else {}
+    subjects |= {"--visualisations": "packets"} if options.visualisations else {}
     names = list(options.viewer)
     if options.isolate and (subjects or {*names} - {"dashboard"}):
         raise UsageError(
@@ -180,8 +179,7 @@ def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
 
 def _dry_run(plan: Plan) -> int:
     from neuros.api.execution import run_domain
-    from neuros.api.recording import recording_of
-    from neuros.api.run_folder import folders_of, run_folder_path
+    from neuros.api.run_folder import folders_of, recording_of, run_folder_path
 
     recording = recording_of(plan, os.environ)
     folder = run_folder_path(plan.request.output, plan.project.name, "<utc time>")
@@ -276,6 +274,7 @@ def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) ->
 
 
 _OF_PARTS = ("domain_id", "peers", "peer_timeout", "duration", "output", "verbose")
+_PART_OPTIONS = [each for each in options_of(Request) if each.name in _OF_PARTS]
 _CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
 
 
@@ -307,7 +306,7 @@ def add_part(part: argparse.ArgumentParser) -> None:
     """Add the arguments of the program."""
     part.add_argument("file", type=Path)
     part.add_argument("node")
-    add_options(part, [each for each in options_of(Request) if each.name in _OF_PARTS])
+    add_options(part, _PART_OPTIONS)
     part.set_defaults(command=_part)
 
 
@@ -316,12 +315,9 @@ def _part(parsed: argparse.Namespace) -> int:
     with signals_noted() as (signals, waker):
         from neuros.api.execution import Execution
         from neuros.api.part import part_plan, reach_peers, read_parts
-        from neuros.errors import EnvironmentFault
 
-        declared = [each for each in options_of(Request) if each.name in _OF_PARTS]
-        request = Request(
-            nodes=(parsed.node,), backend="process", network=True, **values_of(declared, parsed)
-        )
+        values = values_of(_PART_OPTIONS, parsed)
+        request = Request(nodes=(parsed.node,), backend="process", network=True, **values)
         project = read_parts(parsed.file)
         try:
             network = reach_peers(request.peers, request.peer_timeout, signals)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from neuros.cli import EXIT_CODES
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
-from neuros.project.suggest import did_you_mean
+from neuros.project.suggest import counted, did_you_mean
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -145,8 +145,7 @@ def main(arguments: Sequence[str]) -> int:
         return code
     except ProjectError as error:
         _complain(str(error))
-        count = len(error.problems)
-        _complain(f"{count} problem{'' if count == 1 else 's'}; {error.outcome}")
+        _complain(f"{counted(len(error.problems), 'problem')}; {error.outcome}")
         return EXIT_PROJECT
     except UsageError as error:
         _complain(f"neuros: {error}")

@@ -17,14 +17,13 @@ from neuros.cli.common import (
     JSON,
     add_format,
     add_project,
-    count,
     load_with_messages,
     print_json,
     project_path,
 )
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError
-from neuros.project.suggest import did_you_mean
+from neuros.project.suggest import counted, did_you_mean
 
 if TYPE_CHECKING:
     from neuros.project.model import Project
@@ -58,8 +57,8 @@ def _validate(parsed: argparse.Namespace) -> int:
         return _validate_for_programs(parsed)
     project = _validated(parsed)
     print(
-        f"{project.file}: valid: {count(len(project.nodes), 'node')},"
-        f" {count(len(project.connections), 'connection')}"
+        f"{project.file}: valid: {counted(len(project.nodes), 'node')},"
+        f" {counted(len(project.connections), 'connection')}"
     )
     return 0
 
@@ -156,7 +155,7 @@ def _types(options: argparse.Namespace) -> int:
         files = write_stubs({port.type for port in ports}, folder)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
-    print(f"{folder}: {count(len(files), 'package')} of messages")
+    print(f"{folder}: {counted(len(files), 'package')} of messages")
     return 0
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
@@ -136,7 +137,7 @@ def _replay(options: argparse.Namespace) -> int:
             for topic in chosen
             for packet in topic.raw()
         )
-        count = play(
+        sent = play(
             [RosTopic(t.name, t.type, t.is_reliable, t.depth, t.is_latched) for t in chosen],
             packets,
             rate=options.rate,
@@ -144,7 +145,7 @@ def _replay(options: argparse.Namespace) -> int:
             subscriptions=options.wait_matching_subscriptions,
             domain_id=options.domain_id,
         )
-    print(f"{count} packets on {len(chosen)} topics")
+    print(f"{sent} packets on {len(chosen)} topics")
     return 0
 
 
@@ -273,9 +274,11 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
     from neuros.replay.from_container import missing_module, not_here, ran_in_container
 
     compared = node.comparison
-    count = f"{_count(compared.packets, 'packet')} on {_count(compared.connections, 'connection')}"
+    packets = (
+        f"{counted(compared.packets, 'packet')} on {counted(compared.connections, 'connection')}"
+    )
     if is_left:
-        print(f"left after {_count(node.starts, 'start')} of hooks; identical so far: {count}")
+        print(f"left after {counted(node.starts, 'start')} of hooks; identical so far: {packets}")
         return EXIT_LEFT
     if node.failure is not None and node.difference is None:
         if not _failed_alike(node, run.record, name):
@@ -293,8 +296,8 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
     if not compared.packets and node.has_outputs and (node.notes or not compared.connections):
         print("unknown: its packets were not recorded")
         return EXIT_UNKNOWN
-    what = count if compared.connections else "it sends nothing"
-    print(f"identical: {what}; {_count(node.starts, 'start')} of hooks")
+    what = packets if compared.connections else "it sends nothing"
+    print(f"identical: {what}; {counted(node.starts, 'start')} of hooks")
     return EXIT_IDENTICAL
 
 
@@ -340,7 +343,3 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
         stream.flush()
     os.chdir(file.folders.run)
     os.execve(shutil.which(arguments[0]) or arguments[0], arguments, environment)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
+from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
@@ -198,9 +199,8 @@ def _verify(options: argparse.Namespace) -> int:
         return exit_code
     for remark in remarks:
         print(f"note: {remark}")
-    packets = f"{verdict.compared} packet{'' if verdict.compared == 1 else 's'}"
     why = {"different": verdict.difference, "unknown": "there is nothing to compare"}
-    print(f"{result}: {why.get(result, packets)}")
+    print(f"{result}: {why.get(result, counted(verdict.compared, 'packet'))}")
     return exit_code
 
 

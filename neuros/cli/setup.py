@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.backends.containers import OWN_FOLDER, STANDARD
+from neuros.caching import cache_root
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 
@@ -147,7 +148,7 @@ def _build_images(options: argparse.Namespace) -> int:
     from neuros.installation.progress import Progress
 
     wishes = Wishes(
-        logs=_cache() / "builds",
+        logs=cache_root(os.environ) / "builds",
         bases=dict(_pair(text, "neuros_python") for text in options.base_image),
         arguments=dict(_pair(text, None) for text in options.build_arg),
         pull=options.pull,
@@ -259,11 +260,6 @@ def _file_or_folder(text: str | None, option: str, *, is_folder: bool) -> Path |
     if not (path.is_dir() if is_folder else path.is_file()):
         raise UsageError(f"{option} {text}: there is no such {'folder' if is_folder else 'file'}")
     return path
-
-
-def _cache() -> Path:
-    """Where NeuROS keeps what it can make again."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neuros"
 
 
 def add_doctor(doctor: argparse.ArgumentParser) -> None:

@@ -196,11 +196,25 @@ def _search(job: Job, lib: str) -> list[str]:
 
 
 def _run(job: Job, command: Sequence[str]) -> None:
+    run_program(command, job.environment, folder=job.source)
+
+
+def run_program(
+    command: Sequence[str],
+    environment: Mapping[str, str],
+    given: str = "",
+    folder: Path | None = None,
+) -> None:
+    """Run a program of the build; raises ``CompilationError`` if it fails.
+
+    Args:
+        given: for its standard input.
+    """
     done = subprocess.run(
         command,
-        cwd=job.source,
-        env=job.environment,
-        stdin=subprocess.DEVNULL,
+        cwd=folder,
+        env=environment,
+        input=given,
         capture_output=True,
         text=True,
         errors="replace",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,14 @@ from pathlib import Path
 from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.progress import Progress
 from neuros.messages import generation
-from neuros.messages.compilation import HEADERS, CompilationError, Compilers, Job, compile_package
+from neuros.messages.compilation import (
+    HEADERS,
+    CompilationError,
+    Compilers,
+    Job,
+    compile_package,
+    run_program,
+)
 from neuros.messages.package import MANIFEST, Package, Ros
 from neuros.messages.workspace import Built, Workspaces, cycle_problem, sweep
 from neuros.project.model import Node
@@ -123,7 +129,13 @@ class Messages:
         Raises:
             EnvironmentFault: with a sentence for the user.
         """
-        build(self._steps, self._workspaces.ros, progress, environment)
+        missing = [step for step in self._steps if not step.built.is_there]
+        if not missing:
+            return
+        builder = _Builder(self._workspaces.ros, Compilers.here(), progress, environment)
+        for step in missing:
+            builder.build(step)
+        sweep(missing[0].built.folder.parent)
 
     def _is_current(self, built: Built) -> bool:
         return built in self._workspaces.builds([built.package])
@@ -138,106 +150,84 @@ class Messages:
         ]
 
 
-def build(
-    steps: Iterable[Step], ros: Ros, progress: Progress, environment: Mapping[str, str]
-) -> None:
-    """Build what is missing, in this order; a line for each package.
+@dataclass(frozen=True)
+class _Builder:
+    """Builds packages, with a line of progress for each."""
 
-    Args:
-        environment: of the programs that this starts.
+    ros: Ros
+    compilers: Compilers
+    progress: Progress
+    environment: Mapping[str, str]
 
-    Raises:
-        EnvironmentFault: with a sentence for the user; then nothing of that package is left but
-            a log.
-    """
-    missing = [step for step in steps if not step.built.is_there]
-    if not missing:
-        return
-    compilers = Compilers.here()
-    for step in missing:
+    def build(self, step: Step) -> None:
+        """Build a package, or wait until another program has built it.
+
+        Raises:
+            EnvironmentFault: with a sentence for the user; then nothing of the package is left but
+                a log.
+        """
+        name, built = step.package.name, step.built
         try:
-            _build_locked(step, ros, compilers, progress, environment)
+            with built.locked(wait=False) as is_mine:
+                if is_mine:
+                    self._build(step)
+                    return
+            self.progress.step(f"waiting for another program that builds {name}")
+            with built.locked():
+                self._build(step)
         except OSError as error:
             raise EnvironmentFault(
-                f"message package '{step.package.name}' cannot be built in"
-                f" {step.built.folder.parent} ({error.strerror or error}): make room (df -h), or"
-                " set XDG_CACHE_HOME"
+                f"message package '{name}' cannot be built in {built.folder.parent}"
+                f" ({error.strerror or error}): make room (df -h), or set XDG_CACHE_HOME"
             ) from error
-    sweep(missing[0].built.folder.parent)
 
-
-def _build_locked(
-    step: Step, ros: Ros, compilers: Compilers, progress: Progress, environment: Mapping[str, str]
-) -> None:
-    with step.built.locked(wait=False) as is_mine:
-        if is_mine:
-            _build(step, ros, compilers, progress, environment)
+    def _build(self, step: Step) -> None:
+        """Build one package; its lock is held."""
+        package, built = step.package, step.built
+        if built.is_there:  # by another program, meanwhile
             return
-    progress.step(f"waiting for another program that builds {step.package.name}")
-    with step.built.locked():
-        _build(step, ros, compilers, progress, environment)
-
-
-def _build(
-    step: Step, ros: Ros, compilers: Compilers, progress: Progress, environment: Mapping[str, str]
-) -> None:
-    """Build one package; its lock is held."""
-    package, built = step.package, step.built
-    if built.is_there:  # by another program, meanwhile
-        return
-    progress.step(f"building {package.name}: {package.summary} ({package.folder})")
-    draft, source = built.draft, built.draft / "source"
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        source.mkdir(parents=True)
-        _generate(step, ros, source, environment)
-        others = _others(package, source)
-        needs = {need.package: need.folder for need in step.needs}
-        compile_package(
-            Job(package.name, source, draft, others, needs, ros, compilers, environment)
-        )
-        _install(package, source, draft)
-        shutil.rmtree(source)
-        if not step.is_current():
-            raise EnvironmentFault(
-                f"message package '{package.name}' was changed while it was built: start again"
-            )
-        draft.rename(built.folder)
-        built.log.unlink(missing_ok=True)
-    except CompilationError as error:
-        built.log.write_text(str(error), "utf-8")
-        raise EnvironmentFault(
-            f"message package '{package.name}' cannot be built: {_cause(str(error))} (log:"
-            f" {built.log})"
-        ) from error
-    finally:
+        self.progress.step(f"building {package.name}: {package.summary} ({package.folder})")
+        draft, source = built.draft, built.draft / "source"
         shutil.rmtree(draft, ignore_errors=True)
+        try:
+            source.mkdir(parents=True)
+            self._generate(step, source)
+            others = _others(package, source)
+            needs = {need.package: need.folder for need in step.needs}
+            tools = (self.ros, self.compilers, self.environment)
+            compile_package(Job(package.name, source, draft, others, needs, *tools))
+            _install(package, source, draft)
+            shutil.rmtree(source)
+            if not step.is_current():
+                raise EnvironmentFault(
+                    f"message package '{package.name}' was changed while it was built: start again"
+                )
+            draft.rename(built.folder)
+            built.log.unlink(missing_ok=True)
+        except CompilationError as error:
+            built.log.write_text(str(error), "utf-8")
+            raise EnvironmentFault(
+                f"message package '{package.name}' cannot be built: {_cause(str(error))} (log:"
+                f" {built.log})"
+            ) from error
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
 
-
-def _generate(step: Step, ros: Ros, source: Path, environment: Mapping[str, str]) -> None:
-    package = step.package
-    shares = {name: str(ros.share(name)) for name in ros.message_packages()}
-    shares |= {need.package: str(need.share) for need in step.needs}
-    order = generation.Order(
-        package.name,
-        str(package.folder),
-        [file.as_posix() for file in package.files],
-        str(source),
-        str(ros.prefix),
-        shares,
-    )
-    # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
-    done = subprocess.run(
-        [sys.executable, "-I", generation.__file__],
-        env=environment,
-        input=order.text(),
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
-    )
-    if done.returncode:
-        raise CompilationError(f"{done.stdout}{done.stderr}")
+    def _generate(self, step: Step, source: Path) -> None:
+        package = step.package
+        shares = {name: str(self.ros.share(name)) for name in self.ros.message_packages()}
+        shares |= {need.package: str(need.share) for need in step.needs}
+        order = generation.Order(
+            package.name,
+            str(package.folder),
+            [file.as_posix() for file in package.files],
+            str(source),
+            str(self.ros.prefix),
+            shares,
+        )
+        # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
+        command = [sys.executable, "-I", generation.__file__]
+        run_program(command, self.environment, order.text())
 
 
 def _others(package: Package, source: Path) -> set[str]:

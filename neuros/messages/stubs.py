@@ -7,12 +7,13 @@ for a number, a list or an array for a sequence of them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from neuros.project.message_types import parts_of_type
 
 _HEAD = """\
 # Made by `neuros types`: the fields of {package}'s messages. Make it again when those change.
@@ -39,10 +40,6 @@ _SCALARS = {
     **dict.fromkeys(("octet",), "bytes"),
     "boolean": "bool",
 }
-_FIELD = re.compile(
-    r"(?P<sequence>sequence<)?(?P<element>w?string(?:<\d+>)?|[\w/]+)(?:, \d+)?>?"
-    r"(?:\[(?P<length>\d+)\])?"
-)
 _IN_ARRAYS = {"int", "float"}
 
 
@@ -85,7 +82,7 @@ def _stub(package: str) -> tuple[str, set[str]]:
     found = (getattr(module, name) for name in sorted(vars(module)))
     classes = [each for each in found if hasattr(each, "get_fields_and_field_types")]
     fields = {each: each.get_fields_and_field_types() for each in classes}
-    elements = (_parts(kind)[1] for types in fields.values() for kind in types.values())
+    elements = (parts_of_type(kind)[1] for types in fields.values() for kind in types.values())
     needed = {element.partition("/")[0] for element in elements if "/" in element} - {package}
     text = ""
     for each in classes:
@@ -123,7 +120,7 @@ def _fields(types: dict[str, str], package: str) -> Iterator[str]:
 
 def _annotations(kind: str, package: str) -> tuple[str, str]:
     """What a field is when it is read, and what may be written to it."""
-    is_sequence, element, length = _parts(kind)
+    is_sequence, element, length = parts_of_type(kind)
     if "/" in element:
         of, name = element.split("/")
         plain = name if of == package else f"{of}.msg.{name}"
@@ -136,10 +133,3 @@ def _annotations(kind: str, package: str) -> tuple[str, str]:
     if is_sequence or length:
         return f"list[{plain}]", f"Sequence[{plain}]"
     return plain, plain
-
-
-def _parts(kind: str) -> tuple[bool, str, str]:
-    """Whether it is a sequence, of what, and the length of an array: of ``sequence<double, 3>``."""
-    found = _FIELD.fullmatch(kind)
-    assert found is not None, kind
-    return bool(found["sequence"]), found["element"].partition("<")[0], found["length"] or ""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -126,16 +126,9 @@ def _duplicate_connections(parsed: ParsedProject) -> Iterator[Problem]:
 
 
 def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
-    nodes: dict[str, list[Element]] = {}
-    for node in parsed.nodes:
-        nodes.setdefault(node.string("name") or "", []).append(node)
-
-    @cache
-    def ports(name: str, side: str) -> dict[str | None, Element]:
-        every = [each for node in nodes[name] for each in node.items(side)]
-        return {each.string("name"): each for each in reversed(every)}
-
-    all_known = parsed.is_complete and all(node.string("name") for node in parsed.nodes)
+    nodes = {node.string("name") or "" for node in parsed.nodes}
+    ports = _ports_of(parsed)
+    all_known = parsed.is_complete and "" not in nodes
     for connection in parsed.connections:
         found: list[Element] = []
         for node_key, port_key, side in (
@@ -150,7 +143,7 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
                     hint = did_you_mean(name, nodes)
                     yield connection.value[node_key].problem(f"there is no node '{name}'", hint)
                 continue
-            end = _port(nodes[name], ports, name, port, side) if port else None
+            end = _port(ports, name, port, side) if port else None
             if isinstance(end, Element):
                 found.append(end)
                 if end.member("external_topic") is not None:
@@ -165,22 +158,33 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
         yield from _compression(connection, found)
 
 
-_Ports: TypeAlias = "Callable[[str, str], Mapping[str | None, Element]]"
+_Ports: TypeAlias = "dict[tuple[str, str], dict[str | None, Element]]"
 
 
-def _port(
-    nodes: Sequence[Element], ports: _Ports, node: str, port: str, side: str
-) -> Element | tuple[str, str] | None:
+def _ports_of(parsed: ParsedProject) -> _Ports:
+    """By node and side, the ports by name; with the name ``None``, not all of them are known."""
+    found: _Ports = {}
+    for node in parsed.nodes:
+        for side in _SIDES:
+            ports = found.setdefault((node.string("name") or "", side), {})
+            for port in node.items(side):
+                ports.setdefault(port.string("name"), port)
+            member = node.member(side)
+            if member is not None and not isinstance(member.value, list):
+                ports.setdefault(None, member)
+    return found
+
+
+def _port(ports: _Ports, node: str, port: str, side: str) -> Element | tuple[str, str] | None:
     """The port of the nodes of one name, or what is wrong with it; ``None`` if that is unknown."""
-    names = ports(node, side)
+    names = ports[node, side]
     if port in names:
         return names[port]
-    members = [member for node_ in nodes if (member := node_.member(side))]
-    if None in names or not all(isinstance(member.value, list) for member in members):
+    if None in names:
         return None
     other = "outputs" if side == "inputs" else "inputs"
     hint = did_you_mean(port, filter(None, names))
-    if port in ports(node, other):
+    if port in ports[node, other]:
         hint = f"it has an {other[:-1]} of that name"
     return f"node '{node}' has no {side[:-1]} '{port}'", hint
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
 from neuros.project.model import Connection, Node, Port, Project
+from neuros.project.suggest import counted
 
 
 def graph_text(project: Project) -> str:
@@ -26,7 +27,7 @@ def graph_text(project: Project) -> str:
               <- ticker.tick
     """
     nodes, connections = len(project.nodes), len(project.connections)
-    lines = [f"{project.name}: {_count(nodes, 'node')}, {_count(connections, 'connection')}"]
+    lines = [f"{project.name}: {counted(nodes, 'node')}, {counted(connections, 'connection')}"]
     if project.description:
         lines.append(project.description)
     for node in project.nodes:
@@ -127,10 +128,6 @@ def _arrow(connection: Connection) -> str:
 
 def _safe(text: str) -> str:
     return text.replace('"', "#quot;")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 # ---------------------------------------------------------------------- layout
@@ -302,16 +299,11 @@ def graph_svg(project: Project) -> str:
 
 def _topic_ends(project: Project, index: int) -> Iterator[Connection]:
     """External topics as what they are in the picture: ends of connections."""
-    number = itertools.count(index)
-    for node in project.nodes:
-        for port in node.inputs:
-            if port.external_topic is not None:
-                topic = f"{_TOPIC}{port.external_topic}"
-                yield Connection(topic, "", node.name, port.name, index=next(number))
-        for port in node.outputs:
-            if port.external_topic is not None:
-                topic = f"{_TOPIC}{port.external_topic}"
-                yield Connection(node.name, port.name, topic, "", index=next(number))
+    ports = ((node, port, is_input) for node in project.nodes for port, is_input in _external(node))
+    for number, (node, port, is_input) in enumerate(ports, index):
+        own, topic = (node.name, port.name), (f"{_TOPIC}{port.external_topic}", "")
+        ends = (*topic, *own) if is_input else (*own, *topic)
+        yield Connection(*ends, index=number)
 
 
 class _Picture:

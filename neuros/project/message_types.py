@@ -108,7 +108,7 @@ def unknown_type(
             " file: docs/messages.md",
         )
     names = _IMPORTED.findall((folder / "__init__.py").read_text(encoding="utf-8"))
-    if name in names or _really_has(package, name):
+    if name in names or imported(package, name) is not None:
         return None
     return _no_message(type_name, names)
 
@@ -129,10 +129,6 @@ def _message_folder(package: str) -> Path | None:
         if (folder / "__init__.py").is_file():
             return folder
     return None
-
-
-def _really_has(package: str, name: str) -> bool:
-    return imported(package, name) is not None
 
 
 def imported(package: str, name: str) -> Any:
@@ -170,7 +166,7 @@ def _installed_packages() -> set[str]:
 
 _PATH = re.compile(r"[A-Za-z_]\w*(\[\d+\])*(\.[A-Za-z_]\w*(\[\d+\])*)*", re.ASCII)
 _STEP = re.compile(r"(\w+)|\[(\d+)\]", re.ASCII)
-_OF_CLASS = re.compile(r"(sequence<)?([\w/]+)(?:<\d+>)?(?:, \d+)?>?(\[\d+\])?", re.ASCII)
+_OF_CLASS = re.compile(r"(sequence<)?([\w/]+)(?:<\d+>)?(?:, \d+)?>?(?:\[(\d+)\])?", re.ASCII)
 
 
 def fields_of(type_name: str, packages: MessagePackages) -> Mapping[str, MessageField] | None:
@@ -191,12 +187,22 @@ def fields_of(type_name: str, packages: MessagePackages) -> Mapping[str, Message
     return {key: _of_class(text) for key, text in types.items()}
 
 
-def _of_class(text: str) -> MessageField:
+def parts_of_type(text: str) -> tuple[bool, str, str]:
+    """Of a type as classes have it: whether it is a sequence, of what, and the size of an array.
+
+    >>> parts_of_type("sequence<geometry_msgs/Point, 3>")
+    (True, 'geometry_msgs/Point', '')
+    """
     found = _OF_CLASS.fullmatch(text)
     assert found is not None, text
-    package, _, name = found[2].rpartition("/")
+    return bool(found[1]), found[2], found[3] or ""
+
+
+def _of_class(text: str) -> MessageField:
+    is_sequence, element, size = parts_of_type(text)
+    package, _, name = element.rpartition("/")
     written = f"{package}/msg/{name}" if package else name
-    return MessageField(written, is_array=bool(found[1] or found[3]))
+    return MessageField(written, is_array=bool(is_sequence or size))
 
 
 def misfit(

@@ -1,4 +1,4 @@
-"""Hints for misspelt names."""
+"""Words of messages: hints for misspelt names, lists, numbers of things."""
 
 from __future__ import annotations
 
@@ -19,3 +19,8 @@ def listed(words: Iterable[str]) -> str:
     """``'a', 'b' or 'c'``."""
     quoted = [f"'{word}'" for word in words]
     return " or ".join([", ".join(quoted[:-1]), quoted[-1]] if len(quoted) > 1 else quoted)
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 node`` or ``2 nodes``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -60,19 +60,13 @@ class StepLoop:
         return bool(self._events)
 
     def post(self, event: Event) -> None:
-        """Handle ``event`` after all that already wait."""
+        """Handle ``event`` after all that already wait. Any thread."""
         self._events.append(event)
 
-    def post_loop_back(self, event: Event) -> None:
-        """Handle ``event`` after all that already wait."""
-        self._events.append(event)
+    post_loop_back = post_from_thread = post
 
     def note_execution(self) -> None:
         """Nothing has arrived meanwhile."""
-
-    def post_from_thread(self, event: Event) -> None:
-        """Handle ``event`` after all that wait; callable from any thread."""
-        self._events.append(event)
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
         """Call ``on_due`` when :meth:`advance_to` reaches ``next_due_ns()``."""

@@ -35,7 +35,7 @@ from neuros.transport.compression import Compressor, Traffic, compressing, decom
 from neuros.transport.digests import Digest, digest_for, make_digests
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
 from neuros.transport.messages import message_class
-from neuros.transport.ros_graph import ExternalTopics, data_qos
+from neuros.transport.ros_graph import ExternalTopics, data_qos, is_compatible
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
@@ -472,11 +472,6 @@ class Registration:
             self._finish()
         return self.is_done
 
-    def close(self) -> None:
-        """Give up the endpoints."""
-        self._ros_node.destroy_publisher(self._reg_publisher)
-        self._ros_node.destroy_subscription(self._reg_subscription)
-
     def _publish(self, text: str) -> None:
         said = text if self._key is None else signed(text, self._key)
         self._reg_publisher.publish(String(data=said))
@@ -507,33 +502,18 @@ class Registration:
         )
 
     def _reaches_peer(self, publisher: Publisher) -> bool:
-        matched = publisher.get_subscription_count()
+        matched, own = publisher.get_subscription_count(), publisher.qos_profile
         if not matched:  # asked first: the graph is searched from end to end for each topic
             return False
         listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
-        compatible = [e for e in listed if _match(publisher.qos_profile, e.qos_profile)]
-        return self._is_among(compatible, matched)
+        return self._is_among([e for e in listed if is_compatible(own, e.qos_profile)], matched)
 
     def _hears_peer(self, subscription: Subscription) -> bool:
-        matched = subscription.get_publisher_count()
+        matched, own = subscription.get_publisher_count(), subscription.qos_profile
         if not matched:
             return False
         listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
-        compatible = [e for e in listed if _match(e.qos_profile, subscription.qos_profile)]
-        return self._is_among(compatible, matched)
+        return self._is_among([e for e in listed if is_compatible(e.qos_profile, own)], matched)
 
     def _is_among(self, compatible: Sequence[TopicEndpointInfo], matched: int) -> bool:
         return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)
-
-
-def _match(publisher: QoSProfile, subscription: QoSProfile) -> bool:
-    """Whether DDS matches these two.
-
-    ``rclpy.qos.qos_check_compatible`` takes the "infinite" deadline that the graph reports for one
-    that was asked for, and so refuses all that the graph lists.
-    """
-    is_reliable = publisher.reliability == QoSReliabilityPolicy.RELIABLE
-    is_latched = publisher.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
-    wants_reliable = subscription.reliability == QoSReliabilityPolicy.RELIABLE
-    wants_latched = subscription.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
-    return (is_reliable or not wants_reliable) and (is_latched or not wants_latched)

@@ -256,15 +256,14 @@ class QosCheck:
         timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
 
     def _look(self, *, is_input: bool, is_last: bool) -> None:
+        topic = self._port.external_topic  # by the name that rules apply to
         if is_input:
-            side, list_others = "input", self._ros_node.get_publishers_info_by_topic
+            side, others = "input", self._ros_node.get_publishers_info_by_topic(topic)
         else:
-            side, list_others = "output", self._ros_node.get_subscriptions_info_by_topic
-        for other in list_others(self._port.external_topic):  # by the name that rules apply to
-            offered, asked = (
-                (other.qos_profile, self._own) if is_input else (self._own, other.qos_profile)
-            )
-            lacking = list(qos_differences(offered, asked))
+            side, others = "output", self._ros_node.get_subscriptions_info_by_topic(topic)
+        for other in others:
+            ends = (other.qos_profile, self._own)
+            lacking = list(qos_differences(*(ends if is_input else ends[::-1])))
             # The name of its node may come later than what it offers.
             if lacking and (is_last or other.node_name != _UNKNOWN_NODE):
                 self._warn(side, other, lacking)
@@ -293,13 +292,22 @@ class QosCheck:
 
 
 def qos_differences(offered: QoSProfile, asked: QoSProfile) -> Iterator[tuple[str, str]]:
-    """Policies, ``(offered, asked)``, by which a publisher offers less than a subscription asks."""
+    """Policies, ``(offered, asked)``, by which a publisher offers less than a subscription asks.
+
+    ``rclpy.qos.qos_check_compatible`` takes the "infinite" deadline that the graph reports for one
+    that was asked for, and so refuses all that the graph lists.
+    """
     reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
     if (offered.reliability, asked.reliability) == (best_effort, reliable):
         yield "best_effort", "reliable"
     latched, volatile = QoSDurabilityPolicy.TRANSIENT_LOCAL, QoSDurabilityPolicy.VOLATILE
     if (offered.durability, asked.durability) == (volatile, latched):
         yield "volatile", "transient_local"
+
+
+def is_compatible(offered: QoSProfile, asked: QoSProfile) -> bool:
+    """Whether DDS connects a publisher and a subscription."""
+    return not any(qos_differences(offered, asked))
 
 
 def _check_silence(ros_node: RosNode, heard: Mapping[Port, Subscription], loop: RosLoop) -> None:
@@ -330,7 +338,7 @@ def _reason(ros_node: RosNode, port: Port, subscription: Subscription) -> str:
     if types - {port.type}:
         return f"{topic} is published as {' and '.join(sorted(types))}, not as {port.type}"
     if types:
-        if all(any(qos_differences(each.qos_profile, subscription.qos_profile)) for each in listed):
+        if not any(is_compatible(each.qos_profile, subscription.qos_profile) for each in listed):
             return ""
         names = " and ".join(sorted({each.node_name for each in listed}))
         return f"{names} publishes on {topic}, but DDS has not connected the two"

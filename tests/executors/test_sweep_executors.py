@@ -120,7 +120,7 @@ class Instant(Executor):
         self._record = record
 
     def submit(self, job: Callable[..., Any], /, *_: Any, **__: Any) -> Future[Any]:
-        from neuros.api.sweep_job import SweepJob, row_of
+        from neuros.api.sweep import SweepJob, row_of
 
         assert isinstance(job, SweepJob)
         job.folder.mkdir()

@@ -24,9 +24,6 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from neuros.engine.event_log import Script
-from neuros.project.graph import graph_svg
-
 import neuros.bag
 from neuros import control
 from neuros.analysis.comparison import RecordedPackets, compare, comparison_rows
@@ -37,9 +34,10 @@ from neuros.analysis.run_record import open_for_review, open_run
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, encode, kind_of
 from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.engine.event_log import Script
 from neuros.errors import ControlError, NeurosError, ProtocolError
 from neuros.launcher.peers import RUNNING, PeerState, state_from
-from neuros.project.graph import graph_mermaid, graph_text
+from neuros.project.graph import graph_mermaid, graph_svg, graph_text
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
