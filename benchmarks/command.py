@@ -1,4 +1,4 @@
-"""What ``neuros benchmark`` does, after its options were read by :mod:`neuros.cli.checkout`."""
+"""What ``neuros benchmark`` does, after its options were read (:mod:`benchmarks.options`)."""
 
 from __future__ import annotations
 
