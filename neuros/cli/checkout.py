@@ -9,6 +9,8 @@ import sys
 from neuros.distribution import ROOT
 from neuros.errors import EnvironmentFault
 
+_OPTIONS = "benchmarks.options"
+
 
 def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
@@ -26,11 +28,11 @@ def _add_options(parser: argparse.ArgumentParser, name: str) -> None:
     Raises:
         EnvironmentFault: where neuros was installed without a checkout.
     """
-    if not (ROOT / "benchmarks/options.py").is_file():
+    if not (ROOT / _OPTIONS.replace(".", "/")).with_suffix(".py").is_file():
         raise EnvironmentFault(
             f"there are no benchmarks in {ROOT}: they are part of the source checkout and not of"
             " the package; clone it, run ./install.py there, and use its .venv/bin/neuros"
         )
     if str(ROOT) not in sys.path:
         sys.path.insert(0, str(ROOT))
-    getattr(importlib.import_module("benchmarks.options"), name)(parser)
+    getattr(importlib.import_module(_OPTIONS), name)(parser)
