@@ -275,7 +275,7 @@ class TestBuilding:
         messages = bench.messages()
         compilers = Compilers("gcc", "g++", ())
         monkeypatch.setattr(Compilers, "here", lambda: compilers)
-        monkeypatch.setattr(needed, "_generate", lambda *_: file.write_text("float32 x\n"))
+        monkeypatch.setattr(needed._Builder, "_generate", lambda *_: file.write_text("float32 x\n"))
         for part in ("_others", "compile_package", "_install"):
             monkeypatch.setattr(needed, part, lambda *_: None)
 
