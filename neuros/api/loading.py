@@ -14,8 +14,8 @@ from pathlib import Path
 
 from neuros.api.plan import make_environments
 from neuros.backends.containers import find_container, misspelt
-from neuros.backends.pythons import Pythons
 from neuros.backends.node_command import signal_in_words, without_mark
+from neuros.backends.pythons import Pythons
 from neuros.distribution import WORKSPACE, install_command
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
