@@ -20,6 +20,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
@@ -29,14 +30,21 @@ if TYPE_CHECKING:
 
 _Result = TypeVar("_Result")
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
 
 class NeurosError(Exception):
     """Base of all errors that NeuROS raises on purpose; its text is written for the user."""
 
 
 def printable(text: str) -> str:
-    r"""A text that can be written as UTF-8: half a character, as ``'\udc80'``, is spelt out."""
-    return text.encode("utf-8", "backslashreplace").decode()
+    r"""A text that can be written as UTF-8, and does nothing to a terminal.
+
+    Half a character, as ``'\udc80'``, is spelt out, and so are escape sequences and other control
+    characters: names in a project may hold them.
+    """
+    text = text.encode("utf-8", "backslashreplace").decode()
+    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
 
 
 @dataclass(frozen=True, order=True)

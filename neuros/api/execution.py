@@ -37,7 +37,7 @@ from neuros.backends.node_command import with_messages
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import Session, reaper_environment, this_process
 from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault, UsageError, printable
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
@@ -492,7 +492,7 @@ class Console:
     def log(self, severity: str, text: str) -> None:
         """Write a record of the launcher itself, after what nodes have logged so far."""
         self.poll()
-        self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
+        self.write(format_record(severity, "neuros", printable(text), layout=self._layout) + "\n")
 
     def follow(self, progress: Progress) -> None:
         """Show how far the run has come."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.request import ProjectOptions
-from neuros.errors import UsageError
+from neuros.errors import UsageError, printable
 from neuros.options import add_options, options_of
 
 if TYPE_CHECKING:
@@ -87,5 +87,5 @@ def load_with_messages(
     changes = (parsed.set, parsed.namespace, parsed.remap)
     loaded, messages = load(path, *changes, reads_plugins=reads_plugins)
     for warning in loaded.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print(f"warning: {printable(str(warning))}", file=sys.stderr)
     return loaded.project, messages

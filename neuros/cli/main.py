@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from neuros.cli import EXIT_CODES
 from neuros.distribution import __version__
-from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError, printable
 from neuros.project.suggest import counted, did_you_mean
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -222,7 +222,7 @@ def _give_up_output() -> None:
 
 def _complain(text: str) -> None:
     with contextlib.suppress(OSError):  # its reader has gone
-        print(text, file=sys.stderr)
+        print(printable(text), file=sys.stderr)
 
 
 def _open_standard_streams() -> None:

@@ -22,7 +22,7 @@ from neuros.cli.common import (
     project_path,
 )
 from neuros.distribution import EXAMPLES, PACKAGE
-from neuros.errors import NeurosError, ProjectError, UsageError
+from neuros.errors import NeurosError, ProjectError, UsageError, printable
 from neuros.project.suggest import counted, did_you_mean
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def _validate(parsed: argparse.Namespace) -> int:
         return _validate_for_programs(parsed)
     project = _validated(parsed)
     print(
-        f"{project.file}: valid: {counted(len(project.nodes), 'node')},"
+        f"{printable(str(project.file))}: valid: {counted(len(project.nodes), 'node')},"
         f" {counted(len(project.connections), 'connection')}"
     )
     return 0

@@ -28,8 +28,12 @@ class ControlLink:
     def __init__(self, stream: ControlStream, accepted: Sequence[type[Message]], peer: str) -> None:
         self.stream = stream
         self.peer = peer
-        self._accepted = {kind_of(each): each for each in accepted}
+        self.accept(accepted)
         self._parts: list[bytes] = []  # of a line whose end has not arrived
+
+    def accept(self, accepted: Sequence[type[Message]]) -> None:
+        """Take these messages, and no others, from now on."""
+        self._accepted = {kind_of(each): each for each in accepted}
 
     def fileno(self) -> int:
         """For selectors."""

@@ -44,7 +44,7 @@ from neuros.control import (
     WasReset,
     Watch,
 )
-from neuros.control.link import ControlLink, encode, kind_of
+from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
 from neuros.launcher.outcome import Outcome, Output, Phase
 from neuros.ports import ControlListener
@@ -208,7 +208,7 @@ class Channels:
         now_s = time.monotonic()
         while len(self._others) < _MOST_OTHERS and (stream := self._listener.accept()) is not None:
             stream.setblocking(False)
-            link = ControlLink(stream, (*FROM_NODES, *FROM_OBSERVERS), STRANGER)
+            link = ControlLink(stream, (Hello, Watch), STRANGER)
             self._unsent[link] = bytearray()
             self._others[link] = now_s
             self._strangers.add(link)
@@ -231,14 +231,14 @@ class Channels:
             message = link.decode(line)
         except ControlError as error:
             return error
-        if link in self._strangers and not isinstance(message, Hello | Watch):
-            return ControlError(f"{STRANGER} sent '{kind_of(type(message))}' as its first message")
         self._strangers.discard(link)
         if isinstance(message, Hello):
             self._others.pop(link, None)
             self._nodes[link] = tuple(message.nodes)
+            link.accept(FROM_NODES)
             link.peer = f"the process of {' and '.join(message.nodes)}"
         elif isinstance(message, Watch):
+            link.accept(FROM_OBSERVERS)
             link.peer = "an observer"
         return message
 

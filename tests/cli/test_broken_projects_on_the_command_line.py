@@ -5,6 +5,7 @@ What the problems say is tested case by case in ``tests/project``.
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -34,6 +35,22 @@ def test_every_problem_is_listed_and_nothing_is_started(
         assert verdict == f"{count} problem{'' if count == '1' else 's'}; nothing was started"
         assert int(count) >= 1
     assert (sorted(BROKEN.iterdir()), _children()) == before
+
+
+def test_names_do_nothing_to_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "pro\x1b[2Jject.json"
+    node = {
+        "name": "a\x1b[31m",
+        "container": "c\x1b]0;title\x07",
+        "plugin": "p\x9b5m.py",
+        "\x1b[5m": 1,
+    }
+    file.write_text(json.dumps({"nodes": [node], "connections": []}))
+    assert main(["validate", str(file)]) == 3
+    assert main(["launch", str(file)]) == 3
+    said = capsys.readouterr().err
+    assert "name: 'a\\x1b[31m' is not allowed" in said
+    assert all(character.isprintable() or character == "\n" for character in said)
 
 
 def _children() -> list[str]:

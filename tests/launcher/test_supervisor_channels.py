@@ -201,11 +201,19 @@ def test_a_line_without_an_end_is_refused(channels: Channels, node: Node) -> Non
     assert {"refused"} == {*kinds(channels), *kinds(channels)}
 
 
-def test_only_hello_and_watch_are_greetings(channels: Channels, node: Node) -> None:
-    node.send(End("enough"))
-    node.send(Watch())
-    node.send(End("enough"))
-    assert kinds(channels) == ["refused", "watch", "end"]
+def test_only_hello_and_watch_are_greetings_and_each_says_what_may_follow(
+    channels: Channels, node: Node, tmp_path: Path
+) -> None:
+    observer = Node(tmp_path)
+    for each, greeting in ((node, Hello(("a",))), (observer, Watch())):
+        for message in (End("enough"), Failed("a", "why"), greeting):
+            each.send(message)
+        each.send(End("enough"))
+        each.send(Failed("a", "why"))
+        heard = [kind for _ in range(2) for kind in kinds(channels)]
+        allowed = ["refused", "failed"] if each is node else ["end", "refused"]
+        assert heard == ["refused", "refused", kind_of(type(greeting)), *allowed]
+    observer.close()
 
 
 def test_the_end_of_a_run_reaches_a_node_to_which_much_is_to_be_sent(
