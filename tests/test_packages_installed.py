@@ -337,8 +337,9 @@ class TestHashes:
             server.shutdown()
             thread.join()
 
-    def install(self, python: Path, hashes: str, index: dict[str, str], tmp_path: Path) -> None:
-        tree = tmp_path / "tree"
+    def install(self, python: Path, hashes: str, index: dict[str, str], tmp_path: Path) -> str:
+        """Install a tree that asks for the package; returns what was shown."""
+        tree, stream = tmp_path / "tree", StringIO()
         (tree / "requirements").mkdir(parents=True)
         for name in ("build", "core", "uv"):
             text = f"neuros-colour==1.0{hashes}\n" if name == "core" else ""
@@ -352,7 +353,8 @@ class TestHashes:
             "def build_editable(target, config_settings=None, metadata_directory=None):\n"
             f"    return pathlib.Path(shutil.copy({str(wheel)!r}, target)).name\n"
         )
-        install(python, tree, [], Progress(StringIO()), index)
+        install(python, tree, [], Progress(stream), index)
+        return stream.getvalue()
 
     def is_installed(self, python: Path) -> bool:
         return bool([*python.parents[1].glob("lib/*/site-packages/neuros_colour.py")])
@@ -365,6 +367,17 @@ class TestHashes:
         self, python: Path, index: dict[str, str], tmp_path: Path
     ) -> None:
         self.install(python, f" --hash=sha256:{self.sha256(tmp_path)}", index, tmp_path)
+        assert self.is_installed(python)
+
+    def test_constraints_of_pip_need_no_hash(
+        self, python: Path, index: dict[str, str], tmp_path: Path
+    ) -> None:
+        """The lock file names each version, so they have nothing to say; uv takes none there."""
+        constraints = tmp_path / "constraints.txt"
+        constraints.write_text("neuros-shape<=2\n", "utf-8")
+        constrained = {**index, "PIP_CONSTRAINT": str(constraints)}
+        hashes = f" --hash=sha256:{self.sha256(tmp_path)}"
+        assert "uv failed" not in self.install(python, hashes, constrained, tmp_path)
         assert self.is_installed(python)
 
     def test_a_file_that_has_changed_since_is_refused(

@@ -190,6 +190,9 @@ class Installer:
             if in_uv is None:
                 self.progress.step("uv does not know all settings that pip has here: using pip")
             else:
+                if any("--require-hashes" in arguments for arguments in calls):
+                    # Lock files name every version, and uv refuses a constraint without a hash.
+                    in_uv.pop("UV_CONSTRAINT", None)
                 command = [str(uv), *_UV_INSTALL, "--python", str(self.python)]
                 output = self._run_each(command, calls, {**self.environ, **in_uv})
                 if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
