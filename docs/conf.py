@@ -47,6 +47,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True  # else the paths of this machine are shown
 autodoc_typehints_format = "short"
+autodoc_use_type_comments = False  # there are none, and looking for them takes half a minute
 napoleon_use_ivar = True
 # The theme makes the whole navigation anew for each of 400 pages; with every function in it, that
 # took four minutes.
