@@ -80,9 +80,9 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     try:
-        from neuros.simulators.convert.find import NotFound, finder, model_file
+        from neuros.simulators.convert.elements import NotFound, finder
         from neuros.simulators.convert.mjcf import is_ours
-        from neuros.simulators.convert.sdf import convert_sdf
+        from neuros.simulators.convert.sdf import convert_sdf, model_file
         from neuros.simulators.convert.urdf import read_urdf
     except ImportError as error:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"

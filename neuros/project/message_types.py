@@ -94,7 +94,7 @@ def unknown_type(
         packages: those that are built for the project.
     """
     package, _, name = type_name.split("/")
-    folder = _message_folder(package)
+    folder = message_folder(package)
     own = packages.messages(package) if folder is None else None
     if own is not None:
         return None if name in own else _no_message(type_name, own)
@@ -119,7 +119,8 @@ def _no_message(type_name: str, names: Collection[str]) -> tuple[str, str]:
     return text, did_you_mean(name, names)
 
 
-def _message_folder(package: str) -> Path | None:
+def message_folder(package: str) -> Path | None:
+    """The folder ``msg`` of an installed message package."""
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):

@@ -13,7 +13,6 @@ of its message types, so that it can be read where they are not installed.
 from __future__ import annotations
 
 import errno
-import importlib.util
 import json
 import os
 import sqlite3
@@ -30,6 +29,7 @@ from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
+from neuros.project.message_types import message_folder
 from neuros.recording.recording_plan import Topic
 
 _CHUNK_BYTES = 1 << 20
@@ -53,7 +53,10 @@ def _define(type_name: str, store: Typestore) -> None:
     """
     if type_name in store.fielddefs:
         return
-    path = _definition_file(type_name)
+    folder = message_folder(type_name.split("/")[0])
+    # The share folder is some folders above.
+    shares = (above / "share" / f"{type_name}.msg" for above in folder.parents) if folder else ()
+    path = next(filter(Path.is_file, shares), None)
     if path is None:
         raise EnvironmentFault(
             f"message type {type_name} cannot be recorded: its definition"
@@ -69,20 +72,6 @@ def _define(type_name: str, store: Typestore) -> None:
         if used != type_name:
             _define(used, store)
     store.register(types)
-
-
-def _definition_file(type_name: str) -> Path | None:
-    """The definition: the share folder is some folders above an installed message package."""
-    try:
-        spec = importlib.util.find_spec(type_name.split("/")[0])
-    except (ImportError, ValueError):
-        spec = None
-    for location in (spec.submodule_search_locations or ()) if spec else ():
-        for folder in Path(location).parents:
-            path = folder / "share" / f"{type_name}.msg"
-            if path.is_file():
-                return path
-    return None
 
 
 def _types_of_fields(fields: object) -> Iterator[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import os
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -248,16 +247,13 @@ KEPT_NAME = "bag.before_repair"
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
     """Whether no other process writes the bag of a run, now and within the block."""
-    descriptor = os.open(run / PLAN_NAME, os.O_RDONLY)
-    try:
+    with open(run / PLAN_NAME, "rb") as plan:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(plan, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_alone = True
         except OSError:
-            yield False
-            return
-        yield True
-    finally:
-        os.close(descriptor)
+            is_alone = False
+        yield is_alone
 
 
 def needs_repair(run: Path, plan: RecordingPlan) -> bool:
@@ -297,8 +293,7 @@ def repair(
         with the_only_recorder(run) as is_alone:
             if not is_alone or _is_fed(run, plan):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
-            is_to_be_rebuilt = needs_repair(run, plan) or _has_damage(run / BAG_NAME)
-            if not is_to_be_rebuilt:
+            if not needs_repair(run, plan) and not _has_damage(run / BAG_NAME):
                 return None
             return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:

@@ -161,13 +161,11 @@ class SpoolReader:
         numbers = self._numbers()
         if not numbers:
             return False
-        descriptor = os.open(self._path(numbers[-1]), os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return True
-        finally:
-            os.close(descriptor)
+        with open(self._path(numbers[-1]), "rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                return True
         return False
 
     def remove_up_to(self, wall_ns: int) -> None:

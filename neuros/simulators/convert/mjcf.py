@@ -19,8 +19,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros.simulators.convert.elements import Element, NotTaken
-from neuros.simulators.convert.find import Finder, NotFound
+from neuros.simulators.convert.elements import Element, Finder, NotFound, NotTaken
 from neuros.simulators.convert.frames import Link, Pose, Vector, from_quaternion
 
 MARK = "made by `neuros convert`"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from neuros.errors import Problem
 from neuros.simulators.convert import joints, links
-from neuros.simulators.convert.elements import Element, Report
-from neuros.simulators.convert.find import Finder, Includer
+from neuros.simulators.convert.elements import DEEPEST, Element, Finder, NotFound, Report, parse
 from neuros.simulators.convert.frames import (
     Branch,
     Joint,
@@ -23,14 +25,9 @@ from neuros.simulators.convert.frames import (
     read_pose,
     read_scope,
 )
-from neuros.simulators.convert.mjcf import (
-    Building,
-    Converted,
-    Meshes,
-    compile_boxed,
-    said_by,
-)
+from neuros.simulators.convert.mjcf import Building, Converted, Meshes, compile_boxed, said_by
 
+_OVERRIDDEN = ("pose", "static", "placement_frame")  # by the children of an <include>
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 _TOLERANCE = 1e-9
 _MOST_LINKS = 1000
@@ -61,6 +58,159 @@ def convert_sdf(file: Path, finder: Finder) -> Converted:
     report.note_unread(includer.roots)
     made = building.meshes.made
     return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
+
+
+class Includer:
+    """Replaces the ``<include>`` elements of a document, and of what it includes, by models."""
+
+    def __init__(self, finder: Finder, report: Report) -> None:
+        self._finder, self._report = finder, report
+        self.roots: list[Element] = []
+
+    def read(self, file: Path, chain: Sequence[Path] = (), depth: int = 0) -> Element | None:
+        """The root of an SDF file with everything in it that it includes; problems are reported."""
+        root = parse(file, self._report)
+        if isinstance(root, Problem):
+            self._report.problems.append(root)
+            return None
+        if root.tag != "sdf":
+            root.problem(f"an SDF file begins with <sdf>, not with <{root.tag}>")
+            return None
+        root.taken = True
+        self.roots.append(root)
+        self._expand(root, (*chain, file), depth)
+        return root
+
+    def _expand(self, owner: Element, chain: Sequence[Path], depth: int) -> None:
+        if depth > DEEPEST:
+            owner.problem(f"more than {DEEPEST} models are nested in each other")
+            return
+        expanded: list[Element] = []
+        for child in owner.children:
+            if child.tag == "include":
+                child.taken = True
+                expanded += self._included(child, owner, chain, depth)
+            else:
+                if child.tag in ("world", "model"):
+                    self._expand(child, chain, depth + 1)
+                expanded.append(child)
+        owner.children = expanded
+
+    def _included(
+        self, include: Element, owner: Element, chain: Sequence[Path], depth: int
+    ) -> list[Element]:
+        model = self._model(include, chain, depth)
+        if model is None:
+            return []
+        if named := include.text_of("name"):
+            model.attributes["name"] = named
+        for tag in _OVERRIDDEN:
+            own = include.child(tag)
+            if own is not None:
+                own.parent = model
+                model.children = [*(c for c in model.children if c.tag != tag), own]
+        for child in include.children:
+            if child.tag == "plugin" or ":" in child.tag:
+                child.note("an addition to the included model for Gazebo")
+        if include.has("merge"):
+            return _merged(model, owner)
+        model.parent = owner
+        return [model]
+
+    def _model(self, include: Element, chain: Sequence[Path], depth: int) -> Element | None:
+        uri = include.child("uri")
+        if uri is None or not uri.text:
+            include.problem("<uri> is missing: which model is to be included?")
+            return None
+        try:
+            file = model_file(self._finder.find(uri.text, include.file.parent))
+        except NotFound as error:
+            uri.problem(str(error), error.hint)
+            return None
+        if file in chain:
+            circle = " -> ".join(link.name for link in (*chain[chain.index(file) :], file))
+            uri.problem(f"the file includes itself: {circle}")
+            return None
+        root = self.read(file, chain, depth)
+        if root is None:
+            return None
+        models = root.each("model")
+        if not models:
+            uri.problem(f"{file} holds no <model>")
+            return None
+        models[0].attributes.setdefault("_version", root.attributes.get("version", ""))
+        return models[0]
+
+
+def model_file(path: Path) -> Path:
+    """The SDF file behind a URI: itself, or the newest that ``model.config`` of a folder names.
+
+    Raises :class:`NotFound`.
+    """
+    if not os.path.isdir(path):
+        return path
+    config = path / "model.config"
+    if config.is_file():
+        root = parse(config, Report())
+        if isinstance(root, Problem):
+            raise NotFound(str(root))
+        named = [element for element in root.each("sdf") if element.text]
+        if named:
+            newest = max(named, key=lambda element: _version(element.attributes.get("version", "")))
+            file = path / newest.text
+            if not os.path.isfile(file):
+                raise NotFound(f"{newest.place} names '{newest.text}', which does not exist")
+            return file
+    file = path / "model.sdf"
+    if file.is_file():
+        return file
+    raise NotFound(f"the folder '{path}' has neither a model.config nor a model.sdf")
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(int(part) if part.isdecimal() else 0 for part in text[:20].split("."))
+
+
+def _merged(model: Element, owner: Element) -> list[Element]:
+    """The content of a model as if it stood in ``owner`` itself (``merge="true"``).
+
+    A frame stands for the model's own: all that was relative to that is relative to it now.
+    """
+    proxy = f"_merged__{model.name}__model__"
+    frame = model.made("frame", name=proxy)
+    frame.parent = owner
+    placement = model.child("placement_frame")
+    if placement is not None:
+        placement.note("not used in a merged include")
+    frame.children = model.each("pose")
+    for pose in frame.children:
+        pose.parent = frame
+    for child in model.children:
+        child.parent = owner
+        if child.tag in ("link", "model", "frame"):
+            _rebase(child, proxy)
+        elif child.tag == "joint":
+            for end in child.children:
+                if end.tag in ("parent", "child") and end.text == "__model__":
+                    end.text = proxy
+    for tag in ("static", "self_collide"):
+        for element in model.each(tag):
+            element.note("not used in a merged include: the model around it decides")
+    left_out = {"pose", "placement_frame", "static", "self_collide"}
+    return [frame, *(child for child in model.children if child.tag not in left_out)]
+
+
+def _rebase(element: Element, proxy: str) -> None:
+    if element.tag == "frame" and element.attributes.get("attached_to") in (None, "", "__model__"):
+        element.attributes["attached_to"] = proxy
+    pose = next((child for child in element.children if child.tag == "pose"), None)
+    if pose is None:
+        pose = element.made("pose")
+        pose.parent = element
+        element.children.append(pose)
+    if pose.attributes.get("relative_to") in (None, "", "__model__"):
+        default = element.attributes.get("attached_to", proxy)
+        pose.attributes["relative_to"] = default if element.tag == "frame" else proxy
 
 
 def _read(root: Element) -> Scope:

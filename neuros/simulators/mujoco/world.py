@@ -13,7 +13,7 @@ import numpy as np
 
 from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext, Packet
-from neuros.simulators.convert.find import Finder, NotFound, finder
+from neuros.simulators.convert.elements import Finder, NotFound, finder
 from neuros.simulators.convert.sdf import convert_sdf
 from neuros.simulators.convert.urdf import read_urdf
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl

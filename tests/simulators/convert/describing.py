@@ -9,7 +9,7 @@ import mujoco
 import pytest
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.sdf import Converted, convert_sdf
 
 BOX = "<geometry><box><size>1 2 3</size></box></geometry>"

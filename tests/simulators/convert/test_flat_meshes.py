@@ -11,7 +11,7 @@ from describing import CUBE, Folder, link, positions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.frames import from_rpy
 from neuros.simulators.convert.mjcf import _convex_hull, write_mjcf
 from neuros.simulators.convert.urdf import read_urdf

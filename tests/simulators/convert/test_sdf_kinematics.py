@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from kinematics import DrawnModel, models, moved
 
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.sdf import convert_sdf
 
 many = settings(

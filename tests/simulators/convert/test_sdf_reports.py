@@ -8,7 +8,7 @@ import pytest
 from describing import Folder, joint, link
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.sdf import convert_sdf
 
 

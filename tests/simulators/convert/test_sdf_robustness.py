@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from neuros.errors import DescriptionError, Problem
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.sdf import convert_sdf
 
 HERE = Path(__file__).resolve().parent

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.sdf import convert_sdf
 
 HERE = Path(__file__).resolve().parent

@@ -11,7 +11,7 @@ import pytest
 from describing import CUBE, Folder
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.find import Finder
+from neuros.simulators.convert.elements import Finder
 from neuros.simulators.convert.urdf import read_urdf
 
 MOMENTS = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
