@@ -41,8 +41,13 @@ def digest_for(kind: type) -> Digest:
     """The digest function of a message class."""
     buffers = message_buffers(kind)
     if buffers is None:
-        return lambda packet, data: digest_of_bytes(data)
+        return digest_of_data
     return _LargeDigest(kind, buffers)
+
+
+def digest_of_data(packet: Any, data: bytes) -> int:
+    """The digest of a packet that is whole in its bytes; of a JPEG, both ends have only those."""
+    return digest_of_bytes(data)
 
 
 def digest_of(packet: Any) -> int:

@@ -19,7 +19,6 @@ from sensor_msgs.msg import CompressedImage, Image
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.compression import Traffic
-from neuros.transport.digests import digest_of_bytes
 from neuros.transport.values import checker
 
 # By encoding (sensor_msgs/image_encodings.hpp): Pillow's mode of the image, and of its rows.
@@ -97,11 +96,6 @@ class JpegCodec:
             step=len(pixels) // height,
             data=array("B", pixels),
         )
-
-
-def jpeg_digest(packet: Any, data: bytes) -> int:
-    """The digest on these connections: that of the encoded image, which both ends have."""
-    return digest_of_bytes(data)
 
 
 @cache

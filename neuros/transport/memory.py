@@ -142,7 +142,8 @@ class MemoryTransport:
 
     def _sender_with_jpeg(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
         from neuros.transport.compression import Traffic
-        from neuros.transport.jpeg import JpegCodec, jpeg_digest
+        from neuros.transport.digests import digest_of_bytes
+        from neuros.transport.jpeg import JpegCodec
 
         encoded = [c for c in connections if c.is_jpeg]
         links = [(self._hub.link(c), JpegCodec(c.quality, Traffic())) for c in encoded]
@@ -156,7 +157,7 @@ class MemoryTransport:
             for link, codec in links:
                 data, digest = codec.encode(packet), None
                 if link.connection in self.digests and self._digest is not None:
-                    digest = jpeg_digest(packet, data)
+                    digest = digest_of_bytes(data)
                     link.sent.append(digest)
                 link.send(codec.decode(data), digest)
             if bridge.heard:

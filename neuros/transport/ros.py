@@ -32,7 +32,7 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
 from neuros.transport.compression import Compressor, Traffic, compressing, decompressing
-from neuros.transport.digests import Digest, digest_for, make_digests
+from neuros.transport.digests import Digest, digest_for, digest_of_data, make_digests
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
 from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos, is_compatible
@@ -103,7 +103,7 @@ def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Co
     if connection.is_jpeg:
         from neuros.transport import jpeg  # brings all messages of cameras along
 
-        return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), jpeg.jpeg_digest
+        return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), digest_of_data
     kind = message_class(port.type)
     return kind, message_codec(kind), digest_for(kind)
 
