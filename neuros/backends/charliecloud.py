@@ -17,7 +17,7 @@ from typing import Any
 
 from neuros.backends.containers import bare_name
 from neuros.backends.node_command import NodeProcess, node_process
-from neuros.backends.process_launchers import ProcessLauncher
+from neuros.backends.process_launchers import ProcessDeployment, ProcessLauncher
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
@@ -63,7 +63,7 @@ class Charliecloud(BackEnd):
         if missing:
             raise EnvironmentFault("\n".join(missing))
         _try_image(next(iter(images.values())))
-        return _Images(images, nodes)
+        return _Images(nodes, images)
 
     def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
         (option,) = self.options
@@ -89,42 +89,25 @@ class Charliecloud(BackEnd):
 BACK_END = Charliecloud()
 
 
-class _Images(Deployment):
-    """Images for nodes. They keep to no limits."""
+class _Images(ProcessDeployment):
+    """Images for nodes: a process per node, with ``ch-run`` before its command."""
 
-    def __init__(self, images: Mapping[str, Path], nodes: Sequence[Node]) -> None:
+    def __init__(self, nodes: Sequence[Node], images: Mapping[str, Path]) -> None:
+        super().__init__(nodes)
         self._images = images
-        limited = [node.name for node in nodes if any(vars(node.resources).values())]
-        if limited:
-            text = f"resources of {', '.join(limited)}: only --backend docker keeps to them"
-            self.notices = [("INFO", text)]
 
     def launcher(self, program: NodeProgram) -> Launcher:
-        return _ImageLauncher(program, self._images)
+        return ProcessLauncher(program, self._process_of)
+
+    def _process_of(
+        self, program: NodeProgram, node: NodeFile, environment: Mapping[str, str]
+    ) -> NodeProcess:
+        program = replace(program, pythons={node.node.name: _PYTHON})
+        process = node_process(program, node, environment)
+        return _inside(process, node, self._images[node.node.container])
 
     def record(self) -> Mapping[str, Any]:
         return {"charliecloud": {name: str(path) for name, path in self._images.items()}}
-
-
-class _ImageLauncher(ProcessLauncher):
-    """Starts a process per node, with ``ch-run`` before its command."""
-
-    def __init__(self, program: NodeProgram, images: Mapping[str, Path]) -> None:
-        super().__init__(program)
-        self._images = images
-
-    def _processes(
-        self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
-    ) -> Sequence[NodeProcess]:
-        pythons = {node.node.name: _PYTHON for node in nodes}
-        program = replace(self._program, pythons=pythons)
-        return [
-            _inside(node_process(program, node, environment), node, self._image_of(node))
-            for node in nodes
-        ]
-
-    def _image_of(self, node: NodeFile) -> Path:
-        return self._images[node.node.container]
 
 
 def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:

@@ -229,7 +229,7 @@ class _Painter:
     def paint(self, name: str, line: bytes) -> str:
         text = clean(line.decode("utf-8", "backslashreplace"), keep_colours=bool(self._palette))
         record = _RECORD.search(text) if "] [" in text else None
-        if record is None or _without_colours(text[: record.start()]):
+        if record is None or _ESCAPE.sub("", text[: record.start()]):
             return self._coloured(name, f"[{name}] {text}")
         # A process may write records of any of its nodes.
         owner = record["name"] if record["name"] in self._palette else name
@@ -258,10 +258,6 @@ def clean(text: str, *, keep_colours: bool) -> str:
         lambda match: match[0] if keep_colours and match["sgr"] is not None else "", text
     )
     return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
-
-
-def _without_colours(text: str) -> str:
-    return _ESCAPE.sub("", text)
 
 
 class NonBlockingWriter:

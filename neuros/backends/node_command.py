@@ -152,6 +152,14 @@ def log_file(node: NodeFile) -> Path:
     return node_folder(node) / "node.log"
 
 
+def moved(path: Path, places: Sequence[tuple[Path, Path]]) -> Path:
+    """A path in one of the first folders as one in the second; the innermost counts."""
+    for here, there in sorted(places, key=lambda pair: -len(pair[0].parts)):
+        if path.is_relative_to(here):
+            return there / path.relative_to(here)
+    return path
+
+
 def node_environment(node: NodeFile) -> dict[str, str]:
     """Environment variables of one node only."""
     return {**node.node.environment, "NEUROS_RUN_DIR": str(node_folder(node))}

@@ -10,9 +10,9 @@ import contextlib
 import os
 import signal
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.backends.node_command import (
     PROCESS_LOG,
@@ -38,7 +38,7 @@ class Processes(BackEnd):
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
-        return _Processes(nodes)
+        return ProcessDeployment(nodes)
 
 
 class OneProcess(BackEnd):
@@ -55,11 +55,13 @@ class OneProcess(BackEnd):
         return _OneProcess(nodes)
 
 
+ProcessOf: TypeAlias = "Callable[[NodeProgram, NodeFile, Mapping[str, str]], NodeProcess]"
+
 PROCESS = Processes()
 IN_PROCESS = OneProcess()
 
 
-class _Processes(Deployment):
+class ProcessDeployment(Deployment):
     """Processes of this machine, which keep to no limits."""
 
     def __init__(self, nodes: Sequence[Node]) -> None:
@@ -72,7 +74,7 @@ class _Processes(Deployment):
         return ProcessLauncher(program)
 
 
-class _OneProcess(_Processes):
+class _OneProcess(ProcessDeployment):
     def launcher(self, program: NodeProgram) -> Launcher:
         return InProcessLauncher(program)
 
@@ -81,10 +83,15 @@ class _OneProcess(_Processes):
 
 
 class ProcessLauncher:
-    """Starts one node process per node (:class:`neuros.ports.Launcher`)."""
+    """Starts one node process per node (:class:`neuros.ports.Launcher`).
 
-    def __init__(self, program: NodeProgram) -> None:
+    Args:
+        process_of: what to start for a node, with the environment of the run.
+    """
+
+    def __init__(self, program: NodeProgram, process_of: ProcessOf = node_process) -> None:
         self._program = program
+        self._process_of = process_of
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
@@ -108,7 +115,7 @@ class ProcessLauncher:
     def _processes(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[NodeProcess]:
-        return [node_process(self._program, node, environment) for node in nodes]
+        return [self._process_of(self._program, node, environment) for node in nodes]
 
 
 class InProcessLauncher(ProcessLauncher):
@@ -125,11 +132,17 @@ class InProcessLauncher(ProcessLauncher):
 
 
 class RunningProcess:
-    """A node process that was started, and the nodes in it (:class:`neuros.ports.RunningNode`)."""
+    """A node process that was started, and the nodes in it (:class:`neuros.ports.RunningNode`).
+
+    Attributes:
+        pid: its process id, which is also that of its process group and session.
+    """
+
+    is_abandoned = False
 
     def __init__(self, process: NodeProcess) -> None:
         """Start it; raises ``EnvironmentFault`` if that is impossible."""
-        self._names = process.names
+        self.names = process.names
         self._log = process.log
         try:
             process.log.parent.mkdir(parents=True, exist_ok=True)
@@ -144,28 +157,18 @@ class RunningProcess:
                     start_new_session=True,
                 )
         except OSError as error:
-            nodes = ", ".join(self._names)
+            nodes = ", ".join(self.names)
             raise EnvironmentFault(f"cannot start the process of {nodes}: {error}") from error
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self._names
-
-    @property
-    def pid(self) -> int:
-        """Its process id, which is also that of its process group and session."""
-        return self._process.pid
+        self.pid = self._process.pid
 
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended, in words."""
         code = self._process.poll()
         if code is None:
             return None
-        return (script_failure(self._log) if code == 1 else None) or _in_words(code)
-
-    @property
-    def is_abandoned(self) -> bool:
-        return False
+        if code < 0:
+            return signal_in_words(-code)
+        return (script_failure(self._log) if code == 1 else None) or f"exit code {code}"
 
     def wait(self, timeout_s: float) -> str | None:
         """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
@@ -181,7 +184,7 @@ class RunningProcess:
         # Once it has been reaped, its number may be another's.
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+                os.killpg(self.pid, signal.SIGKILL)
 
 
 def end_now(processes: Sequence[RunningProcess]) -> None:
@@ -190,7 +193,3 @@ def end_now(processes: Sequence[RunningProcess]) -> None:
         process.kill()
     for process in processes:
         process.wait(5.0)
-
-
-def _in_words(code: int) -> str:
-    return f"exit code {code}" if code >= 0 else signal_in_words(-code)

@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from neuros.backends.run_processes import RunProcesses
@@ -104,8 +104,16 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
         processes = RunProcesses(run_id)
         for pid in orders.sessions:
             processes.add_session(pid)
-    _end_all(processes, orders.grace_s, lambda: _resume(run_id, orders))
-    _remove_leftovers(run_id, orders)
+
+    def resume() -> None:
+        for cleaner, argument in _cleaners(orders):
+            cleaner.resume(argument, run_id)
+
+    _end_all(processes, orders.grace_s, resume)
+    # What a killed launcher had asked for may still be on its way.
+    settle_s = 0.0 if orders.is_finished else _SETTLE_S
+    for cleaner, argument in _cleaners(orders):
+        cleaner.remove(argument, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
 
     from pathlib import Path
 
@@ -131,7 +139,9 @@ def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]
     resume_at = [now, kill_at]
     while (alive := processes.alive()) and time.monotonic() < give_up_at:
         if time.monotonic() >= kill_at:
-            _kill(alive)
+            for pid in alive:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
             pause_s = _POLL_S / 5
         if resume_at and time.monotonic() >= resume_at[0]:
             del resume_at[0]
@@ -149,24 +159,6 @@ def _cleaners(orders: Orders) -> list[tuple[Any, str]]:
         with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
             found.append((importlib.import_module(module), argument))
     return found
-
-
-def _resume(run_id: str, orders: Orders) -> None:
-    for cleaner, argument in _cleaners(orders):
-        cleaner.resume(argument, run_id)
-
-
-def _remove_leftovers(run_id: str, orders: Orders) -> None:
-    """What a killed launcher had asked for may still be on its way."""
-    settle_s = 0.0 if orders.is_finished else _SETTLE_S
-    for cleaner, argument in _cleaners(orders):
-        cleaner.remove(argument, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
-
-
-def _kill(processes: Mapping[int, int]) -> None:
-    for pid in processes:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.kill(pid, signal.SIGKILL)
 
 
 def _remove(paths: Iterable[str]) -> None:

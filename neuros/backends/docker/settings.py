@@ -22,6 +22,7 @@ from neuros.backends.node_command import (
     THREAD_VARIABLES,
     Cores,
     log_file,
+    moved,
     node_environment,
     node_folder,
     start_arguments,
@@ -328,9 +329,9 @@ def outside(file: NodeFile, folders: Folders, messages: Path = MESSAGES) -> Node
     pairs = [*there, (MESSAGES, messages)]
     return replace(
         file,
-        node=translated(file.node, lambda path: _moved(path, pairs)),
+        node=translated(file.node, lambda path: moved(path, pairs)),
         folders=folders,
-        messages=tuple(_moved(path, pairs) for path in file.messages),
+        messages=tuple(moved(path, pairs) for path in file.messages),
     )
 
 
@@ -345,12 +346,4 @@ def _inside(path: Path, file: NodeFile) -> Path:
     here = file.folders
     mounted = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
     mounted += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
-    return _moved(path, mounted)
-
-
-def _moved(path: Path, places: Sequence[tuple[Path, Path]]) -> Path:
-    """A path in one of the first folders as one in the second; the innermost counts."""
-    for here, there in sorted(places, key=lambda pair: -len(pair[0].parts)):
-        if path.is_relative_to(here):
-            return there / path.relative_to(here)
-    return path
+    return moved(path, mounted)

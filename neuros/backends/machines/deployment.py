@@ -12,12 +12,13 @@ import re
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import connect
 from neuros.backends.machines.machine import Log, Machine, agent_command, ssh_command
+from neuros.backends.node_command import moved
 from neuros.control import CONTROL_VARIABLE
 from neuros.control.machines import Finished, Ready, Start
 from neuros.distribution import WORKSPACE
@@ -195,14 +196,7 @@ class Machines(Deployment):
                 if _package(python) in built
             ),
         ]
-
-        def move(path: Path) -> Path:
-            for here, moved in sorted(pairs, key=lambda pair: -len(pair[0].parts)):
-                if path.is_relative_to(here):
-                    return moved / path.relative_to(here)
-            return path
-
-        node = translated(file.node, move)
+        node = translated(file.node, lambda path: moved(path, pairs))
         return replace(file, node=node, folders=there, messages=side.messages)
 
     def _sides_of(self, host: Host, log: Log, held: list[Machine | RemoteEngine]) -> Sequence[Side]:
@@ -332,10 +326,10 @@ class NodeElsewhere:
 
     side: Side
     name: str
-    names: tuple[str, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.names = (self.name,)
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name,)
 
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended, in words."""
