@@ -143,16 +143,12 @@ def add_build_options(parser: argparse.ArgumentParser) -> None:
 
 def _build_images(options: argparse.Namespace) -> int:
     from neuros.backends.docker.builders import served, surroundings
-    from neuros.backends.docker.building import ImageBuilder, Wishes
+    from neuros.backends.docker.building import ImageBuilder
     from neuros.backends.docker.engine import connect
     from neuros.installation.progress import Progress
 
-    wishes = Wishes(
-        logs=cache_root(os.environ) / "builds",
-        bases=dict(_pair(text, "neuros_python") for text in options.base_image),
-        arguments=dict(_pair(text, None) for text in options.build_arg),
-        pull=options.pull,
-    )
+    bases = dict(_pair(text, "neuros_python") for text in options.base_image)
+    arguments = dict(_pair(text, None) for text in options.build_arg)
     recipes, images = _wanted(options.names or STANDARD)
     wheelhouse = _file_or_folder(options.wheelhouse, "--wheelhouse", is_folder=True)
     bundle = _file_or_folder(options.ca_bundle, "--ca-bundle", is_folder=False)
@@ -167,7 +163,10 @@ def _build_images(options: argparse.Namespace) -> int:
         engine = stack.enter_context(closing(connection))
         wheels = stack.enter_context(served(wheelhouse)) if wheelhouse else ""
         around = surroundings(engine, os.environ, bundle, wheels)
-        builder = ImageBuilder(engine, around, wishes, Progress(sys.stdout))
+        progress, logs = Progress(sys.stdout), cache_root(os.environ) / "builds"
+        builder = ImageBuilder(
+            engine, around, progress, logs, bases=bases, arguments=arguments, pull=options.pull
+        )
         builder.build(recipes)
         for image in images:
             builder.add_to(image)

@@ -148,7 +148,9 @@ class Channels:
         """
         if link not in self._unsent:
             return
-        may_be_left_out = link not in self._nodes or isinstance(message, Look | Deliver)
+        may_be_left_out = link not in self._nodes or isinstance(
+            message, control.Look | control.Deliver
+        )
         if may_be_left_out and len(self._unsent[link]) >= _MOST_UNSENT_BYTES:
             return
         self._unsent[link] += encode(message)
@@ -208,7 +210,7 @@ class Channels:
         now_s = time.monotonic()
         while len(self._others) < _MOST_OTHERS and (stream := self._listener.accept()) is not None:
             stream.setblocking(False)
-            link = ControlLink(stream, (Hello, Watch), STRANGER)
+            link = ControlLink(stream, (control.Hello, control.Watch), STRANGER)
             self._unsent[link] = bytearray()
             self._others[link] = now_s
             self._strangers.add(link)
@@ -232,13 +234,13 @@ class Channels:
         except ControlError as error:
             return error
         self._strangers.discard(link)
-        if isinstance(message, Hello):
+        if isinstance(message, control.Hello):
             self._others.pop(link, None)
             self._nodes[link] = tuple(message.nodes)
-            link.accept(FROM_NODES)
+            link.accept(control.FROM_NODES)
             link.peer = f"the process of {' and '.join(message.nodes)}"
-        elif isinstance(message, Watch):
-            link.accept(FROM_OBSERVERS)
+        elif isinstance(message, control.Watch):
+            link.accept(control.FROM_OBSERVERS)
             link.peer = "an observer"
         return message
 
@@ -279,13 +281,13 @@ class PauseState:
         """Let no hook start."""
         if self.since_s is None:
             self.since_s = self.clock()
-            self.send(Pause())
+            self.send(control.Pause())
 
     def end(self) -> None:
         """Let the run go on."""
         if self.since_s is not None:
             self.forget()
-            self.send(Resume())
+            self.send(control.Resume())
 
     def forget(self) -> None:
         """The pause is over without a request: nodes that drain go on by themselves."""
@@ -294,7 +296,7 @@ class PauseState:
     def step(self, count: int, *, is_driven: bool) -> None:
         """Let a paused run do so many steps."""
         if self.since_s is not None and count > 0:
-            self.send(Step(count, is_driven))
+            self.send(control.Step(count, is_driven))
 
 
 @dataclass
@@ -312,39 +314,41 @@ class Observers:
     _end: Callable[[str], None]
     _links: dict[int, ControlLink] = field(default_factory=dict)  # numbers are not given out again
     _count: int = 0
-    _told: PhaseChanged | None = None
+    _told: control.PhaseChanged | None = None
     _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
     def take(self, link: ControlLink, message: Message) -> None:
         """Take a message from or for an observer."""
         match message:
-            case Watch() if link not in self._links.values():
+            case control.Watch() if link not in self._links.values():
                 self._count += 1
                 self._links[self._count] = link
                 self._told = None
-            case LookAll(wanted):
+            case control.LookAll(wanted):
                 for number, each in self._links.items():
                     if each is link:
                         self._asked[number] = wanted
-            case NodeStatus(asker=asker):
+            case control.NodeStatus(asker=asker):
                 if asker in self._links:
                     self._channels.send_to(self._links[asker], message)
-            case Pause():
+            case control.Pause():
                 self._pause.begin()
-            case Resume():
+            case control.Resume():
                 self._pause.end()
-            case Reset():
+            case control.Reset():
                 if self._channels.process_count == 1:
                     self._channels.send(message)
                 else:
-                    self._channels.send_to(link, WasReset("its nodes are in several processes"))
-            case WasReset():
+                    self._channels.send_to(
+                        link, control.WasReset("its nodes are in several processes")
+                    )
+            case control.WasReset():
                 self.tell(message)
-            case Deliver(node=node):
+            case control.Deliver(node=node):
                 self._channels.send_to_node(node, message)
-            case StepAll(count):
+            case control.StepAll(count):
                 self._pause.step(count, is_driven=self._is_driven())
-            case End(reason):
+            case control.End(reason):
                 self._end(reason)
 
     def tell(self, message: Message) -> None:
@@ -358,7 +362,7 @@ class Observers:
         One that has asked several times since is answered once.
         """
         for number, wanted in self._asked.items():
-            self._channels.send(Look(wanted, number))
+            self._channels.send(control.Look(wanted, number))
         self._asked.clear()
         if phase is not Phase.RUNNING and self._pause.is_on:
             self._pause.forget()
@@ -367,7 +371,7 @@ class Observers:
         self._links = {n: link for n, link in self._links.items() if self._channels.has(link)}
         if not self._links:
             self._pause.end()
-        now = PhaseChanged(phase.value, self._pause.is_on)
+        now = control.PhaseChanged(phase.value, self._pause.is_on)
         if now != self._told:
             self._told = now
             self.tell(now)
@@ -375,7 +379,7 @@ class Observers:
     def part(self, outcome: Outcome) -> None:
         """Tell them how the run has ended."""
         self.tell(
-            Ended(
+            control.Ended(
                 outcome.exit_code,
                 outcome.reason,
                 outcome.reports,
@@ -395,7 +399,7 @@ class Overheard:
 
     def log(self, severity: str, text: str) -> None:
         self._output.log(severity, text)
-        self._tell(LogRecord(severity, text))
+        self._tell(control.LogRecord(severity, text))
 
     def poll(self) -> object:
         return self._output.poll()
@@ -430,12 +434,12 @@ class Settling:
         self._channels = channels
         self._clock = clock
         self._asker: ControlLink | None = None
-        self._asked = Settle(0, {})
+        self._asked = control.Settle(0, {})
         self._round = 0
         self._pause_s = 0.0
         self._due_s: float | None = None
-        self._answers: dict[tuple[str, ...], AtRest] = {}
-        self._packets: dict[str, NewestPacket] = {}
+        self._answers: dict[tuple[str, ...], control.AtRest] = {}
+        self._packets: dict[str, control.NewestPacket] = {}
         self._last: tuple[Counts, Counts] | None = None
         self._last_s = 0.0
 
@@ -444,14 +448,14 @@ class Settling:
         """Seconds until :meth:`look` has something to do."""
         return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
 
-    def ask(self, asker: ControlLink, message: Settle) -> None:
+    def ask(self, asker: ControlLink, message: control.Settle) -> None:
         """Find out from now on, and answer this one; what was asked before is answered no more."""
         self._asker, self._asked = asker, message
         self._packets.clear()
         self._pause_s, self._last = 0.0, None
         self._begin_round()
 
-    def take(self, answer: AtRest) -> None:
+    def take(self, answer: control.AtRest) -> None:
         """Take an answer of a process, perhaps to the last round."""
         if answer.number != self._round or self._asker is None:
             return
@@ -473,7 +477,7 @@ class Settling:
         self._round += 1
         self._answers.clear()
         known = {name: packet.number for name, packet in self._packets.items()}
-        self._channels.send(Settle(self._round, {**self._asked.known, **known}))
+        self._channels.send(control.Settle(self._round, {**self._asked.known, **known}))
 
     def _ask_later(self) -> None:
         self._pause_s = min(max(2 * self._pause_s, _FIRST_LOOK_S), _RAREST_LOOK_S)
@@ -499,9 +503,11 @@ class Settling:
 
     def _answer(self, asker: ControlLink) -> None:
         self._asker = None
-        self._channels.send(Pause())  # takes back what hooks could not use of a step
+        self._channels.send(control.Pause())  # takes back what hooks could not use of a step
         times = {n: t for answer in self._answers.values() for n, t in answer.sim_times.items()}
-        self._channels.send_to(asker, Settled(self._asked.number, times, dict(self._packets)))
+        self._channels.send_to(
+            asker, control.Settled(self._asked.number, times, dict(self._packets))
+        )
 
 
 def _joined(parts: Iterable[Counts]) -> Counts:

@@ -12,7 +12,6 @@ import io
 import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -60,31 +59,29 @@ _FROM = "neuros.image.from"
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """Options of the user for the builds.
+class ImageBuilder:
+    """Builds images, with a line about each.
 
-    Attributes:
+    Args:
         logs: the folder for what the engine says.
         bases: base images by container name, in place of those in the Dockerfiles.
         arguments: build arguments for the Dockerfiles that declare them.
         pull: whether the newest version of base images is asked for.
     """
 
-    logs: Path
-    bases: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
-    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
-    pull: bool = False
-
-
-class ImageBuilder:
-    """Builds images, with a line about each."""
-
     def __init__(
-        self, engine: DockerClient, around: Surroundings, wishes: Wishes, progress: Progress
+        self,
+        engine: DockerClient,
+        around: Surroundings,
+        progress: Progress,
+        logs: Path,
+        *,
+        bases: Mapping[str, str],
+        arguments: Mapping[str, str],
+        pull: bool,
     ) -> None:
-        self._engine, self._around = engine, around
-        self._wishes, self._progress = wishes, progress
+        self._engine, self._around, self._progress = engine, around, progress
+        self._logs, self._bases, self._arguments, self._pull = logs, bases, arguments, pull
 
     def build(self, recipes: Iterable[Recipe]) -> None:
         """Build what is missing or out of date of these and of what they begin from.
@@ -95,9 +92,9 @@ class ImageBuilder:
         """
         recipes = list(recipes)
         with engine_faults("images cannot be built"):
-            bases = self._remembered_bases(recipes) | dict(self._wishes.bases)
+            bases = self._remembered_bases(recipes) | dict(self._bases)
         wanted = in_order(recipes, bases)
-        _require_use(self._wishes.bases, wanted)
+        _require_use(self._bases, wanted)
         for recipe in wanted:
             with engine_faults(f"image '{recipe.name}' cannot be built"):
                 self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
@@ -127,7 +124,7 @@ class ImageBuilder:
             self._report(f"{name}: built {added_tag(image)}, with what nodes need", started_s)
 
     def _steps(self, name: str) -> BuildSteps:
-        log = self._wishes.logs / f"{name.replace('/', '_')}.log"
+        log = self._logs / f"{name.replace('/', '_')}.log"
         return BuildSteps(self._engine, self._around, self._progress, name, log)
 
     def _remembered_bases(self, recipes: Iterable[Recipe]) -> dict[str, str]:
@@ -143,16 +140,16 @@ class ImageBuilder:
         started_s = time.monotonic()
         old = built_image(recipe, self._engine)
         labels = self._labels(recipe, base, old)
-        if self._wishes.pull and not base:
+        if self._pull and not base:
             self._pull_bases(recipe)
         begin = {
             parent.name: built_image(parent, self._engine).id  # type: ignore[union-attr]
             for parent in recipe.parents_on(base or None)
         }
         if base and base not in begin:
-            begin[base] = str(pulled(self._engine, base, newest=self._wishes.pull).id)
+            begin[base] = str(pulled(self._engine, base, newest=self._pull).id)
         labels[_FROM] = json.dumps(begin, sort_keys=True)
-        if old is not None and not self._wishes.pull and _is_as_wanted(old, labels):
+        if old is not None and not self._pull and _is_as_wanted(old, labels):
             self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
             return
         steps = self._steps(recipe.name)
@@ -169,7 +166,7 @@ class ImageBuilder:
         """Labels that the image is to have; arguments of last time count again."""
         wanted = old.labels if old is not None else {}
         known = arguments_of(recipe.dockerfile)
-        given = {key: value for key, value in self._wishes.arguments.items() if key in known}
+        given = {key: value for key, value in self._arguments.items() if key in known}
         arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | given
         return {
             CONTAINER: recipe.name,

@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import requests
@@ -179,7 +178,7 @@ class RemoteEngine:
             found = engine.images.get(image.id)
             size = memory_text(int(found.attrs["Size"]))
             log("INFO", f"{self.host.name} gets the image {image.name} ({size}), once")
-            self._engine.images.load(_Stream(found.save(named=True)))
+            self._engine.images.load(found.save(named=True))
 
     def _remove_never_started(self) -> None:
         """Containers whose launcher was killed between two requests."""
@@ -267,22 +266,6 @@ class AgentContainer:
 def _end(process: subprocess.Popen[str]) -> None:
     process.kill()
     process.communicate()
-
-
-class _Stream(io.RawIOBase):
-    """What the engine of this machine sends, to be read by the other one."""
-
-    def __init__(self, parts: Any) -> None:
-        self._parts, self._rest = iter(parts), b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        self._rest = self._rest or next(self._parts, b"")
-        taken = self._rest[: len(buffer)]
-        buffer[: len(taken)], self._rest = taken, self._rest[len(taken) :]
-        return len(taken)
 
 
 def _for_all(entry: tarfile.TarInfo) -> tarfile.TarInfo | None:

@@ -13,42 +13,18 @@ import shlex
 import subprocess
 import threading
 import time
-from array import array
 from base64 import b64encode
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import neuros.control.machines as agent
 from neuros.backends.machines.files import scan, write_chunk
 from neuros.backends.machines.pump import Pump
 from neuros.backends.node_command import without_mark
 from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
-from neuros.control.machines import (
-    FROM_AGENT,
-    Chunk,
-    Content,
-    Examine,
-    Examined,
-    Finish,
-    Finished,
-    Lacking,
-    NodeEnded,
-    Place,
-    Placed,
-    Pong,
-    Prepare,
-    Prepared,
-    Ready,
-    Refused,
-    Remark,
-    SignalNode,
-    Start,
-    Started,
-    Took,
-)
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
 from neuros.ports import ControlStream
@@ -115,7 +91,7 @@ class Machine:
         self._pump = Pump(
             os.dup(self._process.stdout.fileno()),
             os.dup(self._process.stdin.fileno()),
-            FROM_AGENT,
+            agent.FROM_AGENT,
             host.name,
             self._take,
             self._lose,
@@ -129,13 +105,13 @@ class Machine:
 
     # ------------------------------------------------------------------ before the run
 
-    def greet(self) -> Ready:
+    def greet(self) -> agent.Ready:
         """Wait until the agent is up.
 
         Raises:
             EnvironmentFault: if it does not come up, or is of another version.
         """
-        ready = self._await(Ready, _CONNECT_S)
+        ready = self._await(agent.Ready, _CONNECT_S)
         if ready.version != __version__:
             raise self._failed(
                 f"NeuROS {ready.version} is installed there, but {__version__} here: install the"
@@ -152,8 +128,8 @@ class Machine:
         """
         trees = {"project": (scan(project.name or "project", project), project)}
         trees["workspace"] = (scan("workspace", WORKSPACE), WORKSPACE)
-        self._pump.send(Place(trees["project"][0], trees["workspace"][0], self._timeout_s))
-        lacking = self._await(Lacking).digests
+        self._pump.send(agent.Place(trees["project"][0], trees["workspace"][0], self._timeout_s))
+        lacking = self._await(agent.Lacking).digests
         paths = {
             file.digest: folder / file.path
             for tree, folder in trees.values()
@@ -161,7 +137,7 @@ class Machine:
         }
         for digest in lacking:
             self._send_content(digest, paths[digest])
-        placed = self._await(Placed)
+        placed = self._await(agent.Placed)
         self._folders = Folders(Path(placed.project), Path(placed.workspace), Path(placed.run))
         return len(lacking)
 
@@ -177,13 +153,13 @@ class Machine:
         Raises:
             EnvironmentFault: with all that failed.
         """
-        self._pump.send(Prepare(tuple(nodes)))
-        return tuple(map(Path, self._await(Prepared).messages))
+        self._pump.send(agent.Prepare(tuple(nodes)))
+        return tuple(map(Path, self._await(agent.Prepared).messages))
 
     def examine(self) -> Sequence[tuple[str, str, str, str]]:
         """What ``neuros doctor`` finds there. Raises ``EnvironmentFault``."""
-        self._pump.send(Examine())
-        return self._await(Examined).findings
+        self._pump.send(agent.Examine())
+        return self._await(agent.Examined).findings
 
     # ------------------------------------------------------------------ the run
 
@@ -192,18 +168,18 @@ class Machine:
         """Of the program that reaches it, which leads a session of its own."""
         return self._process.pid
 
-    def begin(self, start: Start, run: Path, control: Callable[[], ControlStream]) -> None:
+    def begin(self, start: agent.Start, run: Path, control: Callable[[], ControlStream]) -> None:
         """Start the nodes; ``control`` connects to the supervisor. :meth:`await_started` waits."""
         self._run, self._control = run, control
         self._pump.send(start)
 
     def await_started(self) -> None:
         """Until all nodes have been started. Raises ``EnvironmentFault``."""
-        self._await(Started)
+        self._await(agent.Started)
 
     def signal(self, node: str, name: str) -> None:
         """Send a signal to the process of a node."""
-        self._pump.send(SignalNode(node, name))
+        self._pump.send(agent.SignalNode(node, name))
 
     def end_of(self, node: str) -> str | None:
         """How the process of a node has ended, ``None`` while it runs."""
@@ -211,14 +187,14 @@ class Machine:
             return self._ends[node]
         return f"{self.host.name} cannot be reached any more: {self.lost}" if self.lost else None
 
-    def finish(self, is_enough: Callable[[], bool]) -> Finished | None:
+    def finish(self, is_enough: Callable[[], bool]) -> agent.Finished | None:
         """Have all that the nodes have left sent here; ``None`` if it did not come."""
         if self.lost or self._run is None:
             self.close()
             return None
-        self._pump.send(Finish())
+        self._pump.send(agent.Finish())
         try:
-            return self._await(Finished, is_enough=is_enough)
+            return self._await(agent.Finished, is_enough=is_enough)
         except EnvironmentFault:
             return None
         finally:
@@ -254,22 +230,22 @@ class Machine:
     def _take(self, message: Message) -> None:
         """A message of the agent; in the thread of the pump."""
         match message:
-            case Pong():
+            case agent.Pong():
                 self.clock.take(message, time.monotonic(), time.time())
-            case Chunk():
+            case agent.Chunk():
                 self._keep(message)
-            case Remark(severity, text):
+            case agent.Remark(severity, text):
                 self._log(severity, f"{self.host.name}: {text}")
-            case NodeEnded(node, how):
+            case agent.NodeEnded(node, how):
                 self._ends[node] = how
             case _:
-                if isinstance(message, Finished):
+                if isinstance(message, agent.Finished):
                     self._pump.end()  # that it hangs up now is no fault
                 with self._arrived:
                     self._answers.append(message)
                     self._arrived.notify_all()
 
-    def _keep(self, chunk: Chunk) -> None:
+    def _keep(self, chunk: agent.Chunk) -> None:
         if self._run is None:
             return
         try:
@@ -278,7 +254,7 @@ class Machine:
             size = len(chunk.data)
             if not self._fault:
                 self._fault = f"{chunk.path} of {self.host.name} cannot be written: {error}"
-        self._pump.send(Took(size))
+        self._pump.send(agent.Took(size))
 
     @property
     def fault(self) -> str:
@@ -322,7 +298,7 @@ class Machine:
                     raise self._failed("it did not answer in time")
                 self._arrived.wait(_LOOK_S)
             answer = self._answers.pop(0)
-        if isinstance(answer, Refused):
+        if isinstance(answer, agent.Refused):
             raise self._failed(answer.text)
         assert isinstance(answer, kind), f"{kind.__name__} was expected, not {answer}"
         return answer
@@ -345,7 +321,7 @@ class Machine:
                         time.sleep(_LOOK_S)
                     self._require_open()
                     text = b64encode(data).decode()
-                    self._pump.send(Content(digest, text, not following))
+                    self._pump.send(agent.Content(digest, text, not following))
                     if not following:
                         return
                     data = following
@@ -424,7 +400,7 @@ class ClockOffset:
     _known_at_s: float = 0.0
     _course: list[tuple[float, float, float]] = field(default_factory=list)
 
-    def take(self, pong: Pong, now_s: float, now_unix_s: float) -> None:
+    def take(self, pong: agent.Pong, now_s: float, now_unix_s: float) -> None:
         """An answer that arrives now, by the clocks of this machine."""
         round_trip_s = now_s - pong.sent_s
         drift_s = _MOST_DRIFT * (now_s - self._known_at_s)
@@ -493,36 +469,23 @@ class ClockOffset:
 
     def log_here(self, folder: Path) -> None:
         """Move the times in the packet log of a node there. Raises ``OSError``."""
-        course = [(round(1e9 * at_s), round(1e9 * ahead_s)) for at_s, ahead_s, _ in self._course]
+        import numpy as np
+
+        if not self._course:
+            return
+        at_s, ahead_s, _ = zip(*self._course, strict=True)
         for file in sorted(folder.glob("*")):
             width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
             if columns:
-                entries = array("q")
-                data = file.read_bytes()
-                entries.frombytes(data[: len(data) // 8 * 8])
+                entries = np.fromfile(file, np.int64)
                 for column in columns:
-                    _shift(entries, column, width, course)
-                file.write_bytes(entries.tobytes())
+                    times = entries[column::width]
+                    # On a straight line between two answers.
+                    times -= np.rint(1e9 * np.interp(1e-9 * times, at_s, ahead_s)).astype(np.int64)
+                entries.tofile(file)
 
 
 def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:
     """Sampled fields: each row begins with its time."""
     rows = [[row[0] - shift_s, *row[1:]] for row in sample.get("values", ())]
     return {**sample, "values": rows} if rows else dict(sample)
-
-
-def _shift(entries: array[int], column: int, width: int, course: Sequence[tuple[int, int]]) -> None:
-    times = [at_ns for at_ns, _ in course]
-    moved = [at_ns - _ahead_ns(at_ns, times, course) for at_ns in entries[column::width]]
-    entries[column::width] = array("q", moved)
-
-
-def _ahead_ns(at_ns: int, times: Sequence[int], course: Sequence[tuple[int, int]]) -> int:
-    """How far the clock there was ahead, on a straight line between two answers."""
-    after = bisect_right(times, at_ns)
-    if not course:
-        return 0
-    if after in (0, len(course)):
-        return course[max(0, after - 1)][1]
-    (from_ns, ahead_ns), (to_ns, then_ns) = course[after - 1], course[after]
-    return ahead_ns + (then_ns - ahead_ns) * (at_ns - from_ns) // (to_ns - from_ns)
