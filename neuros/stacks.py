@@ -54,10 +54,12 @@ class StackFile:
     """
 
     def __init__(self, folder: Path, plugins: Mapping[str, Path]) -> None:
-        head = {
-            "main": f"{threading.main_thread().ident or 0:x}",
-            "plugins": {name: _as_dumped(str(path)) for name, path in plugins.items()},
+        # Paths as faulthandler writes them.
+        dumped = {
+            name: str(path).encode("ascii", "backslashreplace").decode()
+            for name, path in plugins.items()
         }
+        head = {"main": f"{threading.main_thread().ident or 0:x}", "plugins": dumped}
         self._head = json.dumps(head).encode() + b"\n"
         self._descriptor = os.open(
             folder / FILE_NAME, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
@@ -132,8 +134,3 @@ def _from_plugin(
             text = "".join(traceback.format_list(list(frames[place:]))).rstrip("\n")
             return Stack(nodes[frame.filename], frame.name, text)
     return None
-
-
-def _as_dumped(path: str) -> str:
-    """As faulthandler writes it."""
-    return path.encode("ascii", "backslashreplace").decode()

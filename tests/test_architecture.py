@@ -100,6 +100,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "simulators.convert.mjcf": {"mujoco", "numpy", "trimesh"},
     "backends.docker": {"docker", "requests"},
     "backends.console": {"tqdm"},
+    "backends.machines.machine": {"numpy"},
     "backends.virtual_environments": {"packaging"},
     "api.export": {"yaml"},
     "pytest_plugin": {"pytest"},

@@ -35,13 +35,7 @@ from neuros.backends.virtual_environments import (
 from neuros.caching import KEY_LENGTH
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import (
-    NEWEST,
-    OLDEST,
-    answer_of,
-    clean_environment,
-    dotted,
-)
+from neuros.installation.machine import NEWEST, OLDEST, answer_of, clean_environment, dotted
 from neuros.installation.progress import Progress
 from neuros.project.model import Node
 

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
 import re
 import shutil
@@ -121,7 +122,7 @@ def _holders(folder: Path, started_s: float) -> dict[_Files, set[int]]:
         files = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
         if group.locks:
             holders = set().union(*(owners.get(_lock(group.files[n]), ()) for n in group.locks))
-            if not holders and any(_is_locked(folder, name) for name in group.locks):
+            if not holders and any(_inode_if_free(folder / n) is None for n in group.locks):
                 holders = {_UNSEEN}
         else:
             holders = set().union(*(used.get(name, ()) for name in group.files))
@@ -183,20 +184,6 @@ def _users(folder: Path) -> Mapping[str, set[int]]:
     return users
 
 
-def _is_locked(folder: Path, name: str) -> bool:
-    try:
-        descriptor = os.open(folder / name, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except OSError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
-
-
 def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:
     for name, inode in files:
         with contextlib.suppress(OSError):
@@ -241,16 +228,12 @@ def remove_dead_runs(
 def _dead(folder: Path) -> dict[str, int]:
     """Names and inodes without a lock, of runs without processes."""
     found: dict[str, int] = {}
-    is_alive: dict[str, bool] = {}
+    is_alive = functools.cache(lambda run: bool(RunProcesses(run).alive()))
     for name in os.listdir(folder) if folder.is_dir() else ():
         match = _NAME.fullmatch(name)
         inode = _inode_if_free(folder / name) if match else None
-        if match and inode is not None:
-            run = match["run"]
-            if run not in is_alive:
-                is_alive[run] = bool(RunProcesses(run).alive())
-            if not is_alive[run]:
-                found[name] = inode
+        if match and inode is not None and not is_alive(match["run"]):
+            found[name] = inode
     return found
 
 

@@ -15,6 +15,7 @@ from neuros.backends.containers import OWN_FOLDER, STANDARD
 from neuros.caching import cache_root
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
+from neuros.installation.command import add_build_options
 
 if TYPE_CHECKING:
     from neuros.backends.containers import Recipe
@@ -104,7 +105,7 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
         help="a container, an image of your own, or a project (folder or file), for all containers"
         f" of its nodes (default: {' '.join(STANDARD)})",
     )
-    add_build_options(build)
+    add_build_options(build, build)
     build.add_argument(
         "--build-arg",
         action="append",
@@ -124,21 +125,6 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
     remove = actions.add_parser("remove", help="remove images that NeuROS has built")
     remove.add_argument("names", nargs="*", metavar="NAME", help="containers (default: all)")
     remove.set_defaults(command=_remove_images)
-
-
-def add_build_options(parser: argparse.ArgumentParser) -> None:
-    """The options that ``install.py`` has, too."""
-    add = parser.add_argument
-    add(
-        "--base-image",
-        action="append",
-        default=[],
-        metavar="[NAME=]IMAGE",
-        help="begin the image of container NAME (default: neuros_python) from IMAGE",
-    )
-    add("--wheelhouse", metavar="DIR", help="take all Python packages from a folder of wheels")
-    add("--ca-bundle", metavar="FILE", help="certificates (PEM) that builds trust")
-    add("--pull", action="store_true", help="ask for the newest version of base images")
 
 
 def _build_images(options: argparse.Namespace) -> int:

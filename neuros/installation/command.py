@@ -143,26 +143,33 @@ def _add_container_options(parser: argparse.ArgumentParser) -> None:
         " (default: neuros_python, neuros_mujoco, neuros_nest)",
     )
     which.add_argument("--no-containers", action="store_true", help="build none")
-    group.add_argument(
+    offline = parser.add_argument_group(
+        "where PyPI cannot be reached as usual", "These are for containers, too."
+    )
+    add_build_options(group, offline)
+
+
+def add_build_options(
+    images: argparse._ActionsContainer, offline: argparse._ActionsContainer
+) -> None:
+    """The options that ``neuros containers build`` has, too."""
+    images.add_argument(
         "--base-image",
         action="append",
         default=[],
         metavar="[NAME=]IMAGE",
         help="begin the image of container NAME (default: neuros_python) from IMAGE",
     )
-    group.add_argument(
+    images.add_argument(
         "--pull", action="store_true", help="ask for the newest version of base images"
     )
-    offline = parser.add_argument_group("where PyPI cannot be reached as usual")
     offline.add_argument(
         "--wheelhouse",
         metavar="DIR",
-        help="take all Python packages, also for containers, from a folder of wheels; their"
-        " versions and hashes need not be those of the lock files",
+        help="take all Python packages from a folder of wheels; their versions and hashes need not"
+        " be those of the lock files",
     )
-    offline.add_argument(
-        "--ca-bundle", metavar="FILE", help="certificates (PEM) to trust, also in containers"
-    )
+    offline.add_argument("--ca-bundle", metavar="FILE", help="certificates (PEM) to trust")
 
 
 def prepare_tests(root: Path) -> None:

@@ -177,7 +177,7 @@ class Peers:
         counters = counters_of(probes, self._crossing)
         if (self._own.phase, self._own.counters) != (DRAINED, counters):
             self._utter(phase=DRAINED, counters=counters)
-        return all(self._agrees(state) for state in self._living())
+        return all(self._agrees(each) for each in self._others.values() if each.has_just_begun)
 
     def unsettle(self) -> None:
         """There is still something to do here."""
@@ -279,10 +279,6 @@ class Peers:
             if state.is_ending and state.reason and reason.endswith(state.reason):
                 return {"reason": state.reason, "origin": state.origin, "exit_code": exit_code}
         return {"reason": reason, "origin": self._own.machine, "exit_code": exit_code}
-
-    def _living(self) -> list[PeerState]:
-        """The states of peers whose nodes run hooks."""
-        return [state for state in self._others.values() if state.has_just_begun]
 
     def _unfinished(self) -> bool:
         """Whether a peer that is there has not said what it has counted in all."""

@@ -153,13 +153,10 @@ class Probing:
             this_round = counters(probes)
             is_over, verdict = is_dead(probes, connections), Verdict.DEAD
         is_stable, self._last_round = this_round == self._last_round, this_round
-        if is_over and is_stable and self._others_agree():
+        if is_over and is_stable and (self._peers is None or self._peers.settle(probes)):
             self.verdict = verdict
         elif self._peers is not None and not (is_over and is_stable):
             self._peers.unsettle()
-
-    def _others_agree(self) -> bool:
-        return self._peers is None or self._peers.settle(self._probes)
 
 
 def connections_among(files: Sequence[NodeFile]) -> list[Connection]:

@@ -28,10 +28,7 @@ from typing import Any
 from docker import DockerClient
 
 from neuros.backends.containers import files_of
-from neuros.backends.docker.dockerfile import (
-    Instruction,
-    has_syntax_line,
-)
+from neuros.backends.docker.dockerfile import Instruction, has_syntax_line
 from neuros.backends.docker.engine import Abilities, engine_socket
 from neuros.errors import EnvironmentFault
 

@@ -149,7 +149,9 @@ class ImageBuilder:
         if base and base not in begin:
             begin[base] = str(pulled(self._engine, base, newest=self._pull).id)
         labels[_FROM] = json.dumps(begin, sort_keys=True)
-        if old is not None and not self._pull and _is_as_wanted(old, labels):
+        compared = (DIGEST, _BASE, _ARGUMENTS, _FROM)
+        is_as_wanted = old and all(old.labels.get(key) == labels[key] for key in compared)
+        if is_as_wanted and not self._pull:
             self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
             return
         steps = self._steps(recipe.name)
@@ -233,10 +235,6 @@ def _require_use(bases: Mapping[str, str], recipes: Iterable[Recipe]) -> None:
                 f" {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
                 f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
             )
-
-
-def _is_as_wanted(image: Any, labels: Mapping[str, str]) -> bool:
-    return all(image.labels.get(key) == labels[key] for key in (DIGEST, _BASE, _ARGUMENTS, _FROM))
 
 
 def _size(image: Any) -> str:

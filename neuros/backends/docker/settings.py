@@ -188,7 +188,9 @@ def limits(node: Node) -> dict[str, Any]:
     if node.access.devices:
         settings["devices"] = [f"{device}:{device}:rw" for device in node.access.devices]
     if node.access.gpus:
-        settings["device_requests"] = [_gpu_request(node.access.gpus)]
+        are_all = tuple(node.access.gpus) == ("all",)
+        chosen = {"count": -1} if are_all else {"device_ids": list(node.access.gpus)}
+        settings["device_requests"] = [{**chosen, "capabilities": [["gpu"]]}]
     return settings
 
 
@@ -281,11 +283,6 @@ def _mounts(
 def mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
     """A folder or file of this machine, as a container sees it."""
     return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
-
-
-def _gpu_request(gpus: Sequence[str]) -> dict[str, Any]:
-    chosen = {"count": -1} if tuple(gpus) == ("all",) else {"device_ids": list(gpus)}
-    return {**chosen, "capabilities": [["gpu"]]}
 
 
 def _dds_settings(named: str | None) -> Path | None:

@@ -17,7 +17,7 @@ from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import neuros.control.machines as agent
 from neuros.backends.machines.files import scan, write_chunk
@@ -58,6 +58,7 @@ class Machine:
     Attributes:
         lost: why it cannot be reached any more, empty while it can.
         clock: how far its clocks are off.
+        fault: what of it could not be kept here, empty if all could.
     """
 
     def __init__(self, host: Host, timeout_s: float, log: Log, command: Sequence[str]) -> None:
@@ -70,7 +71,7 @@ class Machine:
         self._control: Callable[[], ControlStream] | None = None
         self._run: Path | None = None
         self._ends: dict[str, str] = {}
-        self._fault = ""
+        self.fault = ""
         self._is_closed = False
         self._answers: list[Message] = []
         self._arrived = threading.Condition()
@@ -208,7 +209,7 @@ class Machine:
             try:
                 self.clock.log_here(self._run / node / _PACKET_LOG)
             except OSError as error:
-                self._fault = self._fault or f"the packet log of {node} cannot be moved: {error}"
+                self.fault = self.fault or f"the packet log of {node} cannot be moved: {error}"
 
     def close(self) -> None:
         """Hang up; the agent ends what is left. Any thread."""
@@ -252,14 +253,9 @@ class Machine:
             size = write_chunk(self._run, chunk)
         except OSError as error:
             size = len(chunk.data)
-            if not self._fault:
-                self._fault = f"{chunk.path} of {self.host.name} cannot be written: {error}"
+            if not self.fault:
+                self.fault = f"{chunk.path} of {self.host.name} cannot be written: {error}"
         self._pump.send(agent.Took(size))
-
-    @property
-    def fault(self) -> str:
-        """What of it could not be kept here, empty if all could."""
-        return self._fault
 
     def _lose(self, reason: str) -> None:
         code = None
@@ -463,7 +459,13 @@ class ClockOffset:
                     for key, (position, at_ns) in message.counters.taken_ns.items()
                 },
             )
-            samples = {port: _sample_here(each, shift_s) for port, each in message.samples.items()}
+            # Of sampled fields, each row begins with its time.
+            samples = {
+                port: {**each, "values": [[row[0] - shift_s, *row[1:]] for row in each["values"]]}
+                if each.get("values")
+                else each
+                for port, each in message.samples.items()
+            }
             return replace(message, counters=counters, samples=samples)
         return message
 
@@ -483,9 +485,3 @@ class ClockOffset:
                     # On a straight line between two answers.
                     times -= np.rint(1e9 * np.interp(1e-9 * times, at_s, ahead_s)).astype(np.int64)
                 entries.tofile(file)
-
-
-def _sample_here(sample: Mapping[str, Any], shift_s: float) -> dict[str, Any]:
-    """Sampled fields: each row begins with its time."""
-    rows = [[row[0] - shift_s, *row[1:]] for row in sample.get("values", ())]
-    return {**sample, "values": rows} if rows else dict(sample)
