@@ -379,11 +379,7 @@ class Environment:
         base = getattr(sys, "_base_executable", sys.executable)
         command = [base, "-m", "venv", "--clear", str(self.folder)]
         made = subprocess.run(
-            command,
-            env=clean_environment(os.environ),
-            capture_output=True,
-            text=True,
-            check=False,
+            command, env=clean_environment(os.environ), capture_output=True, text=True, check=False
         )
         version = sys.version_info[:2]
         if made.returncode:

@@ -425,10 +425,7 @@ class Settling:
     """
 
     def __init__(
-        self,
-        names: Iterable[str],
-        channels: Channels,
-        clock: Callable[[], float] = time.monotonic,
+        self, names: Iterable[str], channels: Channels, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._names = set(names)
         self._channels = channels

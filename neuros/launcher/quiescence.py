@@ -285,11 +285,7 @@ def _reliable(
         receiver = probes.get(connection.destination_node)
         if connection.is_reliable and sender and receiver:
             key = str(connection)
-            yield (
-                connection,
-                sender.metrics["outgoing"][key],
-                receiver.metrics["incoming"][key],
-            )
+            yield (connection, sender.metrics["outgoing"][key], receiver.metrics["incoming"][key])
 
 
 @dataclass(frozen=True)

@@ -69,10 +69,7 @@ class Comparison:
     """
 
     def __init__(
-        self,
-        topics: Topics,
-        message: Callable[[bytes, str], Any],
-        lacking: Collection[str] = (),
+        self, topics: Topics, message: Callable[[bytes, str], Any], lacking: Collection[str] = ()
     ) -> None:
         self._streams = [_Stream(each) for each in topics.values()]
         self._numbers = {key: number for number, key in enumerate(topics)}

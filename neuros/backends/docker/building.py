@@ -250,12 +250,7 @@ class BuildSteps:
     """
 
     def __init__(
-        self,
-        engine: DockerClient,
-        around: Surroundings,
-        progress: Progress,
-        name: str,
-        log: Path,
+        self, engine: DockerClient, around: Surroundings, progress: Progress, name: str, log: Path
     ) -> None:
         self._engine, self._around, self._progress = engine, around, progress
         self._name, self._log = name, log
@@ -263,10 +258,7 @@ class BuildSteps:
         log.unlink(missing_ok=True)
 
     def build(
-        self,
-        folder: Path | None,
-        dockerfile: str,
-        arguments: Mapping[str, str] = _NOTHING,
+        self, folder: Path | None, dockerfile: str, arguments: Mapping[str, str] = _NOTHING
     ) -> str:
         """Build from the files of ``folder``; returns the id of the image.
 
@@ -291,12 +283,7 @@ class BuildSteps:
     def _run(self, archive: io.BytesIO, **settings: Any) -> str:
         # The classic builder's API: each line of its output is a JSON object.
         stream = self._engine.api.build(
-            fileobj=archive,
-            custom_context=True,
-            decode=True,
-            rm=True,
-            forcerm=True,
-            **settings,
+            fileobj=archive, custom_context=True, decode=True, rm=True, forcerm=True, **settings
         )
         return self._follow(stream)
 

@@ -462,10 +462,7 @@ class ToolContainer:
                 detach=True,
                 auto_remove=True,
                 environment={**environment, **passed, "HOME": "/tmp", "ROS_LOG_DIR": "/tmp"},
-                labels={
-                    RUN_LABEL: environment.get(RUN_ID, ""),
-                    "neuros.run_folder": str(run),
-                },
+                labels={RUN_LABEL: environment.get(RUN_ID, ""), "neuros.run_folder": str(run)},
                 mounts=[mount(path, path) for path in seen if path.exists()],
                 network_mode="host",
                 ipc_mode="host",
