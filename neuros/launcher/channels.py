@@ -19,31 +19,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from neuros.control import (
-    FROM_NODES,
-    FROM_OBSERVERS,
-    AtRest,
-    Deliver,
-    End,
-    Ended,
-    Hello,
-    LogRecord,
-    Look,
-    LookAll,
-    Message,
-    NewestPacket,
-    NodeStatus,
-    Pause,
-    PhaseChanged,
-    Reset,
-    Resume,
-    Settle,
-    Settled,
-    Step,
-    StepAll,
-    WasReset,
-    Watch,
-)
+import neuros.control as control
+from neuros.control import Message
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
 from neuros.launcher.outcome import Outcome, Output, Phase
