@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import os
 import warnings
@@ -27,17 +28,16 @@ from rosbags.interfaces import Connection, QosDurability, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.columns import (
     LOG_TIME,
     PUBLISH_TIME,
     Column,
     columns_of,
     dataset_of,
+    has_simulated_time,
     library,
-    segment_of,
-    simulated_time_ns,
-    write_nwb,
+    trains_of,
 )
 from neuros.recording.recorder import needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
@@ -141,7 +141,12 @@ class RecordedTopic:
             else:
                 spread[name] = list(column)
         if clock == "sim":
-            time = pd.to_timedelta(simulated_time_ns(self, columns), unit="ns")
+            if not has_simulated_time(columns):
+                raise UsageError(
+                    f"{self.name} has no simulated time: no node of the run owns time, or the bag"
+                    ' is an SQLite file, which has no place for it. Use clock="wall"'
+                )
+            time = pd.to_timedelta(columns[PUBLISH_TIME], unit="ns")
         else:
             time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
         return pd.DataFrame(spread, index=time.rename("time"))
@@ -170,7 +175,15 @@ class RecordedTopic:
             EnvironmentFault: if Neo is not installed.
             UsageError: for packets of another type, and for spikes of neurons that are not there.
         """
-        return segment_of(self)
+        neo = library("neo", "array()")
+        trains = trains_of(self)
+        segment = neo.Segment(name=self.name, topic=self.name, connection=self.connection or "")
+        span = {"t_start": trains.start_s, "t_stop": trains.end_s}
+        segment.spiketrains = [
+            neo.SpikeTrain(times_s, units="s", neuron=neuron, **span)
+            for neuron, times_s in enumerate(trains.times_s)
+        ]
+        return segment
 
     def nwb(self, file: str | os.PathLike[str]) -> None:
         """Write recorded spikes into a new file of Neurodata Without Borders, a unit per neuron.
@@ -180,7 +193,15 @@ class RecordedTopic:
             UsageError: as :meth:`neo`.
             OSError: if the file cannot be written.
         """
-        write_nwb(self, file, self._bag.start_ns, self._bag.custom.get("run_id", "unknown"))
+        pynwb = library("pynwb", "neo()")
+        trains, run_id = trains_of(self), self._bag.custom.get("run_id", "unknown")
+        began = datetime.datetime.fromtimestamp(self._bag.start_ns / 1e9, datetime.timezone.utc)
+        content = pynwb.NWBFile(f"simulated spikes of {self.name}", run_id, began)
+        span = [(trains.start_s, trains.end_s)]
+        for neuron, times_s in enumerate(trains.times_s):
+            content.add_unit(id=neuron, spike_times=times_s, obs_intervals=span)
+        with pynwb.NWBHDF5IO(os.fspath(file), "w") as writer:
+            writer.write(content)
 
 
 class Bag:

@@ -294,16 +294,9 @@ def _headline(found: Bottleneck, budgets: Mapping[str, TimeBudget]) -> str:
                 " acknowledgements are under way, or the processors are busy with something else."
             )
         return text
-    where = "an external topic" if last.state == "waiting" else "a node that has not reported"
-    return f"{where[0].upper()}{where[1:]} limits the speed: {last.node} {_doing(last)}."
-
-
-def _doing(step: Step) -> str:
-    if step.state == "blocked":
-        return f"is blocked on {step.cause}"
-    if step.state == "waiting":
-        return f"waits for its input {step.cause}"
-    return "waits for its clock" if step.state == "idle" else f"executes {step.cause}"
+    if last.state == "waiting":
+        return f"An external topic limits the speed: {last.node} waits for its input {last.cause}."
+    return f"A node that has not reported limits the speed: {last.node} is blocked on {last.cause}."
 
 
 def _reason(step: Step, spent: TimeBudget) -> str:

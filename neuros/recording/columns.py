@@ -14,8 +14,6 @@ stamp of the last packet.
 
 from __future__ import annotations
 
-import datetime
-import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -176,17 +174,9 @@ def _columns_of_none(type_name: str, store: Typestore) -> dict[str, Column]:
     try:
         layout = _Layout(_CDR_HEADER, type_name, store.fielddefs)
     except _Irregular:
-        return {name: np.empty(0, object) for name in _field_names(type_name, store.fielddefs)}
+        return {name: np.empty(0, object) for name, _ in _fields(type_name, store.fielddefs)}
     numbers = {name: np.zeros((0, *kind.shape), kind.base) for name, kind, _ in layout.numbers}
     return numbers | {name: np.zeros(0, "U1") for name, _, _ in layout.texts}
-
-
-def _field_names(type_name: str, types: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for name, (kind, details) in types[type_name][1]:
-        if kind.value == _NAME:
-            yield from _field_names(details, types, f"{prefix}{name}.")
-        elif not name.startswith(_EMPTY):
-            yield f"{prefix}{name}"
 
 
 def _parts(
@@ -318,16 +308,6 @@ def library(name: str, otherwise: str = "") -> Any:
         raise EnvironmentFault(f"{text}, or use {otherwise}" if otherwise else text) from error
 
 
-def simulated_time_ns(topic: Topic, columns: Mapping[str, Column]) -> Column:
-    """The simulated time of each packet. Raises ``UsageError`` if the bag has none."""
-    if has_simulated_time(columns):
-        return columns[PUBLISH_TIME]
-    raise UsageError(
-        f"{topic.name} has no simulated time: no node of the run owns time, or the bag is an"
-        ' SQLite file, which has no place for it. Use clock="wall"'
-    )
-
-
 def has_simulated_time(columns: Mapping[str, Column]) -> bool:
     """Whether packets have another time than that of the wall clock."""
     return bool(np.any(columns[PUBLISH_TIME] != columns[LOG_TIME]))
@@ -381,7 +361,7 @@ def _fields(
         its = units.get(name, unit)
         if isinstance(details, str) and details in types:
             yield from _fields(details, types, f"{prefix}{name}.", its)
-        else:
+        elif not name.startswith(_EMPTY):
             yield f"{prefix}{name}", (type_name, its)
 
 
@@ -448,33 +428,6 @@ def trains_of(topic: Topic) -> SpikeTrains:
     order = np.lexsort((times, senders))
     places = np.searchsorted(senders[order], np.arange(1, size))
     return SpikeTrains(np.split(times[order], places), start_s, end_s)
-
-
-def segment_of(topic: Topic) -> Any:
-    """What :meth:`RecordedTopic.neo` gives."""
-    neo = library("neo", "array()")
-    trains = trains_of(topic)
-    segment = neo.Segment(name=topic.name, topic=topic.name, connection=topic.connection or "")
-    segment.spiketrains = [
-        neo.SpikeTrain(
-            times_s, units="s", t_start=trains.start_s, t_stop=trains.end_s, neuron=neuron
-        )
-        for neuron, times_s in enumerate(trains.times_s)
-    ]
-    return segment
-
-
-def write_nwb(topic: Topic, file: str | os.PathLike[str], start_ns: int, run_id: str) -> None:
-    """What :meth:`RecordedTopic.nwb` does; ``start_ns``: wall time of the bag's first packet."""
-    pynwb = library("pynwb", "neo()")
-    trains = trains_of(topic)
-    began = datetime.datetime.fromtimestamp(start_ns / 1e9, datetime.timezone.utc)
-    content = pynwb.NWBFile(f"simulated spikes of {topic.name}", run_id, began)
-    span = [(trains.start_s, trains.end_s)]
-    for neuron, times_s in enumerate(trains.times_s):
-        content.add_unit(id=neuron, spike_times=times_s, obs_intervals=span)
-    with pynwb.NWBHDF5IO(os.fspath(file), "w") as writer:
-        writer.write(content)
 
 
 def _joined(column: npt.NDArray[Any]) -> Floats:

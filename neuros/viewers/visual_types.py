@@ -120,7 +120,7 @@ class VisualTypes:
             if self.is_scan:
                 yield Points(_beams(sample["all"]))
             elif self._numbers is None:
-                self._numbers = list(_numbers_of(sample["all"]))
+                self._numbers = _numbers_of(sample["all"])
         for row in sample.get("values", ()):
             yield from self._of_row(row[0], dict(zip(sample["fields"], row[1:], strict=True)))
 
@@ -153,16 +153,15 @@ def _vector(
     return numbers if len(numbers) == len(axes) else None
 
 
-def _numbers_of(fields: Mapping[str, Any]) -> Iterator[str]:
-    count = 0
-    for path, value in fields.items():
-        is_number = isinstance(value, int | float) or value in _NOT_FINITE
-        is_about_it = path.startswith("header.") or path.endswith(".length") or "covariance" in path
-        if is_number and not is_about_it:
-            yield path
-            count += 1
-            if count == MOST_NUMBERS:
-                return
+def _numbers_of(fields: Mapping[str, Any]) -> list[str]:
+    """The first numbers that a message has of its own."""
+    numbers = [
+        path
+        for path, value in fields.items()
+        if (isinstance(value, int | float) or value in _NOT_FINITE)
+        and not (path.startswith("header.") or path.endswith(".length") or "covariance" in path)
+    ]
+    return numbers[:MOST_NUMBERS]
 
 
 def _beams(scan: Mapping[str, Any]) -> list[tuple[float, float, float]]:

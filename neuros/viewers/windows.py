@@ -14,7 +14,7 @@ from neuros.backends.docker.launcher import ToolContainer, find_tool_image
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Reaper
-from neuros.project.model import Project
+from neuros.project.model import Port, Project
 from neuros.viewers.viewer import Shown, Viewer
 
 RVIZ_FILE = "project.rviz"
@@ -193,21 +193,19 @@ def rviz_configuration(project: Project) -> str:
 
 
 def _displays(project: Project) -> Iterator[dict[str, Any]]:
-    seen: set[str] = set()
+    shown: dict[str, tuple[Port, str]] = {}  # one connection of an output is enough
     for connection in project.connections:
         port = project.node(connection.source_node).output(connection.source_output)
         name = f"{connection.source_node}.{port.name}"
-        if port.type in DISPLAYS and name not in seen:  # one connection of an output is enough
-            seen.add(name)
-            yield _display(DISPLAYS[port.type], name, f"{connection.topic}/data")
+        shown.setdefault(name, (port, f"{connection.topic}/data"))
     for node in project.nodes:
         for port in (*node.inputs, *node.outputs):
-            if port.external_topic is None or port.type not in DISPLAYS:
-                continue
-            topic = project.names.resolve(port.external_topic, node.name)
-            if topic not in seen:
-                seen.add(topic)
-                yield _display(DISPLAYS[port.type], topic, topic)
+            if port.external_topic is not None:
+                topic = project.names.resolve(port.external_topic, node.name)
+                shown.setdefault(topic, (port, topic))
+    for name, (port, topic) in shown.items():
+        if port.type in DISPLAYS:
+            yield _display(DISPLAYS[port.type], name, topic)
 
 
 def _display(kind: str, name: str, topic: str | None = None) -> dict[str, Any]:

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import install_opengl, offscreen_opengl
 
-_BACKENDS = ("egl", "osmesa", "glfw")
 _MAX_GEOMS = 20_000
 _SMALL_WORLD = """
 <mujoco>
@@ -42,7 +41,7 @@ def choose_opengl() -> str:
     if not sys.platform.startswith("linux"):
         return "glfw"
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if wanted in _BACKENDS:
+    if wanted in _NAMES:
         return wanted
     return offscreen_opengl() or ("glfw" if os.environ.get("DISPLAY") else "")
 

@@ -22,17 +22,11 @@ _WATCHED_S = 2.0
 _MOST_FRAMES = 60
 _MOST_GROUP = 2  # as MuJoCo's own viewer: elements of the groups 3 to 5 are hidden at first
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+_GEOMS = mujoco.mjtGeom
 _SHAPES = {
-    mujoco.mjtGeom.mjGEOM_PLANE.value: "plane",
-    mujoco.mjtGeom.mjGEOM_HFIELD.value: "mesh",
-    mujoco.mjtGeom.mjGEOM_SPHERE.value: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE.value: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID.value: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER.value: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX.value: "box",
-    mujoco.mjtGeom.mjGEOM_MESH.value: "mesh",
-    mujoco.mjtGeom.mjGEOM_SDF.value: "mesh",
-}
+    getattr(_GEOMS, f"mjGEOM_{name.upper()}").value: name
+    for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+} | {_GEOMS.mjGEOM_HFIELD.value: "mesh", _GEOMS.mjGEOM_SDF.value: "mesh"}
 _MATERIAL = ("emission", "specular", "shininess")
 # What a plugin may change while the world runs.
 _LOOKS = ("geom_rgba", "geom_size", "geom_pos", "geom_quat", "mat_rgba", "site_rgba", "site_pos")
