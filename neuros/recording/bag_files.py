@@ -40,7 +40,8 @@ _SUMMARY_OFFSET, DATA_END = 0x0E, 0x0F
 RECORD_HEAD = Struct("<BQ")  # kind, length
 MESSAGE_HEAD = Struct("<HIQQ")  # channel, number within the channel, log time, publish time
 _MESSAGE_RECORD = Struct("<BQHIQQ")  # both
-CHUNK_HEAD = Struct("<QQQI")  # first and last log time, size, checksum
+# First and last log time, size and checksum of the records; no compression, size once more.
+CHUNK_HEAD = Struct("<QQQIIQ")
 _LAST_NS = (1 << 63) - 1
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # as rmw has it for "no deadline"
 
@@ -300,7 +301,7 @@ class _McapFile:
         checksum = 0
         for part in self._chunk:
             checksum = crc32(part, checksum)
-        head = CHUNK_HEAD.pack(first_ns, last_ns, size, checksum) + _text("") + pack("<Q", size)
+        head = CHUNK_HEAD.pack(first_ns, last_ns, size, checksum, 0, size)
         self._add(RECORD_HEAD.pack(CHUNK, len(head) + size), head, *self._chunk)
         length = self._size - start
         offsets = b""

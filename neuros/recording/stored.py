@@ -191,7 +191,7 @@ def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Fou
         # A damaged length may be any number: no memory is taken for it.
         content = file.read(min(size, file_size - offset))
         if kind == CHUNK:
-            whole = content[: CHUNK_HEAD.size + 4 + 8 + _size_in(content)]
+            whole = content[: CHUNK_HEAD.size + _size_in(content)]
             is_right = _is_as_written(whole)
             if not is_right or len(whole) < len(content):
                 complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
@@ -210,8 +210,8 @@ def _next_chunk(content: bytes) -> int | None:
         if start + CHUNK_HEAD.size > len(content):
             return None
         size = RECORD_HEAD.unpack_from(content, at)[1]
-        _, _, records, checksum = CHUNK_HEAD.unpack_from(content, start)
-        is_there = size == CHUNK_HEAD.size + 4 + 8 + records <= len(content) - start
+        _, _, records, checksum, *_ = CHUNK_HEAD.unpack_from(content, start)
+        is_there = size == CHUNK_HEAD.size + records <= len(content) - start
         if checksum and is_there and _is_as_written(content[start : start + size]):
             return at
         at = content.find(CHUNK, at + 1)
@@ -225,23 +225,21 @@ def _size_in(chunk: bytes) -> int:
 
 def _is_as_written(chunk: bytes) -> bool:
     """Whether the checksum of a chunk is right; a chunk without one, or cut off, counts as that."""
-    at = CHUNK_HEAD.size + 4 + 8
-    if len(chunk) < at + _size_in(chunk):
+    if len(chunk) < CHUNK_HEAD.size + _size_in(chunk):
         return True
     checksum = CHUNK_HEAD.unpack_from(chunk)[3]
-    return not checksum or crc32(memoryview(chunk)[at:]) == checksum
+    return not checksum or crc32(memoryview(chunk)[CHUNK_HEAD.size :]) == checksum
 
 
 def _of_chunk(
     content: bytes, offset: int, topics: dict[int, str], is_right: bool
 ) -> Iterator[_Found]:
     """The messages of a chunk without compression; ``topics`` grows by its channels."""
-    at = CHUNK_HEAD.size
-    if len(content) < at + 4:
+    if len(content) < CHUNK_HEAD.size:
         return
-    if int.from_bytes(content[at : at + 4], "little"):
+    if CHUNK_HEAD.unpack_from(content)[4]:
         raise EnvironmentFault("its chunks are compressed, which this reader does not read")
-    at += 4 + 8
+    at = CHUNK_HEAD.size
     view = memoryview(content)
     while at + RECORD_HEAD.size <= len(content):
         kind, size = RECORD_HEAD.unpack_from(content, at)
