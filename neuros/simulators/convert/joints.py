@@ -11,7 +11,7 @@ import numpy as np
 
 from neuros.simulators.convert.elements import Element
 from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector
-from neuros.simulators.convert.mjcf import Building, set_first
+from neuros.simulators.convert.mjcf import Building
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
@@ -127,9 +127,9 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
             velocity.taken = not 0 <= limit.number("velocity", -1) < _NO_LIMIT
     dynamics = axis.child("dynamics")
     if dynamics is not None:
-        set_first(joint, "damping", dynamics.number("damping", 0.0))
+        joint.damping[0] = dynamics.number("damping", 0.0)
         joint.frictionloss = dynamics.number("friction", 0.0)
-        set_first(joint, "stiffness", dynamics.number("spring_stiffness", 0.0))
+        joint.stiffness[0] = dynamics.number("spring_stiffness", 0.0)
         joint.springref = dynamics.number("spring_reference", 0.0)
 
 

@@ -367,8 +367,7 @@ def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> N
             site = _add_site(building, link, element, ray, f"{link.name}/{element.name}{suffix}")
             sensor = _add_sensor(building, site, _SENSORS.mjSENS_RANGEFINDER, site, element)
             sensor.cutoff = most if math.isfinite(most) else 0
-            if hasattr(mujoco, "mjtRayDataField"):  # since then it says what it measures
-                sensor.intprm[0] = 1 << mujoco.mjtRayDataField.mjRAYDATA_DIST.value
+            sensor.intprm[0] = 1 << mujoco.mjtRayDataField.mjRAYDATA_DIST.value
     element.remark(f"{count} rangefinder(s) in MuJoCo, -1 where nothing is hit")
 
 

@@ -86,14 +86,6 @@ class Building:
         return name
 
 
-def set_first(thing: Any, attribute: str, value: float) -> None:
-    """Set a number, or the first of several: MuJoCo 4 made polynomials of some numbers."""
-    if np.ndim(getattr(thing, attribute)):
-        getattr(thing, attribute)[0] = value
-    else:
-        setattr(thing, attribute, value)
-
-
 @dataclass(frozen=True)
 class Converted:
     """A description as MuJoCo has it.
@@ -384,7 +376,7 @@ def _box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, S
             mesh.inertia = _SHELL
         else:
             made.pop(mesh.name, None)
-            spec.delete(mesh) if hasattr(spec, "delete") else mesh.delete()  # until MuJoCo 3.3
+            spec.delete(mesh)
     return boxed
 
 
