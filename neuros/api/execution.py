@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from neuros.analysis.run_record import broken_budgets, losses, run_record, run_table
 from neuros.api.observation import Observation, check_observation
@@ -44,18 +44,11 @@ from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
-from neuros.viewers.viewer import Shown
+from neuros.viewers.viewer import Shown, Views
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
 _PATIENCE_S = 1.0
-
-
-class Views(Protocol):
-    """Windows and pages that show a run, from when there is a control socket to its end."""
-
-    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None: ...
-    def finish(self) -> None: ...
 
 
 class Execution:

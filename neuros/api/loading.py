@@ -25,7 +25,7 @@ from neuros.project.message_types import unknown_type
 from neuros.project.model import NETWORK, NETWORK_MODULE, Node, Project
 from neuros.project.paths import why_no_module
 from neuros.project.plugin_files import PluginFile, read_plugin
-from neuros.project.scanner import display_name, place_of
+from neuros.project.scanner import display_name, problem_in
 from neuros.recording.provenance import seeds
 
 _LONG_BYTES = 1 << 20
@@ -110,9 +110,7 @@ def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
                 unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
                 package = port.type.partition("/")[0]
                 if unknown and not _names_package(container.folder, package):
-                    pointer = f"{node.pointer}/{side}/{index}/type"
-                    place = place_of(node.file, pointer)
-                    yield Problem(display_name(node.file), *place, pointer, *unknown)
+                    yield problem_in(node.file, f"{node.pointer}/{side}/{index}/type", *unknown)
 
 
 def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
@@ -122,11 +120,9 @@ def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
         if node.module and node.plugin == Path() and container and not container.is_own:
             package = node.module.partition(".")[0]
             if not _names_package(container.folder, package):
-                pointer = f"{node.pointer}/plugin"
                 text, _ = why_no_module(node.module)
                 hint = f"nothing in {container.folder} names '{package}'"
-                place = place_of(node.file, pointer)
-                yield Problem(display_name(node.file), *place, pointer, text, hint)
+                yield problem_in(node.file, f"{node.pointer}/plugin", text, hint)
 
 
 def _network_problems(node: Node) -> Iterator[Problem]:
@@ -150,8 +146,7 @@ def _network_doubts(loaded: Loaded) -> Iterator[Problem]:
 
 
 def _at_network(node: Node, text: str, hint: str = "") -> Problem:
-    pointer = f"{node.pointer}/network"
-    return Problem(display_name(node.file), *place_of(node.file, pointer), pointer, text, hint)
+    return problem_in(node.file, f"{node.pointer}/network", text, hint)
 
 
 def _names_package(folder: Path, package: str) -> bool:
@@ -262,9 +257,7 @@ def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
             time.period_steps(rate)
         except ValueError as error:
             pointer = f"{node.pointer}/outputs/{index}/mujoco/rate"
-            yield Problem(
-                display_name(node.file), *place_of(node.file, pointer), pointer, str(error)
-            )
+            yield problem_in(node.file, pointer, str(error))
 
 
 def _parts(plugin: Path) -> Iterator[PluginFile]:

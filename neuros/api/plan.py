@@ -26,7 +26,7 @@ from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
 from neuros.project.deployment import load_deployment
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.names import SESSION
-from neuros.project.scanner import display_name, place_of
+from neuros.project.scanner import problem_in
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
 from neuros.registry import AUTO
@@ -250,8 +250,8 @@ def make_plan(
         )
     if request.isolate:
         _check_isolation(plan)
-    problems = [*_nest_problems(plan), *_time_problems(plan)]
-    if problems:
+    conflicts = nest_conflicts(project, names) if back_end.is_one_process else ()
+    if problems := [*conflicts, *_time_problems(plan)]:
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
@@ -311,12 +311,15 @@ def _check_cores(plan: Plan) -> None:
     """A project may have been written for another machine: its cores are no mistake in it."""
     usable = usable_cores()
     problems = [
-        f"{display_name(node.file)}:{line}:{column}: {pointer}: node '{node.name}' asks for"
-        f" {_cores_in_words(missing)}"
+        str(
+            problem_in(
+                node.file,
+                f"{node.pointer}/affinity",
+                f"node '{node.name}' asks for {_cores_in_words(missing)}",
+            )
+        )
         for node in plan.nodes_here
         if (missing := set(node.affinity) - usable)
-        for pointer in [f"{node.pointer}/affinity"]
-        for line, column in [place_of(node.file, pointer)]
     ]
     if problems:
         problems.append(
@@ -367,10 +370,6 @@ def _check_isolation(plan: Plan) -> None:
             f"--isolate: other programs cannot reach the external inputs {', '.join(heard)}; leave"
             " --isolate out, or connect them"
         )
-
-
-def _nest_problems(plan: Plan) -> Sequence[Problem]:
-    return nest_conflicts(plan.project, plan.names) if plan.back_end.is_one_process else ()
 
 
 def _time_problems(plan: Plan) -> Sequence[Problem]:

@@ -300,8 +300,5 @@ def _budgets_of(parsed: ParsedProject) -> Budgets:
     """The budgets of a valid project."""
     element = parsed.root.member("budgets")
     values: dict[str, Any] = {} if element is None else element.plain
-    return Budgets(
-        lost_packets={name: int(most) for name, most in values.get("lost_packets", {}).items()},
-        real_time_factor=values.get("real_time_factor"),
-        tick_error_ms=values.get("tick_error_ms"),
-    )
+    lost = {name: int(most) for name, most in values.get("lost_packets", {}).items()}
+    return Budgets(**{**values, "lost_packets": lost})

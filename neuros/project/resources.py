@@ -70,18 +70,12 @@ def access_of(keys: Mapping[str, Any]) -> Access:
 
 def keys_of(resources: Resources, access: Access) -> dict[str, Any]:
     """The keys of a node that say this; the inverse of the two above."""
-    limits: dict[str, Any] = {}
-    if resources.mem_bytes is not None:
-        limits["memory"] = memory_text(resources.mem_bytes)
-    if resources.cpus is not None:
-        limits["cpus"] = resources.cpus
-    if resources.pids is not None:
-        limits["pids"] = resources.pids
-    keys: dict[str, Any] = {"resources": limits} if limits else {}
-    if access.devices:
-        keys["devices"] = list(access.devices)
-    if access.gpus:
-        keys["gpus"] = "all" if access.gpus == ("all",) else list(access.gpus)
-    if access.display:
-        keys["display"] = True
-    return keys
+    memory = None if resources.mem_bytes is None else memory_text(resources.mem_bytes)
+    limits = {"memory": memory, "cpus": resources.cpus, "pids": resources.pids}
+    keys = {
+        "resources": {key: limit for key, limit in limits.items() if limit is not None},
+        "devices": list(access.devices),
+        "gpus": "all" if access.gpus == ("all",) else list(access.gpus),
+        "display": access.display,
+    }
+    return {key: value for key, value in keys.items() if value}

@@ -312,5 +312,10 @@ def place_of(file: Path, pointer: str) -> tuple[int, int]:
     return element.source.place(element.start)
 
 
+def problem_in(file: Path, pointer: str, text: str, hint: str = "") -> Problem:
+    """A problem at a pointer in a file that has been read before."""
+    return Problem(display_name(file), *place_of(file, pointer), pointer, text, hint)
+
+
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a JSON number")

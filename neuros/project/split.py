@@ -158,21 +158,20 @@ def translated(node: Node, translate: Callable[[Path], Path]) -> Node:
 
 
 def _node_keys(node: Node) -> dict[str, Any]:
-    keys: dict[str, Any] = {
+    optional = {
+        "script": "" if node.script is None else str(node.script),
+        "affinity": list(node.affinity),
+        **keys_of(node.resources, node.access),
+        "parameters": parameters_to_json(node.parameters),
+    }
+    return {
         "name": node.name,
         "container": node.container,
         "plugin": node.module or str(node.plugin),
+        **{key: value for key, value in optional.items() if value},
+        "inputs": [_port_keys(port) for port in node.inputs],
+        "outputs": [_port_keys(port) for port in node.outputs],
     }
-    if node.script is not None:
-        keys["script"] = str(node.script)
-    if node.affinity:
-        keys["affinity"] = list(node.affinity)
-    keys |= keys_of(node.resources, node.access)
-    if node.parameters:
-        keys["parameters"] = parameters_to_json(node.parameters)
-    keys["inputs"] = [_port_keys(port) for port in node.inputs]
-    keys["outputs"] = [_port_keys(port) for port in node.outputs]
-    return keys
 
 
 def _port(keys: Mapping[str, Any], *, is_input: bool) -> Port:
@@ -181,16 +180,9 @@ def _port(keys: Mapping[str, Any], *, is_input: bool) -> Port:
 
 
 def _port_keys(port: Port) -> dict[str, Any]:
-    keys: dict[str, Any] = {"name": port.name, "type": port.type}
-    if port.external_topic is not None:
-        keys["external_topic"] = port.external_topic
-    if port.qos is not None:
-        keys["qos"] = qos_to_json(port.qos)
-    if port.mujoco:
-        keys["mujoco"] = dict(port.mujoco)
-    if port.gazebo_type is not None:
-        keys["gazebo_type"] = port.gazebo_type
-    return keys
+    qos = None if port.qos is None else qos_to_json(port.qos)
+    keys = {**vars(port), "mujoco": dict(port.mujoco) or None, "qos": qos}
+    return {key: value for key, value in keys.items() if value is not None}
 
 
 def _written(node: Node, key: str, value: str) -> str:

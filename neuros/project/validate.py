@@ -18,7 +18,7 @@ from typing import Any
 from neuros.errors import Problem
 from neuros.project.model import Project
 from neuros.project.parsed import ParsedProject
-from neuros.project.scanner import Element, display_name, place_of
+from neuros.project.scanner import Element, problem_in
 from neuros.project.suggest import did_you_mean, listed
 
 MOST_PROBLEMS = 200
@@ -71,9 +71,8 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
     chosen = [node for node in project.nodes if names is None or node.name in names]
     nest = [node for node in chosen if node.container.partition(":")[0] == "neuros_nest"]
     return tuple(
-        Problem(
-            display_name(node.file),
-            *place_of(node.file, f"{node.pointer}/container"),
+        problem_in(
+            node.file,
             f"{node.pointer}/container",
             f"nodes '{nest[0].name}' and '{node.name}' both use NEST, which allows one node per "
             "process",

@@ -184,15 +184,13 @@ def _part(leaf: Leaf) -> Part:
         return Array(leaf)
     if field.shape is Shape.LIST:
         return Items(leaf, *_item(field.type))
-    if field.type.sort is Sort.TEXT:
-        return Text(leaf, write_text, read_text)
-    if field.type.sort is Sort.WIDE_TEXT:
-        return Text(leaf, write_wide_text, read_wide_text)
+    if field.type.sort in (Sort.TEXT, Sort.WIDE_TEXT):
+        return Text(leaf, *_item(field.type))
     raise Unusual
 
 
 def _item(of: Type) -> tuple[WriteItem, ReadItem]:
-    """Writer and reader of one of several values that are no numbers."""
+    """Writer and reader of a value that is no number."""
     if of.sort is Sort.MESSAGE:
         return _message(of.message)
     if of.sort is Sort.TEXT:

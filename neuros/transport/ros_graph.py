@@ -82,25 +82,25 @@ class ExternalTopics:
 
     def _publisher(self, port: Port, topic: str) -> Publisher:
         profile = qos_profile(port.qos or OFFERED)
-        check = QosCheck(self._ros_node, self._loop, port, self._full(topic), profile)
+        check = self._qos_check(port, topic, profile, is_input=False)
         return self._ros_node.create_publisher(
             message_class(port.type),
             topic,
             profile,
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=check.on_subscription),
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=check),
         )
 
     def _subscription(self, port: Port, topic: str, inbox: Inbox) -> Subscription:
         kind = message_class(port.type)
         profile = qos_profile(port.qos or ASKED)
         deliver = partial(inbox.on_external_packet, port)
-        check = QosCheck(self._ros_node, self._loop, port, self._full(topic), profile)
+        check = self._qos_check(port, topic, profile, is_input=True)
         return self._ros_node.create_subscription(
             kind,
             topic,
             self._loop.guarded(self._receiver(kind, topic, deliver)),
             profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check.on_publisher),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check),
             raw=True,
         )
 
@@ -125,8 +125,9 @@ class ExternalTopics:
 
         return receive
 
-    def _full(self, topic: str) -> str:
-        return self._file.names.resolve(topic, self._file.node.name)
+    def _qos_check(self, port: Port, topic: str, own: QoSProfile, *, is_input: bool) -> QosCheck:
+        full = self._file.names.resolve(topic, self._file.node.name)
+        return QosCheck(self._ros_node, self._loop, port, full, own, is_input=is_input)
 
 
 class RosGraphBridge:
@@ -218,28 +219,31 @@ class QosCheck:
 
     Args:
         topic: its full name.
-        own: what the port offers or asks for.
+        own: what the port offers (an output) or asks for (an input).
     """
 
     def __init__(
-        self, ros_node: RosNode, loop: RosLoop, port: Port, topic: str, own: QoSProfile
+        self,
+        ros_node: RosNode,
+        loop: RosLoop,
+        port: Port,
+        topic: str,
+        own: QoSProfile,
+        *,
+        is_input: bool,
     ) -> None:
         self._ros_node = ros_node
         self._loop = loop
         self._port = port
         self._topic = topic
         self._own = own
+        self._is_input = is_input
+        self._log = ros_node.get_logger()
+        self._name = f"{'input' if is_input else 'output'} '{port.name}'"
         self._named: set[bytes] = set()
 
-    def on_publisher(self, event: Any) -> None:
-        """DDS has found a publisher that offers less than this input asks for."""
-        self._look_later(event, is_input=True)
-
-    def on_subscription(self, event: Any) -> None:
-        """DDS has found a subscription that asks for more than this output offers."""
-        self._look_later(event, is_input=False)
-
-    def _look_later(self, event: Any, *, is_input: bool) -> None:
+    def __call__(self, event: Any) -> None:
+        """DDS has found an endpoint that does not fit: look for it in the ROS graph."""
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
         total, looks = event.total_count, 0
 
@@ -247,34 +251,31 @@ class QosCheck:
             nonlocal looks
             looks += 1
             is_last = looks == _MOST_QOS_LOOKS
-            self._look(is_input=is_input, is_last=is_last)
+            self._look(is_last=is_last)
             if len(self._named) >= total or is_last:
                 self._ros_node.destroy_timer(timer)
                 if not self._named:
-                    self._warn_of_unknown("input" if is_input else "output", policy)
+                    self._log.warning(
+                        f"{self._name}: another node on {self._topic} cannot be connected: its"
+                        f" {policy} does not fit"
+                    )
 
         timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
 
-    def _look(self, *, is_input: bool, is_last: bool) -> None:
+    def _look(self, *, is_last: bool) -> None:
         topic = self._port.external_topic  # by the name that rules apply to
-        if is_input:
-            side, others = "input", self._ros_node.get_publishers_info_by_topic(topic)
+        if self._is_input:
+            others = self._ros_node.get_publishers_info_by_topic(topic)
         else:
-            side, others = "output", self._ros_node.get_subscriptions_info_by_topic(topic)
+            others = self._ros_node.get_subscriptions_info_by_topic(topic)
         for other in others:
             ends = (other.qos_profile, self._own)
-            lacking = list(qos_differences(*(ends if is_input else ends[::-1])))
+            lacking = list(qos_differences(*(ends if self._is_input else ends[::-1])))
             # The name of its node may come later than what it offers.
             if lacking and (is_last or other.node_name != _UNKNOWN_NODE):
-                self._warn(side, other, lacking)
+                self._warn(other, lacking)
 
-    def _warn_of_unknown(self, side: str, policy: str) -> None:
-        self._ros_node.get_logger().warning(
-            f"{side} '{self._port.name}': another node on {self._topic} cannot be connected: its"
-            f" {policy} does not fit"
-        )
-
-    def _warn(self, side: str, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
+    def _warn(self, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
         gid = bytes(other.endpoint_gid)
         if gid in self._named:
             return
@@ -282,13 +283,11 @@ class QosCheck:
         name = f"{other.node_namespace.rstrip('/')}/{other.node_name}"
         offered = " and ".join(each for each, _ in lacking)
         asked = " and ".join(each for _, each in lacking)
-        if side == "input":
+        if self._is_input:
             text = f"{name} offers {offered}, but this input requires {asked}: it gets no packets"
         else:
             text = f"{name} requires {asked}, but this output offers {offered}: it gets no packets"
-        self._ros_node.get_logger().warning(
-            f"{side} '{self._port.name}': on {self._topic} {text}; {_ADVICE}"
-        )
+        self._log.warning(f"{self._name}: on {self._topic} {text}; {_ADVICE}")
 
 
 def qos_differences(offered: QoSProfile, asked: QoSProfile) -> Iterator[tuple[str, str]]:

@@ -91,13 +91,13 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._loop = RosLoop(self._context, on_failure)
+        self.loop = RosLoop(self._context, on_failure)
         self.packets = RosPackets()
         self._has_digests = digests
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
-        self._hub = MemoryHub(self._loop, self.packets.copy) if in_memory else None
+        self._hub = MemoryHub(self.loop, self.packets.copy) if in_memory else None
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
@@ -105,23 +105,19 @@ class RosProcess:
         self._no_spinning = contextlib.ExitStack()
         self._no_spinning.enter_context(without_spinning())
 
-    @property
-    def loop(self) -> RosLoop:
-        return self._loop
-
     def transport(self, file: NodeFile) -> Transport:
         ros_node = lean_node(file, self._context)
         self._ros_nodes[file.node.name] = ros_node
-        self._loop.add_node(ros_node)
+        self.loop.add_node(ros_node)
         transport: Transport
         if self._hub is None:
-            transport = RosTransport(file, ros_node, self._loop)
+            transport = RosTransport(file, ros_node, self.loop)
         else:
             is_asked = self._has_digests or self._is_recorded
             transport = MemoryTransport(
                 file,
                 self._hub,
-                RosGraphBridge(file, ros_node, self._loop),
+                RosGraphBridge(file, ros_node, self.loop),
                 digest_of if is_asked else self._tried_digest,
                 lambda c: not self._is_recorded or self._has_digests or not c.is_reliable,
             )
@@ -135,7 +131,7 @@ class RosProcess:
         """Remember what exists on a ROS node before its plugin gets hold of it."""
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = _entities(ros_node)
-        self._callbacks.append(PluginCallbacks(ros_node, self._loop, enter, fail))
+        self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         own = self._own_entities.get(file.node.name, set())
@@ -154,7 +150,7 @@ class RosProcess:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
         for callbacks in self._callbacks:
             callbacks.close()
-        self._loop.take_in()
+        self.loop.take_in()
 
     def close(self) -> None:
         """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
@@ -165,11 +161,11 @@ class RosProcess:
         self._no_spinning.close()
         for transport in self._transports:
             transport.close()
-        self._loop.run_for(_LINGER_S)
+        self.loop.run_for(_LINGER_S)
         self.has_leftovers = self._is_in_a_crowd()
         if self.has_leftovers:
             return
-        self._loop.close()
+        self.loop.close()
         give_up(self._context, self._ros_nodes.values())
 
     def _is_in_a_crowd(self) -> bool:
