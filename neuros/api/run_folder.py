@@ -32,7 +32,7 @@ from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile, Project
-from neuros.project.split import node_file_to_json, project_to_json
+from neuros.project.split import node_file_text, project_to_json
 from neuros.recording.provenance import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
 
@@ -84,13 +84,13 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     try:
         # Two runs that were given the same empty folder: only one of them gets it.
         with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
-            expanded.write(_text(project_to_json(plan.project)))
+            expanded.write(json.dumps(project_to_json(plan.project), indent=2) + "\n")
         for file in files:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
             seen = plan.deployment.as_seen(file)
             path.touch(0o600)  # wherever the folder is: it holds keys
-            path.write_text(_text(node_file_to_json(seen)), "utf-8")
+            path.write_text(node_file_text(seen), "utf-8")
     except FileExistsError as error:
         raise UsageError(
             f"{run_folder}: another run has just begun there; name a new one"
@@ -116,10 +116,6 @@ def _with_keys(files: Sequence[NodeFile]) -> list[NodeFile]:
         replace(f, keys={c.index: keys[c.index] for c in f.connections if c.index in keys})
         for f in files
     ]
-
-
-def _text(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, indent=2) + "\n"
 
 
 # ---------------------------------------------------------------------- recording

@@ -58,8 +58,7 @@ from neuros.control.machines import (
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError
 from neuros.ports import NodeProgram
-from neuros.project.model import NodeFile
-from neuros.project.split import node_file_to_json, node_files_from_json
+from neuros.project.split import node_file_text, node_files_from_json
 from neuros.transport.dds_profile import as_asked
 
 if TYPE_CHECKING:
@@ -172,10 +171,8 @@ class Agent:
                     self._examine()
                 case Finish():
                     self._finish()
-        except ProjectError as error:
-            self._pump.send(Refused(str(error)))
         except (NeurosError, OSError) as error:
-            self._pump.send(Refused(f"{error}"))
+            self._pump.send(Refused(str(error)))
 
     # ------------------------------------------------------------------ before the run
 
@@ -245,7 +242,7 @@ class Agent:
         assert self._run is not None
         files = node_files_from_json(order.nodes)
         names = [file.node.name for file in files]
-        given = {**order.files, **{f"{f.node.name}/node.json": _json_of(f) for f in files}}
+        given = {**order.files, **{f"{f.node.name}/node.json": node_file_text(f) for f in files}}
         for name, text in given.items():
             path = self._run / name
             path.parent.mkdir(exist_ok=True)
@@ -376,12 +373,6 @@ class _Remarks:
 
     def flush(self) -> None:
         """There is no buffer."""
-
-
-def _json_of(file: NodeFile) -> str:
-    import json
-
-    return json.dumps(node_file_to_json(file), indent=2) + "\n"
 
 
 def remove_old_runs(cache: Path) -> None:

@@ -325,11 +325,11 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
         start_environment,
         with_messages,
     )
-    from neuros.project.split import node_file_to_json
+    from neuros.project.split import node_file_text
 
     own = file.folders.run / file.node.name
     own.mkdir()
-    (own / "node.json").write_text(json.dumps(node_file_to_json(file), indent=2) + "\n", "utf-8")
+    (own / "node.json").write_text(node_file_text(file), "utf-8")
     added = {
         **node_environment(file),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF",  # it has no neighbours

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +63,11 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "environment_paths": list(node.environment_paths),
         **names_to_json(node_file.names),
     }
+
+
+def node_file_text(node_file: NodeFile) -> str:
+    """``node.json`` as it is written."""
+    return json.dumps(node_file_to_json(node_file), indent=2) + "\n"
 
 
 def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
