@@ -18,7 +18,7 @@ from typing import Any
 from neuros.backends.console import clean
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
-from neuros.control import Interrupt
+from neuros.control import Interrupt, Watch
 from neuros.control.link import ControlLink, read_as
 from neuros.errors import ControlError, EnvironmentFault
 
@@ -90,6 +90,7 @@ class Session:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
         else:
+            link.send(Watch())  # what observers ask for is heard of those that have greeted
             link.send(Interrupt())
             link.close()
 

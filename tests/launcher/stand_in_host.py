@@ -24,21 +24,34 @@ class Host:
     def __init__(self) -> None:
         self.scheme, _, self.place = os.environ["NEUROS_CONTROL"].partition(":")
         is_unix = self.scheme == "unix"
-        self.socket = socket.socket(socket.AF_UNIX if is_unix else socket.AF_INET)
+        self.family = socket.AF_UNIX if is_unix else socket.AF_INET
+        self.socket = socket.socket(self.family)
         self.lines = self.socket.makefile("r")
+        self.observer: socket.socket | None = None
         self.is_idle = True
         self.connections: dict[str, dict[str, Any]] = {"outgoing": {}, "incoming": {}}
 
-    def hello(self) -> None:
+    def connect(self, end: socket.socket) -> None:
         if self.scheme == "unix":
-            self.socket.connect(os.path.basename(self.place))  # which may be too long as a whole
+            end.connect(os.path.basename(self.place))  # which may be too long as a whole
         else:
             name, _, port = self.place.partition(":")
-            self.socket.connect((name, int(port)))
+            end.connect((name, int(port)))
+
+    def hello(self) -> None:
+        self.connect(self.socket)
         self.send("hello", nodes=NAMES)
 
     def send(self, kind: str, **fields: Any) -> None:
         self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
+
+    def ask(self, kind: str) -> None:
+        """Ask for something as an observer, over a connection of its own."""
+        if self.observer is None:
+            self.observer = socket.socket(self.family)
+            self.connect(self.observer)
+            self.observer.sendall(b'{"kind": "watch"}\n')
+        self.observer.sendall(json.dumps({"kind": kind}).encode() + b"\n")
 
     def tell(self, kind: str, **fields: Any) -> None:
         """Send a message about the (first) node."""

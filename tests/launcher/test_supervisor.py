@@ -48,7 +48,7 @@ def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> N
 
 
 def test_a_pause_before_the_first_hook_leaves_the_duration_as_it_is(run: Run) -> None:
-    paused = "host.send('pause'); time.sleep(1.0); host.send('resume')"
+    paused = "host.ask('pause'); time.sleep(1.0); host.ask('resume')"
     act = f"host.hello(); host.report(); import time; {paused}; host.tell('first_hook')"
     outcome = run(a=f"{act}; host.serve()", duration_s=0.3)
     assert outcome.reason == "0.3 s are over"
@@ -56,7 +56,7 @@ def test_a_pause_before_the_first_hook_leaves_the_duration_as_it_is(run: Run) ->
 
 
 def test_a_pause_is_no_part_of_the_duration(run: Run) -> None:
-    pauses = "host.up(); import time; host.send('pause'); time.sleep(0.6); host.send('resume'); "
+    pauses = "host.up(); import time; host.ask('pause'); time.sleep(0.6); host.ask('resume'); "
     outcome = run(a=f"{pauses} host.serve()", duration_s=0.3)
     assert outcome.reason == "0.3 s are over"
     assert outcome.ending_s - outcome.started_s >= 0.85
@@ -64,7 +64,7 @@ def test_a_pause_is_no_part_of_the_duration(run: Run) -> None:
 
 
 def test_a_run_that_is_stopped_while_paused_ended_when_the_pause_began(run: Run) -> None:
-    pauses = "host.up(); import time; host.send('pause'); time.sleep(0.6); host.send('interrupt')"
+    pauses = "host.up(); import time; host.ask('pause'); time.sleep(0.6); host.ask('interrupt')"
     outcome = run(a=f"{pauses}; host.serve()")
     assert outcome.exit_code == 130
     assert outcome.paused_s >= 0.55
