@@ -38,8 +38,7 @@ from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
 from neuros.errors import UsageError
 from neuros.options import options_of
-from neuros.project.model import Folders, Node, NodeFile, Project
-from neuros.project.resources import memory_text
+from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
 from neuros.project.split import split, translated
 
 ROOT = Path("/neuros")

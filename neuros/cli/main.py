@@ -70,9 +70,9 @@ COMMANDS = {
     "doctor": Command("setup", "check this machine, and prove that packets arrive"),
     "containers": Command("setup", "build, list and remove the images that nodes run in"),
     "benchmark": Command(
-        "checkout", "measure what NeuROS costs, compared with the same program without it"
+        "setup", "measure what NeuROS costs, compared with the same program without it"
     ),
-    "reproduce": Command("checkout", "repeat the published experiments"),
+    "reproduce": Command("setup", "repeat the published experiments"),
     "node": Command("node"),
     "part": Command("launch"),
     "import-plugin": Command("projects"),

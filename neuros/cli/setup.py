@@ -1,8 +1,9 @@
-"""``neuros build``, ``containers`` and ``doctor``: prepare this machine for runs, and check it."""
+"""``neuros build``, ``containers``, ``doctor``, ``benchmark``, ``reproduce``: all for this machine."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -14,11 +15,13 @@ from typing import TYPE_CHECKING
 from neuros.backends.containers import OWN_FOLDER, STANDARD
 from neuros.caching import cache_root
 from neuros.cli.common import JSON, add_format, print_json
+from neuros.distribution import ROOT
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 from neuros.installation.command import add_build_options
 
 if TYPE_CHECKING:
     from neuros.backends.containers import Recipe
+
 
 _CONTAINERS_EPILOG = """\
 exit codes:
@@ -61,8 +64,7 @@ def _build(options: argparse.Namespace) -> int:
     from neuros.api.loading import workspaces_of
     from neuros.cli.environments import build_messages
     from neuros.distribution import WORKSPACE
-    from neuros.messages.compilation import Compilers
-    from neuros.messages.needed import Messages
+    from neuros.messages.needed import Compilers, Messages
     from neuros.project.suggest import did_you_mean
 
     project = Path(options.project or os.curdir)
@@ -283,3 +285,37 @@ def _doctor(options: argparse.Namespace) -> int:
     if options.format == JSON:
         print_json(found)
     return 4 if any(finding.state is State.BAD for finding in found) else 0
+
+
+# ---------------------------------------------------------------------- programs of the checkout
+#
+# ``neuros benchmark`` and ``neuros reproduce``, whose options and programs are in the checkout.
+
+
+_OPTIONS = "benchmarks.options"
+
+
+def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    _add_options(benchmark, "add_benchmark")
+
+
+def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    _add_options(reproduce, "add_reproduce")
+
+
+def _add_options(parser: argparse.ArgumentParser, name: str) -> None:
+    """Have the checkout add its options.
+
+    Raises:
+        EnvironmentFault: where neuros was installed without a checkout.
+    """
+    if not (ROOT / _OPTIONS.replace(".", "/")).with_suffix(".py").is_file():
+        raise EnvironmentFault(
+            f"there are no benchmarks in {ROOT}: they are part of the source checkout and not of"
+            " the package; clone it, run ./install.py there, and use its .venv/bin/neuros"
+        )
+    if str(ROOT) not in sys.path:
+        sys.path.insert(0, str(ROOT))
+    getattr(importlib.import_module(_OPTIONS), name)(parser)

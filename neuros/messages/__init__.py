@@ -9,7 +9,7 @@ ROS distribution is done here with rosidl's generators, which come with the whee
   what is built, and by which process a package is built now;
 - :mod:`~neuros.messages.checking` finds mistakes in them, line by line;
 - :mod:`~neuros.messages.needed` builds what a run needs, with the generators in
-  :mod:`~neuros.messages.generation` and the compiler in :mod:`~neuros.messages.compilation`.
+  :mod:`~neuros.messages.generation` and a compiler.
 
 **One build for every Python.** Of what the generators write only the conversion from and to Python
 objects depends on Python. It is compiled against Python's stable ABI (``stable_abi.h``), and needs

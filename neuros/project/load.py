@@ -21,12 +21,16 @@ from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalise
 from neuros.project.model import (
     NETWORK,
     NETWORK_MODULE,
+    Access,
     Budgets,
     Connection,
     Node,
     Port,
     Project,
+    Resources,
+    access_of,
     parameters_of,
+    resources_of,
 )
 from neuros.project.parsed import (
     ParsedProject,
@@ -38,7 +42,6 @@ from neuros.project.parsed import (
 )
 from neuros.project.paths import PathError, Roots, find_module, is_module_name, why_no_module
 from neuros.project.qos import qos_of
-from neuros.project.resources import Access, Resources, access_of, resources_of
 from neuros.project.scanner import Element, SourceError, display_name
 from neuros.project.suggest import did_you_mean
 from neuros.project.validate import violations

@@ -16,13 +16,15 @@ from neuros.project.model import (
     NodeFile,
     Port,
     Project,
+    access_of,
+    keys_of,
     parameters_of,
     parameters_to_json,
+    resources_of,
 )
 from neuros.project.names import names_from, names_to_json
 from neuros.project.paths import find_module, is_module_name
 from neuros.project.qos import qos_of, qos_to_json
-from neuros.project.resources import access_of, keys_of, resources_of
 
 
 def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[NodeFile, ...]:

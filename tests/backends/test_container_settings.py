@@ -21,8 +21,7 @@ from neuros.backends.docker.settings import (
 )
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
-from neuros.project.model import Folders, Node, NodeFile
-from neuros.project.resources import Access, Resources
+from neuros.project.model import Access, Folders, Node, NodeFile, Resources
 
 HERE = Folders(Path("/home/me/robot"), Path("/opt/ws"), Path("/home/me/runs/1"))
 IMAGE = Image("sha256:1234", "neuros_python", ("/opt/neuros/bin/python",), (3, 11))

@@ -24,8 +24,7 @@ from neuros.backends.docker import engine as engine_module
 from neuros.backends.docker.engine import Abilities, connect, engine_faults, engine_name, explain
 from neuros.backends.docker.launcher import without_limits
 from neuros.errors import EnvironmentFault
-from neuros.project.model import Node
-from neuros.project.resources import Resources
+from neuros.project.model import Node, Resources
 
 
 def fault_of(environ: dict[str, str]) -> str:

@@ -14,8 +14,7 @@ from message_packages import write_package
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
 from neuros.messages import needed
-from neuros.messages.compilation import Compilers
-from neuros.messages.needed import Messages
+from neuros.messages.needed import Compilers, Messages
 from neuros.messages.package import find_packages
 from neuros.messages.workspace import Built, Workspaces, message_cache, sweep
 from neuros.project.model import Node, Port

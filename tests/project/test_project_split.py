@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from neuros.project.load import load_project
-from neuros.project.model import Connection, Folders, Node, Port, Project
+from neuros.project.model import Access, Connection, Folders, Node, Port, Project, Resources
 from neuros.project.names import Names
 from neuros.project.qos import Qos
-from neuros.project.resources import Access, Resources
 from neuros.project.split import (
     node_file_from_json,
     node_file_to_json,

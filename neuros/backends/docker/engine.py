@@ -66,7 +66,7 @@ class Abilities:
 
     Attributes:
         is_rootless: whether it runs as an ordinary user, who is root in its containers.
-        unkept: what of :class:`neuros.project.resources.Resources` it accepts and does not keep
+        unkept: what of :class:`neuros.project.model.Resources` it accepts and does not keep
             to, since there are no control groups for it.
     """
 

@@ -54,8 +54,7 @@ from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault, results_of
 from neuros.ports import Deployment, NodeProgram, Notice, Reaper
 from neuros.project.load import PROJECT_FILE
-from neuros.project.model import Folders, Node, NodeFile
-from neuros.project.resources import memory_text
+from neuros.project.model import Folders, Node, NodeFile, memory_text
 
 TOOL_IMAGE = "neuros_tools"
 _STOP_S = 2

@@ -39,8 +39,7 @@ from neuros.backends.node_command import DEFAULTS, without_mark
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.project.deployment import Host
-from neuros.project.model import Node
-from neuros.project.resources import memory_text
+from neuros.project.model import Node, memory_text
 
 AGENT_LABEL = "neuros.agent"
 """The label of every container with an agent."""
