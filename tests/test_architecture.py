@@ -113,7 +113,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "messages.checking": {"rosidl_adapter"},
     "messages.workspace": {"rosidl_adapter"},
     "messages.generation": GENERATORS,
-    "messages.compilation": {"numpy"},
+    "messages.needed": {"numpy"},
     "cli.main": {"argcomplete"},
     "cli.template": {"std_msgs"},
     "cli.live": {"tabulate"},

@@ -1,4 +1,4 @@
-"""``neuros build``, ``containers``, ``doctor``, ``benchmark``, ``reproduce``: all for this machine."""
+"""``neuros build``, ``containers``, ``doctor``, ``benchmark``, ``reproduce``: for this machine."""
 
 from __future__ import annotations
 
