@@ -9,27 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from neuros.errors import Problem
-from neuros.simulators.convert import joints, links
+from neuros.simulators.convert import bodies, links
 from neuros.simulators.convert.elements import DEEPEST, Element, Finder, NotFound, Report, parse
-from neuros.simulators.convert.frames import (
-    Branch,
-    Joint,
-    Link,
-    Scope,
-    Vector,
-    grow,
-    place_all,
-    read_pose,
-    read_scope,
-)
+from neuros.simulators.convert.frames import Branch, Joint, Link, Scope, grow, place_all, read_scope
 from neuros.simulators.convert.mjcf import Building, Converted, Meshes, compile_boxed, said_by
 
 _OVERRIDDEN = ("pose", "static", "placement_frame")  # by the children of an <include>
-_INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
-_TOLERANCE = 1e-9
 _MOST_LINKS = 1000
 _GRAVITY = (0.0, 0.0, -9.8)
 _MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
@@ -234,7 +221,7 @@ def _grow(scope: Scope) -> tuple[list[Branch], list[Joint]]:
     for inner, element in scope.each("joint"):
         ends = [_end(inner, element, side) for side in ("parent", "child")]
         joint = Joint(element, inner, *ends)
-        if not joints.is_known(joint) or element.name not in inner.frames:
+        if not bodies.is_known(joint) or element.name not in inner.frames:
             continue
         if all(end is None or end.is_static for end in ends):
             element.note("left out: neither of its ends can move")
@@ -257,39 +244,18 @@ def _build(building: Building, scope: Scope, branches: list[Branch], loops: list
     if scope.element.tag == "world":
         _read_world(building, scope)
     for branch in branches:
-        _add_body(building, branch)
+        bodies.add_body(building, branch)
     links.share_masks(building)
     for branch in branches:
         if branch.joint is not None:
             links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
     for joint in loops:
-        joints.close_loop(building, joint)
-    joints.add_mimics(building, scope)
-    joints.add_actuators(building, scope)
+        bodies.close_loop(building, joint)
+    bodies.add_mimics(building, scope)
+    bodies.add_actuators(building, scope)
     links.add_frames(building, scope)
     links.add_lights(building, scope)
     _exclude_contacts(building, scope)
-
-
-def _add_body(building: Building, branch: Branch) -> None:
-    link, inertial = branch.link, branch.link.element.child("inertial")
-    body = building.add("body", branch.parent, link.pose, link.name, link.element)
-    building.bodies[id(link)] = body
-    # Since SDF 1.11 the mass may be computed from shapes and densities.
-    is_solid = inertial is not None and inertial.has("auto") and not link.is_static
-    if not link.is_static and not is_solid:
-        _set_inertia(body, link.element, inertial)
-    elif link.is_static and inertial is not None:
-        inertial.take_all()  # what never moves needs none
-    if not link.element.is_true("gravity", default=True):
-        body.gravcomp = 1.0
-    if branch.joint is not None:
-        joints.add_joints(building, branch, branch.joint)
-    elif not link.is_static:
-        free = body.add_freejoint()
-        free.name = building.name("joint", f"{link.name}/free", link.element)
-    links.add_shapes(building, link, is_solid=is_solid)
-    links.add_link_sensors(building, link)
 
 
 def _exclude_contacts(building: Building, scope: Scope) -> None:
@@ -334,45 +300,6 @@ def _compiled(building: Building, root: Element) -> Any:
     for warning in heard:
         root.remark(f"MuJoCo: {' '.join(str(warning.message).split())}")
     return model
-
-
-def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
-    """Set mass (kg), its centre (m) and inertia (kg m²); SDF's defaults are 1 kg and 1 kg m²."""
-    mass, centre, matrix = 1.0, np.zeros(3), np.eye(3)
-    if inertial is None:
-        link.remark("no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")
-    else:
-        pose = read_pose(inertial)
-        mass, centre = inertial.number("mass", 1.0, positive=True), pose.position
-        element = inertial.child("inertia") or inertial.made("inertia")
-        ixx, iyy, izz, ixy, ixz, iyz = (element.number(*entry) for entry in _INERTIA.items())
-        matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-        matrix = pose.rotation @ _possible(matrix, element) @ pose.rotation.T
-    body.explicitinertial = True
-    body.mass, body.ipos = mass, centre
-    body.fullinertia = [*np.diag(matrix), matrix[0, 1], matrix[0, 2], matrix[1, 2]]
-
-
-def _possible(matrix: Vector, element: Element) -> Vector:
-    """The matrix, or one that a rigid body can have."""
-    if not np.isfinite(matrix).all():
-        element.problem("every moment of inertia must be finite")
-        return np.eye(3)
-    least, middle, most = np.linalg.eigvalsh(matrix)
-    if least <= 0:
-        element.problem(
-            f"no body has this inertia: its principal moments are {least:.3g}, {middle:.3g} and"
-            f" {most:.3g} kg m², and each must be positive",
-        )
-        return np.eye(3)
-    if least + middle < most * (1 - _TOLERANCE):
-        mean = float(np.trace(matrix)) / 3
-        element.remark(
-            f"no body has this inertia (its largest principal moment, {most:.3g} kg m², exceeds the"
-            f" sum of the others): MuJoCo gets {mean:.3g} kg m² about every axis",
-        )
-        return np.eye(3) * mean
-    return matrix
 
 
 def _read_world(building: Building, scope: Scope) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import mujoco
 
 from neuros.errors import Problem
+from neuros.simulators.convert.bodies import follow_joint
 from neuros.simulators.convert.elements import Element, Finder, NotFound, Report, parse
-from neuros.simulators.convert.joints import follow_joint
 from neuros.simulators.convert.mjcf import (
     Converted,
     Triangles,

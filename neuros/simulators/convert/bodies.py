@@ -1,4 +1,4 @@
-"""Joints of SDF as joints, equality constraints and actuators of MuJoCo."""
+"""Bodies of SDF's links in MuJoCo, with their joints, and constraints and actuators of joints."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from neuros.simulators.convert import links
 from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector
+from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector, read_pose
 from neuros.simulators.convert.mjcf import Building
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
+_INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
+_TOLERANCE = 1e-9
 _NO_LIMIT = 1e15
 _UNLIMITED_ENDS = (-1e16, 1e16)
 # The kinds of joints in MuJoCo that each type consists of, by the element with its axis.
@@ -35,6 +38,67 @@ _CONNECT = mujoco.mjtEq.mjEQ_CONNECT
 _WELD = mujoco.mjtEq.mjEQ_WELD
 _POSITION, _VELOCITY = "JointPositionController", "JointController"
 _STIFF_GAIN = 1000.0
+
+
+def add_body(building: Building, branch: Branch) -> None:
+    """Add the body of a link with its inertia, joints, shapes and sensors."""
+    link, inertial = branch.link, branch.link.element.child("inertial")
+    body = building.add("body", branch.parent, link.pose, link.name, link.element)
+    building.bodies[id(link)] = body
+    # Since SDF 1.11 the mass may be computed from shapes and densities.
+    is_solid = inertial is not None and inertial.has("auto") and not link.is_static
+    if not link.is_static and not is_solid:
+        _set_inertia(body, link.element, inertial)
+    elif link.is_static and inertial is not None:
+        inertial.take_all()  # what never moves needs none
+    if not link.element.is_true("gravity", default=True):
+        body.gravcomp = 1.0
+    if branch.joint is not None:
+        _add_joints(building, branch, branch.joint)
+    elif not link.is_static:
+        free = body.add_freejoint()
+        free.name = building.name("joint", f"{link.name}/free", link.element)
+    links.add_shapes(building, link, is_solid=is_solid)
+    links.add_link_sensors(building, link)
+
+
+def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
+    """Set mass (kg), its centre (m) and inertia (kg m²); SDF's defaults are 1 kg and 1 kg m²."""
+    mass, centre, matrix = 1.0, np.zeros(3), np.eye(3)
+    if inertial is None:
+        link.remark("no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")
+    else:
+        pose = read_pose(inertial)
+        mass, centre = inertial.number("mass", 1.0, positive=True), pose.position
+        element = inertial.child("inertia") or inertial.made("inertia")
+        ixx, iyy, izz, ixy, ixz, iyz = (element.number(*entry) for entry in _INERTIA.items())
+        matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+        matrix = pose.rotation @ _possible(matrix, element) @ pose.rotation.T
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, centre
+    body.fullinertia = [*np.diag(matrix), matrix[0, 1], matrix[0, 2], matrix[1, 2]]
+
+
+def _possible(matrix: Vector, element: Element) -> Vector:
+    """The matrix, or one that a rigid body can have."""
+    if not np.isfinite(matrix).all():
+        element.problem("every moment of inertia must be finite")
+        return np.eye(3)
+    least, middle, most = np.linalg.eigvalsh(matrix)
+    if least <= 0:
+        element.problem(
+            f"no body has this inertia: its principal moments are {least:.3g}, {middle:.3g} and"
+            f" {most:.3g} kg m², and each must be positive",
+        )
+        return np.eye(3)
+    if least + middle < most * (1 - _TOLERANCE):
+        mean = float(np.trace(matrix)) / 3
+        element.remark(
+            f"no body has this inertia (its largest principal moment, {most:.3g} kg m², exceeds the"
+            f" sum of the others): MuJoCo gets {mean:.3g} kg m² about every axis",
+        )
+        return np.eye(3) * mean
+    return matrix
 
 
 def _direction(joint: Joint, tag: str) -> Vector:
@@ -80,7 +144,7 @@ def is_known(joint: Joint) -> bool:
     return False
 
 
-def add_joints(building: Building, branch: Branch, joint: Joint) -> None:
+def _add_joints(building: Building, branch: Branch, joint: Joint) -> None:
     """Add the joints between a body and the one that it hangs on."""
     body, link = building.body(branch.link), branch.link
     place = link.pose.inverse() @ joint.anchor
