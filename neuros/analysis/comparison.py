@@ -23,6 +23,8 @@ from neuros.recording.stored import stored_messages
 
 _Figures = dict[tuple[str, int], float | None]
 """Values by their name and the digits after the point."""
+_LARGE_BYTES = 64 * 1024
+"""The buffers of larger messages travel beside them, and nodes digest them apart."""
 
 
 def labels_of(runs: Sequence[PastRun]) -> list[str]:
@@ -151,10 +153,6 @@ def comparison_figure(runs: Sequence[PastRun]) -> Any | None:
     handles, labels = all_axes[0].get_legend_handles_labels()
     add_legend(figure, 4, handles=handles, labels=labels)
     return figure
-
-
-_LARGE_BYTES = 64 * 1024
-"""The buffers of larger messages travel beside them, and nodes digest them apart."""
 
 
 class RecordedPackets:

@@ -41,6 +41,42 @@ _NUMBERS = {
 _EMPTY = "structure_needs_at_least_one_member"
 _BASE, _NAME, _ARRAY = 1, 2, 3
 _MOST_LAYOUTS = 64
+_UNITS = {
+    "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
+    "builtin_interfaces/msg/Time": {"sec": "s", "nanosec": "ns"},
+    "geometry_msgs/msg/Accel": {"linear": "m/s^2", "angular": "rad/s^2"},
+    "geometry_msgs/msg/Pose": {"position": "m"},
+    "geometry_msgs/msg/Transform": {"translation": "m"},
+    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
+    "geometry_msgs/msg/Wrench": {"force": "N", "torque": "N m"},
+    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa", "variance": "Pa^2"},
+    "sensor_msgs/msg/Illuminance": {"illuminance": "lx", "variance": "lx^2"},
+    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2"},
+    "sensor_msgs/msg/LaserScan": {
+        **dict.fromkeys(("angle_min", "angle_max", "angle_increment"), "rad"),
+        **dict.fromkeys(("time_increment", "scan_time"), "s"),
+        **dict.fromkeys(("range_min", "range_max", "ranges"), "m"),
+    },
+    "sensor_msgs/msg/MagneticField": {"magnetic_field": "T"},
+    "sensor_msgs/msg/Range": {
+        "field_of_view": "rad",
+        **dict.fromkeys(("min_range", "max_range", "range"), "m"),
+    },
+    "sensor_msgs/msg/Temperature": {"temperature": "degC", "variance": "degC^2"},
+}
+# By encoding: the type of a pixel's values, and its channels.
+_PIXELS = {
+    **{name: ("u1", tuple(name[:-1])) for name in ("rgb8", "bgr8", "rgba8", "bgra8")},
+    "rgb16": ("u2", tuple("rgb")),
+    "bgr16": ("u2", tuple("bgr")),
+    "mono8": ("u1", ()),
+    "mono16": ("u2", ()),
+    "8UC1": ("u1", ()),
+    "8UC3": ("u1", (0, 1, 2)),
+    "16UC1": ("u2", ()),
+    "32FC1": ("f4", ()),
+}
+Floats = npt.NDArray[np.float64]
 
 
 class _Irregular(Exception):
@@ -244,43 +280,6 @@ def _join(parts: Sequence[tuple[npt.NDArray[np.intp], Column]], count: int) -> C
     return objects
 
 
-_UNITS = {
-    "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
-    "builtin_interfaces/msg/Time": {"sec": "s", "nanosec": "ns"},
-    "geometry_msgs/msg/Accel": {"linear": "m/s^2", "angular": "rad/s^2"},
-    "geometry_msgs/msg/Pose": {"position": "m"},
-    "geometry_msgs/msg/Transform": {"translation": "m"},
-    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
-    "geometry_msgs/msg/Wrench": {"force": "N", "torque": "N m"},
-    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa", "variance": "Pa^2"},
-    "sensor_msgs/msg/Illuminance": {"illuminance": "lx", "variance": "lx^2"},
-    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2"},
-    "sensor_msgs/msg/LaserScan": {
-        **dict.fromkeys(("angle_min", "angle_max", "angle_increment"), "rad"),
-        **dict.fromkeys(("time_increment", "scan_time"), "s"),
-        **dict.fromkeys(("range_min", "range_max", "ranges"), "m"),
-    },
-    "sensor_msgs/msg/MagneticField": {"magnetic_field": "T"},
-    "sensor_msgs/msg/Range": {
-        "field_of_view": "rad",
-        **dict.fromkeys(("min_range", "max_range", "range"), "m"),
-    },
-    "sensor_msgs/msg/Temperature": {"temperature": "degC", "variance": "degC^2"},
-}
-# By encoding: the type of a pixel's values, and its channels.
-_PIXELS = {
-    **{name: ("u1", tuple(name[:-1])) for name in ("rgb8", "bgr8", "rgba8", "bgra8")},
-    "rgb16": ("u2", tuple("rgb")),
-    "bgr16": ("u2", tuple("bgr")),
-    "mono8": ("u1", ()),
-    "mono16": ("u2", ()),
-    "8UC1": ("u1", ()),
-    "8UC3": ("u1", (0, 1, 2)),
-    "16UC1": ("u2", ()),
-    "32FC1": ("f4", ()),
-}
-
-
 class Topic(Protocol):
     """A recorded topic."""
 
@@ -382,9 +381,6 @@ def pixels_of(columns: Mapping[str, Column], prefix: str) -> Column | None:
     rows = np.ascontiguousarray(data.reshape(len(data), height, step)[:, :, :used])
     pixels: Column = rows.view(value).astype(value.newbyteorder("="), copy=False)
     return pixels.reshape((len(data), height, width, *([len(channels)] if channels else [])))
-
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,8 @@ _ALL_NS = (1 << 63) - 1
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
 _IsNew: TypeAlias = Callable[[int, int], bool]
+DAMAGED_NAME = "bag.damaged"
+KEPT_NAME = "bag.before_repair"
 
 
 class Recorder:
@@ -238,10 +240,6 @@ class _SpoolSource:
 def has_spools(run: Path, nodes: Collection[str]) -> bool:
     """Whether packets of a run wait to be put into its bag."""
     return any(any((run / name / "spool").glob("*")) for name in (*nodes, LISTENER))
-
-
-DAMAGED_NAME = "bag.damaged"
-KEPT_NAME = "bag.before_repair"
 
 
 @contextlib.contextmanager

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+ROUNDING_S = 1e-9
+"""By so much may a spike lie outside of its step: sums of floats of seconds are not exact."""
 
 
 @dataclass(frozen=True)
@@ -175,10 +177,6 @@ class RegularEncoder:
         after_s = (nth - self._phase[neuron]) / rates[neuron]
         self._phase = reached - counts
         return Spikes(neuron, start_s + np.minimum(after_s, duration_s)).in_order()
-
-
-ROUNDING_S = 1e-9
-"""By so much may a spike lie outside of its step: sums of floats of seconds are not exact."""
 
 
 class _Clock:

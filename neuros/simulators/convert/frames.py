@@ -24,6 +24,8 @@ import numpy.typing as npt
 from neuros.simulators.convert.elements import Element
 
 Vector = npt.NDArray[np.float64]
+_OWN = ("", "__model__", "world")
+_KINDS = ("link", "joint", "frame", "model")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +88,6 @@ def read_pose(owner: Element) -> Pose:
     if element.has("degrees"):
         angles = [math.radians(angle) for angle in angles]
     return from_rpy(x, y, z, *angles)
-
-
-_OWN = ("", "__model__", "world")
-_KINDS = ("link", "joint", "frame", "model")
 
 
 @dataclass(eq=False)

@@ -24,6 +24,16 @@ from neuros.simulators.convert.frames import Link, Pose, Vector, from_quaternion
 
 MARK = "made by `neuros convert`"
 """Stands in the first line of every file that is written here, and may be overwritten."""
+_READ_BY_MUJOCO = (".obj", ".stl", ".msh")
+_CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
+_CONVERTERS = ("trimesh", "collada")
+_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+_HOW = "`pip install 'neuros[meshes]'` converts it"
+Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
+"""Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
+_FLAT = 1e-4  # how thick, at most, by how long
+_THICKNESS_M = 0.01
+_RECTANGULAR = 0.999  # of its area, at least
 
 
 @dataclass
@@ -158,20 +168,6 @@ def _write_obj(file: Path, triangles: Triangles) -> None:
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     file.write_text("\n".join(lines) + "\n", "ascii")
-
-
-_READ_BY_MUJOCO = (".obj", ".stl", ".msh")
-_CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
-_CONVERTERS = ("trimesh", "collada")
-_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-_HOW = "`pip install 'neuros[meshes]'` converts it"
-
-Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
-"""Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
-
-_FLAT = 1e-4  # how thick, at most, by how long
-_THICKNESS_M = 0.01
-_RECTANGULAR = 0.999  # of its area, at least
 
 
 @dataclass
