@@ -186,7 +186,8 @@ class Export:
             (self.folder / NODES_FILE).write_text(content, "utf-8")
             file = self.folder / form.file
             documents = form.documents(self)
-            file.write_text(form.head.format(name=self.name) + _yaml(documents), "utf-8")
+            text = yaml.dump_all(documents, Dumper=_Dumper, sort_keys=False, width=10_000)
+            file.write_text(form.head.format(name=self.name) + text, "utf-8")
         return file
 
     def _check(self, form: Form) -> None:
@@ -526,8 +527,3 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
 
 
 _Dumper.add_representer(str, _text)
-
-
-def _yaml(documents: Sequence[Mapping[str, Any]]) -> str:
-    text: str = yaml.dump_all(documents, Dumper=_Dumper, sort_keys=False, width=10_000)
-    return text

@@ -165,7 +165,11 @@ class Recording:
         problems = list(recorded.problems)
         if recorded.counts:  # else the recorder has stopped, and said so
             problems += _missing(
-                {n: t for n, t in topics.items() if not _is_named(n, recorded.problems)}
+                {
+                    name: topic
+                    for name, topic in topics.items()
+                    if not any(text.startswith(f"{name} ") for text in recorded.problems)
+                }
             )
         record["recording"] = {
             "bag": str(self._run / BAG_NAME),
@@ -242,11 +246,6 @@ def summary(report: Mapping[str, Any]) -> str:
         of = "?" if None in passed else sum(passed)
         lines.append(f"recorded {seen} of {of} packets of connections that may lose any number")
     return "\n".join(lines)
-
-
-def _is_named(topic: str, problems: Sequence[str]) -> bool:
-    """Whether one of the problems is that this topic was left out."""
-    return any(problem.startswith(f"{topic} ") for problem in problems)
 
 
 def _missing(topics: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -172,26 +171,26 @@ class _Sweeping:
 
     def _execute(self, jobs: Jobs, waiting: Sequence[str]) -> None:
         """Have the runs made, and note each as soon as it has ended."""
-        ended: SimpleQueue[str] = SimpleQueue()
-        futures: dict[str, Future[Any]] = {}
-        noted: set[str] = set()
+        ended: SimpleQueue[Future[Any]] = SimpleQueue()
+        futures: dict[Future[Any], str] = {}
+        noted = 0
         try:
             submitted = jobs.submit([self._jobs[name] for name in waiting])
-            futures |= zip(waiting, submitted, strict=True)
-            for name, future in futures.items():
-                future.add_done_callback(partial(_put, ended, name))
-            while len(noted) < len(futures):
+            futures |= zip(submitted, waiting, strict=True)
+            for future in futures:
+                future.add_done_callback(ended.put)
+            while noted < len(futures):
                 # Python does not see a Ctrl+C that comes just before it waits, until it has waited.
                 with contextlib.suppress(Empty):
-                    name = ended.get(timeout=_HEED_S)
-                    noted.add(name)
-                    self._note(name, futures[name])
+                    future = ended.get(timeout=_HEED_S)
+                    noted += 1
+                    self._note(futures[future], future)
         except BaseException:
             # Wherever they are: jobs look for it.
             (self._sweep.folder / _STOP_NAME).touch()
             jobs.cancel()
-            wait(futures.values())
-            for name, future in futures.items():
+            wait(futures)
+            for future, name in futures.items():
                 self._take(name, future)
             raise
 
@@ -238,10 +237,6 @@ class _Sweeping:
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
         now_s = time.monotonic()
         self._next_save_s = now_s + _PAUSE_PER_WRITING * (now_s - started_s)
-
-
-def _put(ended: SimpleQueue[str], name: str, _: Future[Any]) -> None:
-    ended.put(name)
 
 
 def _as_list(given: Any) -> list[Any]:

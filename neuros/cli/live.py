@@ -126,21 +126,17 @@ def _filter(text: str) -> tuple[str, str]:
 def _rows(session: Session) -> Iterator[_RunningNode]:
     prefix = f"{session.namespace}/" if session.namespace else ""
     for node, state in session.states().items():
+        machine = session.elsewhere.get(node)
         yield _RunningNode(
             session.run,
             _user_name(session.user),
             session.project,
             prefix + node,
-            _where(session, node),
+            f"{session.backend} on {machine}" if machine else session.backend,
             session.since,
             state,
             session.folder,
         )
-
-
-def _where(session: Session, node: str) -> str:
-    machine = session.elsewhere.get(node)
-    return f"{session.backend} on {machine}" if machine else session.backend
 
 
 def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:

@@ -9,10 +9,9 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from graphlib import CycleError
 from importlib.util import find_spec
 from pathlib import Path
@@ -42,13 +41,11 @@ class Step:
 
     Attributes:
         needs: the packages of workspaces that it needs, directly or not, all built before it.
-        is_current: whether its files are still those that ``built`` is named after.
     """
 
     package: Package
     built: Built
     needs: Sequence[Built]
-    is_current: Callable[[], bool]
 
 
 class Messages:
@@ -74,10 +71,7 @@ class Messages:
         for built in builds:
             needs = workspaces.closure(workspaces.needs(built.package))
             package = workspaces.packages[built.package]
-            is_current = partial(self._is_current, built)
-            self._steps.append(
-                Step(package, built, [by_name[need.name] for need in needs], is_current)
-            )
+            self._steps.append(Step(package, built, [by_name[need.name] for need in needs]))
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
@@ -130,13 +124,10 @@ class Messages:
         missing = [step for step in self._steps if not step.built.is_there]
         if not missing:
             return
-        builder = _Builder(self._workspaces.ros, Compilers.here(), progress, environment)
+        builder = _Builder(self._workspaces, Compilers.here(), progress, environment)
         for step in missing:
             builder.build(step)
         sweep(missing[0].built.folder.parent)
-
-    def _is_current(self, built: Built) -> bool:
-        return built in self._workspaces.builds([built.package])
 
     def describe(self) -> list[str]:
         """One line per package."""
@@ -152,7 +143,7 @@ class Messages:
 class _Builder:
     """Builds packages, with a line of progress for each."""
 
-    ros: Ros
+    workspaces: Workspaces
     compilers: Compilers
     progress: Progress
     environment: Mapping[str, str]
@@ -192,11 +183,11 @@ class _Builder:
             self._generate(step, source)
             others = _others(package, source)
             needs = {need.package: need.folder for need in step.needs}
-            tools = (self.ros, self.compilers, self.environment)
+            tools = (self.workspaces.ros, self.compilers, self.environment)
             compile_package(Job(package.name, source, draft, others, needs, *tools))
             _install(package, source, draft)
             shutil.rmtree(source)
-            if not step.is_current():
+            if built not in self.workspaces.builds([package.name]):
                 raise EnvironmentFault(
                     f"message package '{package.name}' was changed while it was built: start again"
                 )
@@ -212,15 +203,15 @@ class _Builder:
             shutil.rmtree(draft, ignore_errors=True)
 
     def _generate(self, step: Step, source: Path) -> None:
-        package = step.package
-        shares = {name: str(self.ros.share(name)) for name in self.ros.message_packages()}
+        package, ros = step.package, self.workspaces.ros
+        shares = {name: str(ros.share(name)) for name in ros.message_packages()}
         shares |= {need.package: str(need.share) for need in step.needs}
         order = generation.Order(
             package.name,
             str(package.folder),
             [file.as_posix() for file in package.files],
             str(source),
-            str(self.ros.prefix),
+            str(ros.prefix),
             shares,
         )
         # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.

@@ -123,14 +123,10 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
         text = " ".join(
             line.strip() for line in lines if not line.startswith("Error(s) in package")
         )
-        raise ManifestError(problem_at(file, text, _line_of(error))) from error
+        line = getattr(error.__context__, "lineno", 1)  # what is missing is in no line
+        raise ManifestError(problem_at(file, text, int(line))) from error
     depends = (*manifest.build_depends, *manifest.build_export_depends, *manifest.exec_depends)
     return Package(manifest.name, folder, files, frozenset(each.name for each in depends))
-
-
-def _line_of(error: BaseException) -> int:
-    """The line that a mistake in XML is in; what is missing is in none."""
-    return int(getattr(error.__context__, "lineno", 1))
 
 
 @dataclass(frozen=True)
