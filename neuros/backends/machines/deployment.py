@@ -93,7 +93,7 @@ class Machines(Deployment):
         self.file = file
         self.monitors_load = monitors_load
         self.sides: list[Side] = []
-        self._engines: list[RemoteEngine] = []
+        self._held: list[Machine | AgentContainer | RemoteEngine] = []
         self.project = project
         self.notices = inner.notices
         self._inner = inner
@@ -118,14 +118,12 @@ class Machines(Deployment):
             EnvironmentFault: with all that went wrong; none of them is held any more then.
         """
         hosts = self.file.used
-        held: list[Machine | RemoteEngine] = []
         with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
-            work = [threads.submit(self._sides_of, host, log, held) for host in hosts]
+            work = [threads.submit(self._sides_of, host, log) for host in hosts]
             try:
                 wait(work)
             except BaseException:  # Ctrl+C
-                for each in tuple(held):
-                    each.close()
+                self._let_go()
                 raise
         sides, failed = results_of(work)
         self.sides = [side for of_host in sides for side in of_host]
@@ -145,14 +143,13 @@ class Machines(Deployment):
 
     def close(self) -> None:
         """Hang up on all machines, whose agents then end what is left."""
-        for side in self.sides:
-            side.machine.close()
+        self._let_go()
         self.sides = []
-        self._leave_engines()
 
-    def _leave_engines(self) -> None:
-        while self._engines:
-            self._engines.pop().close()
+    def _let_go(self) -> None:
+        """Close what was made last first: an engine after its containers."""
+        while self._held:
+            self._held.pop().close()
 
     def launcher(self, program: NodeProgram) -> Launcher:
         return _Launcher(self, self._inner.launcher(program), program)
@@ -180,7 +177,7 @@ class Machines(Deployment):
         with ThreadPoolExecutor(len(self.sides), "neuros-machines") as threads:
             for found in threads.map(lambda side: _bring_home(side, is_enough), self.sides):
                 faults += found
-        self._leave_engines()
+        self._let_go()
         return faults
 
     def node_there(self, file: NodeFile, side: Side) -> NodeFile:
@@ -199,32 +196,22 @@ class Machines(Deployment):
         node = translated(file.node, lambda path: moved(path, pairs))
         return replace(file, node=node, folders=there, messages=side.messages)
 
-    def _sides_of(self, host: Host, log: Log, held: list[Machine | RemoteEngine]) -> Sequence[Side]:
+    def _sides_of(self, host: Host, log: Log) -> Sequence[Side]:
         """One for all nodes there; where they are in containers, one for each."""
         names = tuple(node for node, place in self.places.items() if place == host.name)
         if not host.docker:
-            return [self._side(host, names, log, held)]
+            return [self._side(host, names, log)]
         # The Docker SDK is slow to import.
         from neuros.backends.docker.remote import RemoteEngine
 
         engine = RemoteEngine(host, ssh_command(host))
-        held.append(engine)
-        self._engines.append(engine)
+        self._held.append(engine)
         sides: list[Side] = []
-        try:
-            for name in names:
-                node = self.project.node(name)
-                container = engine.container(node, self.project.folder, log)
-                own = host if len(names) == 1 else replace(host, name=f"{host.name}-{name}")
-                try:
-                    sides.append(self._side(own, (name,), log, held, engine, container))
-                except BaseException:
-                    container.close()
-                    raise
-        except BaseException:
-            for side in sides:
-                side.machine.close()
-            raise
+        for name in names:
+            container = engine.container(self.project.node(name), self.project.folder, log)
+            self._held.append(container)
+            own = host if len(names) == 1 else replace(host, name=f"{host.name}-{name}")
+            sides.append(self._side(own, (name,), log, engine, container))
         return sides
 
     def _side(
@@ -232,27 +219,21 @@ class Machines(Deployment):
         host: Host,
         names: tuple[str, ...],
         log: Log,
-        held: list[Machine | RemoteEngine],
         engine: RemoteEngine | None = None,
         container: AgentContainer | None = None,
     ) -> Side:
         command = container.command if container else agent_command(host)
         machine = Machine(host, self.file.timeout_s, log, command)
-        held.append(machine)
-        try:
-            ready = machine.greet()
-            side = Side(machine, names, ready, container=container)
-            side.address = _address(host, ready, engine.reached_at if engine else ready.reached_at)
-            side.here = _own_address(self.file.here, side.address)
-            side.sent = machine.place(self.project.folder)
-            folders = Folders(self.project.folder, WORKSPACE, Path())
-            files = [f for f in split(self.project, lambda _: folders) if f.node.name in names]
-            side.messages = machine.prepare(
-                [node_file_to_json(self.node_there(file, side)) for file in files]
-            )
-        except BaseException:
-            machine.close()
-            raise
+        self._held.append(machine)
+        ready = machine.greet()
+        side = Side(machine, names, ready, container=container)
+        side.address = _address(host, ready, engine.reached_at if engine else ready.reached_at)
+        side.here = _own_address(self.file.here, side.address)
+        side.sent = machine.place(self.project.folder)
+        folders = Folders(self.project.folder, WORKSPACE, Path())
+        files = [f for f in split(self.project, lambda _: folders) if f.node.name in names]
+        described = [node_file_to_json(self.node_there(file, side)) for file in files]
+        side.messages = machine.prepare(described)
         return side
 
 
