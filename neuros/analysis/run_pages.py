@@ -26,12 +26,12 @@ import numpy.typing as npt
 from neuros.analysis import charts
 from neuros.analysis.findings import Findings
 from neuros.analysis.run_record import PastRun
-from neuros.backends.choice import back_end_of
 from neuros.bag import RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
 from neuros.project.dashboard import ARRAYS, SPIKES
 from neuros.recording.columns import has_simulated_time
+from neuros.registry import back_end_of
 
 MOST_SPIKES = 2_000_000
 """Of one output; later ones are left out."""

@@ -13,12 +13,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.backends.choice import ran_in_one_process
 from neuros.engine.metrics import TimeBudget, in_flight_and_lost, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 from neuros.recording.run_file import FORMAT, RUN_FILE, check_record, read_object, read_run_file
+from neuros.registry import ran_in_one_process
 
 if TYPE_CHECKING:
     from neuros.analysis.packets import Numbers, Packets, Trace

@@ -15,12 +15,12 @@ from typing import Any
 
 from neuros.api.plan import Network, Plan, check_machine, chosen_network
 from neuros.api.request import Request
-from neuros.backends.choice import Chosen
 from neuros.backends.process_launchers import PROCESS
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, NodeFile, Project
 from neuros.project.names import Names
 from neuros.project.split import budgets_to_json, node_file_to_json, node_files_from_json
+from neuros.registry import Chosen
 
 _AGAIN_S = 0.5
 

@@ -13,7 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.request import Request
-from neuros.backends.choice import Chosen, choose
 from neuros.backends.node_command import place, usable_cores, without_mark
 from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
@@ -29,7 +28,7 @@ from neuros.project.names import SESSION
 from neuros.project.scanner import problem_in
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.registry import AUTO
+from neuros.registry import AUTO, Chosen, choose
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,

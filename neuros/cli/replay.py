@@ -204,9 +204,9 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
     Raises:
         EnvironmentFault: if it cannot be made.
     """
-    from neuros.backends.choice import ran_in_one_process
     from neuros.backends.pythons import Pythons
     from neuros.cli.environments import make_shown_environments
+    from neuros.registry import ran_in_one_process
     from neuros.replay.from_container import not_here, ran_in_container
 
     own = [] if ran_in_one_process(run.record) else [file.node]

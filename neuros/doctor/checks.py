@@ -21,7 +21,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.loading import load_with_messages
-from neuros.backends.choice import option_values
 from neuros.backends.domain import choose_domain
 from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import usable_cores
@@ -31,7 +30,7 @@ from neuros.installation.machine import Machine, answer_of, install_opengl, offs
 from neuros.ports import Finding, SimulatorKind, State
 from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
-from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry
+from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry, option_values
 
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")

@@ -15,11 +15,11 @@ import pytest
 from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
-from neuros.backends.choice import choose
 from neuros.cli.launch import signals_noted
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
+from neuros.registry import choose
 from neuros.transport.dds_profile import MOST_LOCAL_PARTICIPANTS
 
 PORT = "std_msgs/msg/Int32"
