@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import io
 import signal
 import socket
 import sys
@@ -176,7 +177,7 @@ class LiveRun:
         self._done.wait(_AT_EXIT_S)
 
 
-class _Through:
+class _Through(io.TextIOBase):
     """Writes to the current ``sys.stdout``: a cell of a notebook, or what pytest captures."""
 
     encoding = "utf-8"
@@ -185,15 +186,6 @@ class _Through:
         sys.stdout.write(text)
         sys.stdout.flush()
         return len(text)
-
-    def isatty(self) -> bool:
-        return False
-
-    def flush(self) -> None:
-        sys.stdout.flush()
-
-    def fileno(self) -> int:
-        raise OSError("no file of its own")
 
 
 def _shown_on() -> TextIO | Any:

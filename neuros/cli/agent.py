@@ -8,6 +8,7 @@ the agent itself is killed.
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import platform
 import queue
@@ -358,21 +359,16 @@ class Agent:
             self._domain.release()
 
 
-class _Remarks:
+class _Remarks(io.TextIOBase):
     """What is said while environments are made, for the user at the launcher."""
 
     def __init__(self, pump: Pump) -> None:
         self._pump = pump
 
-    def isatty(self) -> bool:
-        return False
-
-    def write(self, text: str) -> None:
+    def write(self, text: str) -> int:
         for line in filter(str.strip, text.splitlines()):
             self._pump.send(Remark("INFO", line))
-
-    def flush(self) -> None:
-        """There is no buffer."""
+        return len(text)
 
 
 def remove_old_runs(cache: Path) -> None:

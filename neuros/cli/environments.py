@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -53,18 +54,16 @@ def build_messages(messages: Messages) -> int:
     return make_shown_environments(Pythons({}), [], messages)
 
 
-class _Output:
+class _Output(io.TextIOBase):
     """Standard output. It may be closed: then nothing is written, and no error is raised."""
 
     def isatty(self) -> bool:
         return os.isatty(1)
 
-    def write(self, text: str) -> None:
+    def write(self, text: str) -> int:
         with suppress(OSError):
             os.write(1, text.encode(errors="replace"))
-
-    def flush(self) -> None:
-        """There is no buffer."""
+        return len(text)
 
 
 @contextmanager
