@@ -33,7 +33,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
-from neuros.transport.compression import Traffic
+from neuros.transport.envelope import Traffic
 from neuros.transport.messages import RosPackets
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 

@@ -42,7 +42,7 @@ class WrongBytes(ProtocolError):
 PARCEL_MARK = b"NR"
 """Option bytes of the encapsulation header of a parcel (:mod:`neuros.transport.large_packets`)."""
 COMPRESSED_MARK = b"NZ"
-"""Those of a compressed packet (:mod:`neuros.transport.compression`)."""
+"""Those of a compressed packet (:mod:`neuros.transport.envelope`)."""
 
 
 class Encoder(Protocol):

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.transport.codecs import WrongBytes, message_codec
-from neuros.transport.compression import Traffic
+from neuros.transport.envelope import Traffic
 from neuros.transport.values import checker
 
 # By encoding (sensor_msgs/image_encodings.hpp): Pillow's mode of the image, and of its rows.

@@ -141,8 +141,8 @@ class MemoryTransport:
         return send
 
     def _sender_with_jpeg(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
-        from neuros.transport.compression import Traffic
         from neuros.transport.digests import digest_of_bytes
+        from neuros.transport.envelope import Traffic
         from neuros.transport.jpeg import JpegCodec
 
         encoded = [c for c in connections if c.is_jpeg]

@@ -2,7 +2,7 @@
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
 ``/ack`` (the position of the last packet that every taker has started on), and ``/reg``. Only what
-its own two nodes publish there is taken: see :mod:`neuros.transport.authentication`.
+its own two nodes publish there is taken: see :mod:`neuros.transport.envelope`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,18 @@ from std_msgs.msg import String, UInt64MultiArray
 
 from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
-from neuros.transport.compression import Compressor, Traffic, compressing, decompressing
 from neuros.transport.digests import Digest, digest_for, digest_of_data, make_digests
+from neuros.transport.envelope import (
+    Compressor,
+    DataTags,
+    Positions,
+    Traffic,
+    compressing,
+    decompressing,
+    signed,
+    verified,
+)
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
 from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, data_qos, is_compatible

@@ -41,8 +41,8 @@ from neuros.project.graph import graph_mermaid, graph_svg, graph_text
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
-from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import WrongBytes, cdr, message_codec
+from neuros.transport.envelope import DataTags, Positions, signed, verified
 from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.ros import data_qos

@@ -7,8 +7,8 @@ import struct
 import pytest
 from rclpy.serialization import deserialize_message
 
-from neuros.transport.authentication import DataTags, Positions, signed, verified
 from neuros.transport.codecs import PARCEL_MARK, message_codec
+from neuros.transport.envelope import DataTags, Positions, signed, verified
 from neuros.transport.large_packets import is_parcel
 from neuros.transport.messages import message_class
 

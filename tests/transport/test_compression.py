@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from neuros.errors import EnvironmentFault, ProtocolError
 from neuros.transport import compression
 from neuros.transport.codecs import COMPRESSED_MARK
-from neuros.transport.compression import Compressor, Traffic, compressing, decompressing
+from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
 
 HEADER = b"\0\1\0\0"
 IMAGE = HEADER + bytes(100_000)

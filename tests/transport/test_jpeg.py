@@ -12,7 +12,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.transport.codecs import WrongBytes, message_codec
-from neuros.transport.compression import Traffic
+from neuros.transport.envelope import Traffic
 from neuros.transport.jpeg import JpegCodec, jpeg_checker
 
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
