@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.errors import EnvironmentFault, ProtocolError
-from neuros.transport import compression
+from neuros.transport import envelope
 from neuros.transport.codecs import COMPRESSED_MARK
 from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
 
@@ -80,4 +80,4 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("backports", "compression"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(EnvironmentFault, match=r"pip install backports\.zstd"):
-        compression._library.__wrapped__()
+        envelope._library.__wrapped__()
