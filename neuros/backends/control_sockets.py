@@ -30,14 +30,8 @@ class UnixListener:
 
     def __init__(self, run_folder: Path, name: str = SOCKET_NAME) -> None:
         self._path = run_folder / name
-
-    @property
-    def address(self) -> str:
-        return f"{_SCHEME}:{self._path}"
-
-    @property
-    def files(self) -> tuple[Path]:
-        return (self._path,)
+        self.address = f"{_SCHEME}:{self._path}"
+        self.files = (self._path,)
 
     def open(self) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -247,33 +247,28 @@ class RunningContainer:
 
     Nothing here waits for the engine: it is asked for something in a thread of its own, and the
     events say what came of it.
+
+    Attributes:
+        id: that the engine has given it.
     """
 
     def __init__(
         self, file: NodeFile, container_id: str, engine: DockerClient, events: ContainerEvents
     ) -> None:
         self._file = file
-        self._id = container_id
+        self.names = (file.node.name,)
+        self.id = container_id
         self._engine = engine
         self._events = events
         self._is_told = False
         events.add(container_id)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (self._file.node.name,)
-
-    @property
-    def id(self) -> str:
-        """The id that the engine has given it."""
-        return self._id
-
     def poll(self) -> str | None:
         """``None`` while it runs, then how it ended, in words."""
-        end = self._events.end_of(self._id)
+        end = self._events.end_of(self.id)
         if end is not None:
             words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
-            is_stopped = self._events.is_signalled(self._id) and not self._is_told
+            is_stopped = self._events.is_signalled(self.id) and not self._is_told
             return f"{words}: {_STOPPED}" if is_stopped else words
         if self._events.lost and not self._events.has_processes(self._file.node.name):
             return f"the Docker engine went away ({self._events.lost}): start it again"
@@ -281,7 +276,7 @@ class RunningContainer:
 
     @property
     def is_abandoned(self) -> bool:
-        return bool(self._events.lost) and self._events.end_of(self._id) is None
+        return bool(self._events.lost) and self._events.end_of(self.id) is None
 
     def terminate(self) -> None:
         self._signal(signal.SIGTERM)
@@ -299,7 +294,7 @@ class RunningContainer:
     def _tell_engine(self, number: signal.Signals) -> None:
         # It may have ended meanwhile; the events say what became of it.
         with contextlib.suppress(DockerException, requests.RequestException):
-            self._engine.api.kill(self._id, int(number))
+            self._engine.api.kill(self.id, int(number))
 
 
 def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: int | None) -> str:

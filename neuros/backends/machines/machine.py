@@ -58,6 +58,7 @@ class Machine:
     Attributes:
         lost: why it cannot be reached any more, empty while it can.
         clock: how far its clocks are off.
+        folders: those of the project there, once it is placed.
         fault: what of it could not be kept here, empty if all could.
     """
 
@@ -67,7 +68,7 @@ class Machine:
         self.clock = ClockOffset()
         self._timeout_s = timeout_s
         self._log = log
-        self._folders: Folders | None = None
+        self.folders: Folders
         self._control: Callable[[], ControlStream] | None = None
         self._run: Path | None = None
         self._ends: dict[str, str] = {}
@@ -139,14 +140,8 @@ class Machine:
         for digest in lacking:
             self._send_content(digest, paths[digest])
         placed = self._await(agent.Placed)
-        self._folders = Folders(Path(placed.project), Path(placed.workspace), Path(placed.run))
+        self.folders = Folders(Path(placed.project), Path(placed.workspace), Path(placed.run))
         return len(lacking)
-
-    @property
-    def folders(self) -> Folders:
-        """The folders of the project there."""
-        assert self._folders is not None
-        return self._folders
 
     def prepare(self, nodes: Sequence[Mapping[str, object]]) -> tuple[Path, ...]:
         """Have environments and message packages made there; returns the folders of these.
