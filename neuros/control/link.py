@@ -23,12 +23,16 @@ class ControlLink:
         stream: what carries it.
         accepted: the messages that may come from the other end.
         peer: the other end, for error messages: "the supervisor", "node 'a'".
+
+    Attributes:
+        unsent: what :meth:`flush` is to write.
     """
 
     def __init__(self, stream: ControlStream, accepted: Sequence[type[Message]], peer: str) -> None:
         self.stream = stream
         self.peer = peer
         self.accept(accepted)
+        self.unsent = bytearray()
         self._parts: list[bytes] = []  # of a line whose end has not arrived
 
     def accept(self, accepted: Sequence[type[Message]]) -> None:
@@ -48,6 +52,20 @@ class ControlLink:
         """Send one message; returns False if the other end is gone."""
         try:
             self.stream.sendall(encode(message))
+        except OSError:
+            return False
+        return True
+
+    def flush(self) -> bool:
+        """Write what goes through now, on a stream that does not block; False if nobody is there.
+
+        An error shows again when the link is read.
+        """
+        try:
+            while self.unsent:
+                del self.unsent[: self.stream.send(self.unsent)]
+        except BlockingIOError:
+            pass
         except OSError:
             return False
         return True

@@ -58,7 +58,7 @@ class Channels:
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
         self._is_listening = True
-        self._unsent: dict[ControlLink, bytearray] = {}
+        self._links: dict[ControlLink, None] = {}  # in the order in which they came
         # All but node processes, and since when each has been connected; the next one to be read
         # comes first.
         self._others: dict[ControlLink, float] = {}
@@ -123,15 +123,15 @@ class Channels:
 
         What observers want and get is left out while too much waits; what ends a run never is.
         """
-        if link not in self._unsent:
+        if link not in self._links:
             return
         may_be_left_out = link not in self._nodes or isinstance(
             message, control.Look | control.Deliver
         )
-        if may_be_left_out and len(self._unsent[link]) >= _MOST_UNSENT_BYTES:
+        if may_be_left_out and len(link.unsent) >= _MOST_UNSENT_BYTES:
             return
-        self._unsent[link] += encode(message)
-        self._flush(link)
+        link.unsent += encode(message)
+        link.flush()
 
     def is_node(self, link: ControlLink) -> bool:
         """Whether a node process is, or was, at the other end."""
@@ -139,25 +139,25 @@ class Channels:
 
     def has(self, link: ControlLink) -> bool:
         """Whether that one is still connected."""
-        return link in self._unsent
+        return link in self._links
 
     def flush(self) -> None:
         """Try again to send what did not go through."""
-        for link, unsent in tuple(self._unsent.items()):
-            if unsent:
-                self._flush(link)
+        for link in self._links:
+            link.flush()
 
     def hang_up(self, link: ControlLink) -> None:
         """Neither send to this one nor hear it any more."""
         self._others.pop(link, None)
         self._strangers.discard(link)
-        if self._unsent.pop(link, None) is not None:
+        if link in self._links:
+            del self._links[link]
             self._selector.unregister(link)
             link.close()
 
     def close(self) -> None:
         """Hang up on all."""
-        for link in tuple(self._unsent):
+        for link in tuple(self._links):
             self.hang_up(link)
         self._selector.close()
         self._listener.close()
@@ -165,7 +165,7 @@ class Channels:
     def _read(self, link: ControlLink) -> Iterator[tuple[ControlLink, Message | ControlError]]:
         """All that a node process has said; of any other program, what comes first."""
         for _ in range(_READS_AT_A_TIME):
-            if link not in self._unsent:
+            if link not in self._links:
                 return
             try:
                 lines = link.read_lines()
@@ -188,7 +188,7 @@ class Channels:
         while len(self._others) < _MOST_OTHERS and (stream := self._listener.accept()) is not None:
             stream.setblocking(False)
             link = ControlLink(stream, (control.Hello, control.Watch), STRANGER)
-            self._unsent[link] = bytearray()
+            self._links[link] = None
             self._others[link] = now_s
             self._strangers.add(link)
             self._selector.register(link, selectors.EVENT_READ)
@@ -220,13 +220,6 @@ class Channels:
             link.accept(control.FROM_OBSERVERS)
             link.peer = "an observer"
         return message
-
-    def _flush(self, link: ControlLink) -> None:
-        unsent = self._unsent[link]
-        # An error shows again, and is dealt with, when we read.
-        with contextlib.suppress(OSError):
-            while unsent:
-                del unsent[: link.stream.send(unsent)]
 
 
 @dataclass

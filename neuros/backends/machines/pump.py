@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from neuros.control import Message
-from neuros.control.link import decode, encode, kind_of
+from neuros.control.link import ControlLink, decode, encode, kind_of
 from neuros.control.machines import Closed, Opened, Ping, Pong, Said
 from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
@@ -68,7 +68,7 @@ class Pump(threading.Thread):
         self._unsent = bytearray()
         self._rest = b""
         self._last: deque[Message] = deque()
-        self._links: dict[int, _Link] = {}
+        self._links: dict[int, ControlLink] = {}
         self._count = 0
         self._listener: ControlListener | None = None
         self._is_ending = False
@@ -172,7 +172,7 @@ class Pump(threading.Thread):
         if self._listener is not None and self._listener not in self._selector.get_map():
             self._selector.register(self._listener, selectors.EVENT_READ)
         for number, link in tuple(self._links.items()):
-            if not link.flush():
+            if not link.flush() or len(link.unsent) > _MOST_UNTOLD_BYTES:
                 self._part(number)
 
     def _read(self) -> str:
@@ -251,17 +251,22 @@ class Pump(threading.Thread):
 
     def _add(self, number: int, stream: ControlStream) -> None:
         stream.setblocking(False)
-        self._links[number] = link = _Link(stream)
+        self._links[number] = link = ControlLink(stream, (), self._peer)
         self._selector.register(link, selectors.EVENT_READ)
 
-    def _relay(self, number: int, link: _Link) -> bool:
+    def _relay(self, number: int, link: ControlLink) -> bool:
         """Pass on what was said; returns whether there may be more right now."""
-        text, size, is_open = link.read()
-        if text:
-            self.send(Said(number, text))
-        if not is_open:
+        try:
+            lines = link.read_lines()
+        except BlockingIOError:
+            return False
+        if lines is None:
             self._part(number)
-        return is_open and size > 0
+            return False
+        if lines:
+            text = b"".join(line + b"\n" for line in lines)
+            self.send(Said(number, text.decode("utf-8", "replace")))
+        return True
 
     def _part(self, number: int) -> None:
         self._hang_up(number)
@@ -272,43 +277,8 @@ class Pump(threading.Thread):
         if link is not None:
             link.flush()
             self._selector.unregister(link)
-            link.stream.close()
+            link.close()
 
     def _wake(self) -> None:
         with contextlib.suppress(OSError):
             self._waker.send(b"\0")
-
-
-class _Link:
-    """A control connection: whole lines from there, any text to there."""
-
-    def __init__(self, stream: ControlStream) -> None:
-        self.stream = stream
-        self.unsent = bytearray()
-        self._rest = b""
-
-    def fileno(self) -> int:
-        return self.stream.fileno()
-
-    def read(self) -> tuple[str, int, bool]:
-        """The lines that have come, how many bytes came, and whether it is still open."""
-        try:
-            data = self.stream.recv(_READ_BYTES)
-        except BlockingIOError:
-            return "", 0, True
-        except OSError:
-            return "", 0, False
-        whole, line_feed, rest = (self._rest + data).rpartition(b"\n")
-        self._rest = rest
-        return (whole + line_feed).decode("utf-8", "replace"), len(data), bool(data)
-
-    def flush(self) -> bool:
-        """Write what goes through now; False if there is nobody to take it."""
-        try:
-            while self.unsent:
-                del self.unsent[: self.stream.send(self.unsent)]
-        except BlockingIOError:
-            return len(self.unsent) < _MOST_UNTOLD_BYTES
-        except OSError:
-            return False
-        return True
