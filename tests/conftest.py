@@ -7,11 +7,17 @@ depends on the machine: it has tests of its own, which name it.
 import os
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 from marking import Watch, longest_first, mark
 from needs import require, summary
+
+with pytest.MonkeyPatch.context() as patch:
+    # NumPy reads it when it is loaded: threads of six workers spin while they wait for a core.
+    patch.setenv("OPENBLAS_NUM_THREADS", "1")
+    import_module("numpy")
 
 os.environ.setdefault("NEUROS_BACKEND", "process")
 LOADING = sys.getdlopenflags()

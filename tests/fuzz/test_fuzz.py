@@ -25,11 +25,12 @@ def test_an_ordinary_input_is_let_in(name: str) -> None:
 @pytest.mark.parametrize("name", TARGETS)
 def test_any_other_is_answered(name: str) -> None:
     target = TARGETS[name]
+    seeds = target.seeds()
 
     @settings(max_examples=20)
     @given(st.randoms(use_true_random=False))
     def check(chance: random.Random) -> None:
-        data = changed(target.seeds(), target.mutate, chance)
+        data = changed(seeds, target.mutate, chance)
         assert not fault_of(target, data, measures_memory=True), data
 
     check()
