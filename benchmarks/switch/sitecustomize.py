@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from neuros.node.effects import NodeEffects
+from neuros.node.node import NodeEffects
 
 Place = tuple[Any, str]
 
