@@ -226,15 +226,15 @@ class _Topic:
 
     Attributes:
         name: on the ROS graph.
-        connection: ``a.out -> b.in``; ``None`` for an external topic.
-        node, port: who samples its packets, and under which name; ``None``: nobody in this run.
+        connection: ``a.out -> b.in``; empty for an external topic.
+        node, port: who samples its packets, and under which name; empty: nobody in this run.
     """
 
     name: str
     type: str
-    connection: str | None
-    node: str | None
-    port: str | None
+    connection: str
+    node: str = ""
+    port: str = ""
 
     @property
     def calls(self) -> set[str]:
@@ -281,7 +281,7 @@ def _list(options: argparse.Namespace) -> int:
     topics = _topics(_run(options.run))
     if options.format == JSON:
         shown = ("name", "type", "connection")
-        print_json([{key: getattr(each, key) for key in shown} for each in topics])
+        print_json([{key: getattr(each, key) or None for key in shown} for each in topics])
     else:
         rows = [[each.connection or each.node, each.type, each.name] for each in topics]
         print(tabulate(rows, headers=["connection or node", "type", "topic"]))
@@ -291,8 +291,6 @@ def _list(options: argparse.Namespace) -> int:
 def _echo(options: argparse.Namespace) -> int:
     session = _run(options.run)
     topic = _named(_topics(session), options.topic)
-    if topic.node is None or topic.port is None:
-        raise UsageError(f"{topic.name}: its sender is in another run; ask that one")
     wanted = {topic.node: {topic.port: {"all": True}}}
     samples = (status.samples.get(topic.port, {}) for status in _watch(session, wanted, topic.node))
     seen = (sample for sample in samples if "all" in sample or "fault" in sample)
@@ -310,8 +308,6 @@ def _echo(options: argparse.Namespace) -> int:
 def _hz(options: argparse.Namespace) -> int:
     session = _run(options.run)
     topic = _named([each for each in _topics(session) if each.connection], options.topic)
-    if topic.node is None or topic.connection is None:
-        raise UsageError(f"{topic.name}: its sender is in another run; ask that one")
     statuses = _watch(session, {}, topic.node, _HZ_PERIOD_S)
     for per_s in islice(_rates(statuses, topic.connection), options.count):
         if options.format == JSON:
@@ -386,7 +382,7 @@ def _topics(session: Session) -> list[_Topic]:
     found: dict[str, _Topic] = {}
     for file in files:
         for topic in _topics_of(file):
-            if topic.node is not None:
+            if topic.node:
                 found[topic.name] = topic
             else:
                 found.setdefault(topic.name, topic)
@@ -401,18 +397,20 @@ def _topics_of(file: NodeFile) -> Iterator[_Topic]:
             kind = node.output(c.source_output).type
             yield _Topic(name, kind, str(c), node.name, c.source_output)
         else:
-            yield _Topic(name, node.input(c.destination_input).type, str(c), None, None)
+            yield _Topic(name, node.input(c.destination_input).type, str(c))
     for ports, is_input in ((node.inputs, True), (node.outputs, False)):
         for port in ports:
             if port.external_topic is not None:
                 name = file.names.resolve(port.external_topic, node.name)
                 seen = port.external_topic if is_input else port.name
-                yield _Topic(name, port.type, None, node.name, seen)
+                yield _Topic(name, port.type, "", node.name, seen)
 
 
 def _named(topics: Sequence[_Topic], wanted: str) -> _Topic:
     for topic in topics:
         if wanted in topic.calls:
+            if not topic.node:
+                raise UsageError(f"{topic.name}: its sender is in another run; ask that one")
             return topic
     known = sorted({each.connection or each.name for each in topics})
     hint = did_you_mean(wanted, {call for each in topics for call in each.calls})

@@ -53,23 +53,21 @@ def add_validate(validate: argparse.ArgumentParser) -> None:
 
 
 def _validate(parsed: argparse.Namespace) -> int:
-    if parsed.format == JSON:
-        return _validate_for_programs(parsed)
-    project = _validated(parsed)
+    is_json = parsed.format == JSON
+    try:
+        project = _validated(parsed)
+    except ProjectError as error:
+        if not is_json:
+            raise
+        print_json({"is_valid": False, "problems": error.problems})
+        return EXIT_PROJECT
+    if is_json:
+        print_json({"is_valid": True, "problems": []})
+        return 0
     print(
         f"{printable(str(project.file))}: valid: {counted(len(project.nodes), 'node')},"
         f" {counted(len(project.connections), 'connection')}"
     )
-    return 0
-
-
-def _validate_for_programs(parsed: argparse.Namespace) -> int:
-    try:
-        _validated(parsed)
-    except ProjectError as error:
-        print_json({"is_valid": False, "problems": error.problems})
-        return EXIT_PROJECT
-    print_json({"is_valid": True, "problems": []})
     return 0
 
 
