@@ -84,7 +84,7 @@ def test_a_launch_flag_touches_two_files(checkout: Checkout) -> None:
     )
     checkout.insert(
         "neuros/cli/launch.py",
-        "    for line in plan.launcher()",
+        "    messages = plan.messages.describe()",
         "    if plan.request.quiet:\n        return 0\n",
     )
     assert len(checkout.changed) == 2

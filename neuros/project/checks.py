@@ -200,10 +200,8 @@ def _different_types(connection: Element, ends: list[Element]) -> Iterator[Probl
 
 
 def _compression(connection: Element, ends: list[Element]) -> Iterator[Problem]:
-    transport = connection.member("transport")
-    if transport is None or not isinstance(transport.value, dict):
-        return
-    compression, quality = transport.member("compression"), transport.member("quality")
+    transport = connection.members("transport")
+    compression, quality = transport.get("compression"), transport.get("quality")
     if compression is None or compression.value != "jpeg":
         if quality is not None:
             yield quality.key_problem("'quality' is that of JPEG", 'add "compression": "jpeg"')
@@ -236,13 +234,11 @@ def _unconnected(parsed: ParsedProject) -> Iterator[Problem]:
 def _budget_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
     """Budgets for connections that the project has not."""
     budgets = parsed.root.member("budgets")
-    limits = None if budgets is None else budgets.member("lost_packets")
-    if limits is None or not isinstance(limits.value, dict):
-        return
+    limits = {} if budgets is None else budgets.members("lost_packets")
     names = [_connection_name(connection) for connection in parsed.connections]
     known = [name for name in names if name is not None]
     known_names = {*known}
-    for name, member in limits.value.items():
+    for name, member in limits.items():
         if name not in known_names and len(known) == len(names):
             hint = did_you_mean(name, known) or "write 'a.out -> b.in', as `neuros launch` does"
             yield member.key_problem(f"there is no connection '{name}'", hint)
@@ -290,17 +286,14 @@ def _qos_without_effect(parsed: ParsedProject) -> Iterator[Problem]:
 
 
 def _rules_without_sense(parsed: ParsedProject) -> Iterator[Problem]:
-    names, remap = names_of(parsed), parsed.root.member("remap")
+    names, remap = names_of(parsed), parsed.root.members("remap")
     nodes = [node.string("name") or "" for node in parsed.nodes]
-    for rule in rules_of(remap):
-        assert remap is not None
+    for rule in rules_of(parsed):
         only, _, old = rule.rpartition(":")
         if only and only not in nodes and parsed.is_complete:
-            yield remap.value[rule].key_problem(
-                f"there is no node '{only}'", did_you_mean(only, nodes)
-            )
+            yield remap[rule].key_problem(f"there is no node '{only}'", did_you_mean(only, nodes))
         if names.full(old, only).startswith(f"{names.namespace}{INTERNAL}"):
-            yield remap.value[rule].key_problem(
+            yield remap[rule].key_problem(
                 f"'{old}' is an internal topic of NeuROS and cannot be renamed",
                 "a namespace moves all internal topics",
             )
@@ -333,16 +326,16 @@ def _too_long(topic: str) -> str:
 def _parameter_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
     """What ROS has no type for, and names that occur twice."""
     for node in parsed.nodes:
-        parameters = node.member("parameters")
-        if parameters is not None and isinstance(parameters.value, dict):
-            yield from _group_mistakes(parameters, "", {})
+        yield from _group_mistakes(node.members("parameters"), "", {})
 
 
-def _group_mistakes(group: Element, prefix: str, seen: dict[str, Element]) -> Iterator[Problem]:
-    for name, member in group.value.items():
+def _group_mistakes(
+    group: Mapping[str, Element], prefix: str, seen: dict[str, Element]
+) -> Iterator[Problem]:
+    for name, member in group.items():
         full = prefix + name
         if isinstance(member.value, dict):
-            yield from _group_mistakes(member, f"{full}.", seen)
+            yield from _group_mistakes(member.value, f"{full}.", seen)
             continue
         if seen.setdefault(full, member) is not member:
             yield member.key_problem(f"the parameter '{full}' occurs twice")
@@ -395,10 +388,7 @@ def _gazebo_remarks(parsed: ParsedProject) -> Iterator[Problem]:
 
 
 def _gazebo_variables(parsed: ParsedProject, node: Element) -> Iterator[Problem]:
-    environment = node.member("environment")
-    if environment is None or not isinstance(environment.value, dict):
-        return
-    for name, member in environment.value.items():
+    for name, member in node.members("environment").items():
         if not is_for_gazebo(name):
             continue
         if name not in _GAZEBO_FOLDERS:

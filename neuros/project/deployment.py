@@ -101,17 +101,11 @@ def _host(name: str, keys: Mapping[str, object]) -> Host:
     return Host(name, **{**keys, **lists})  # type: ignore[arg-type]
 
 
-def _members(element: Element | None) -> Mapping[str, Element]:
-    """Those of an object; of anything else, which the schema refuses, none."""
-    return element.value if element is not None and isinstance(element.value, dict) else {}
-
-
 def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> list[Problem]:
     """What the schema cannot say; ``wrong``: pointers to what it has refused."""
     found: list[Problem] = []
-    members = _members(root)
     known = {HERE}
-    for name, host in _members(members.get("hosts")).items():
+    for name, host in root.members("hosts").items():
         known.add(name)
         if any(f"{each}/".startswith(f"{host.pointer}/") for each in wrong):
             continue
@@ -129,7 +123,7 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
             text = "has no effect with 'docker': NeuROS comes into the containers by itself"
             found.append(host.value["neuros"].key_problem(text, "leave it out"))
     names = None if project is None else [node.name for node in project.nodes]
-    for node, host in _members(members.get("nodes")).items():
+    for node, host in root.members("nodes").items():
         if isinstance(host.value, str) and host.value not in known:
             hint = did_you_mean(host.value, known) or f"there are {', '.join(sorted(known))}"
             found.append(host.problem(f"there is no host '{host.value}'", hint))

@@ -74,20 +74,16 @@ class _Builder:
         """The node that an object describes."""
         environment: dict[str, str] = {}
         paths: list[str] = []
-        variables = element.member("environment")
-        if variables is not None and isinstance(variables.value, dict):
-            for name, member in variables.value.items():
-                if is_for_gazebo(name) and not self._roots.finds(
-                    member.value, member.source.folder
-                ):
-                    continue
-                if name in _OWN_VARIABLES:
-                    text = f"'{name}' is set by NeuROS itself: remove it"
-                    self.problems.append(member.key_problem(text))
-                    continue
-                environment[name], is_path = self._variable(member)
-                if is_path:
-                    paths.append(name)
+        for name, member in element.members("environment").items():
+            if is_for_gazebo(name) and not self._roots.finds(member.value, member.source.folder):
+                continue
+            if name in _OWN_VARIABLES:
+                text = f"'{name}' is set by NeuROS itself: remove it"
+                self.problems.append(member.key_problem(text))
+                continue
+            environment[name], is_path = self._variable(member)
+            if is_path:
+                paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
         module, plugin = self._plugin(element)
         if element.member("network") is not None:

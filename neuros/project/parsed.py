@@ -149,14 +149,13 @@ def _import(
 def names_of(parsed: ParsedProject) -> Names:
     """The namespace and rules of a project; what has the wrong form is passed over."""
     namespace = parsed.root.string("namespace") or ""
-    return names_from(namespace, rules_of(parsed.root.member("remap")))
+    return names_from(namespace, rules_of(parsed))
 
 
-def rules_of(remap: Element | None) -> dict[str, str]:
+def rules_of(parsed: ParsedProject) -> dict[str, str]:
     """The rules of a project's ``"remap"`` that have the right form."""
-    if remap is None or not isinstance(remap.value, dict):
-        return {}
-    return {old: new.value for old, new in remap.value.items() if isinstance(new.value, str)}
+    rules = parsed.root.members("remap").items()
+    return {old: new.value for old, new in rules if isinstance(new.value, str)}
 
 
 # ---- overrides

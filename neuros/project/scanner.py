@@ -109,6 +109,11 @@ class Element:
         member = self.member(key)
         return member.value if member is not None and isinstance(member.value, list) else []
 
+    def members(self, key: str) -> dict[str, Element]:
+        """The members of the object under that key, nothing if there is none."""
+        member = self.member(key)
+        return member.value if member is not None and isinstance(member.value, dict) else {}
+
     def at(self, path: Iterable[str | int]) -> Element:
         """The element at the end of a path of keys and indices."""
         element = self
