@@ -5,6 +5,7 @@ The launcher makes the plan; as a file in the run folder it tells nodes and reco
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -200,13 +201,9 @@ def _candidates(project: Project, names: Collection[str]) -> Iterator[_Candidate
         yield from _of_connection(project, connection, names)
     nodes = [node for node in project.nodes if node.name in names]
     seen: set[str] = set()
-    for node in nodes:
-        for candidate in _of_external_topics(project.names, node, is_output=True):
-            seen.add(candidate.topic.name)
-            yield candidate
-    for node in nodes:
-        for candidate in _of_external_topics(project.names, node, is_output=False):
-            if candidate.topic.name not in seen:
+    for is_output, node in itertools.product((True, False), nodes):
+        for candidate in _of_external_topics(project.names, node, is_output=is_output):
+            if is_output or candidate.topic.name not in seen:
                 seen.add(candidate.topic.name)
                 yield candidate
 

@@ -413,11 +413,10 @@ def _add_sensor(building: Building, name: str, kind: Any, site: str, element: El
 def add_lights(building: Building, scope: Scope) -> None:
     """Lights of a world, of models and of links."""
     for inner in scope.and_models():
-        for element in inner.element.each("light"):
-            _add_light(building, element, inner.read_pose(element, inner.pose), None)
-        for link in inner.links.values():
-            for element in link.element.each("light"):
-                _add_light(building, element, inner.read_pose(element, link.pose), link)
+        for link in (None, *inner.links.values()):
+            owner = inner if link is None else link
+            for element in owner.element.each("light"):
+                _add_light(building, element, inner.read_pose(element, owner.pose), link)
 
 
 def _add_light(building: Building, element: Element, pose: Pose, link: Link | None) -> None:
@@ -446,9 +445,5 @@ def _add_light(building: Building, element: Element, pose: Pose, link: Link | No
 
 def _light_colour(owner: Element, tag: str, default: float) -> tuple[float, ...]:
     """Red, green and blue of a light."""
-    element = owner.child(tag)
-    if element is None:
-        return (default,) * 3
-    if len(element.text.split()) == 3:
-        return owner.vector(tag, (default,) * 3)
-    return owner.vector(tag, (default,) * 3 + (1.0,))[:3]
+    count = 3 if len(owner.text_of(tag).split()) == 3 else 4  # with opacity
+    return owner.vector(tag, (default, default, default, 1.0)[:count])[:3]
