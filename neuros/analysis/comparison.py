@@ -42,7 +42,10 @@ def comparison_rows(runs: Sequence[PastRun]) -> tuple[list[str], list[list[str]]
     rows = []
     for (name, digits), values in _side_by_side(runs).items():
         cells = ["-" if value is None else f"{value:,.{digits}f}" for value in values]
-        rows.append([name, *cells, *_ratio(values)])
+        if len(values) == 2:
+            a, b = values
+            cells.append("-" if a is None or b is None or not a else f"{b / a:.2f}")
+        rows.append([name, *cells])
     return ["", *labels_of(runs), *(["ratio"] if len(runs) == 2 else [])], rows
 
 
@@ -57,13 +60,6 @@ def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
     align = ("left", *("right" for _ in header[1:])) if rows else None
     return str(tabulate(rows, headers=header, disable_numparse=True, colalign=align))
-
-
-def _ratio(values: Sequence[float | None]) -> list[str]:
-    if len(values) != 2:
-        return []
-    a, b = values
-    return ["-" if a is None or b is None or not a else f"{b / a:.2f}"]
 
 
 def _side_by_side(runs: Sequence[PastRun]) -> dict[tuple[str, int], list[float | None]]:

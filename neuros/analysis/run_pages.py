@@ -62,7 +62,9 @@ def report_page(run: PastRun, findings: Findings, figures: Mapping[str, tuple[st
     """
     parts = [_facts(run), bottleneck_part(findings)]
     if run.missing:
-        parts.append(_missing(run.missing))
+        items = "".join(f"<li>{escape(each)}</li>" for each in run.missing)
+        text = f"<p>What this page lacks:</p><ul>{items}</ul>"
+        parts.append(f'<div class="missing">{text}</div>')
     parts += [figure_part(title, text, data) for title, (text, data) in figures.items()]
     parts += [_connections(run), _provenance(run)]
     return page(f"Run of {run.name}", parts)
@@ -124,11 +126,6 @@ def _facts(run: PastRun) -> str:
         parts.append(f"real-time factor {record['real_time_factor']:.2f}")
     parts += [f"broken budget: {each}" for each in record.get("broken_budgets", ())]
     return f"<p>{escape('; '.join(parts))}.</p>"
-
-
-def _missing(missing: Sequence[str]) -> str:
-    items = "".join(f"<li>{escape(each)}</li>" for each in missing)
-    return f'<div class="missing"><p>What this page lacks:</p><ul>{items}</ul></div>'
 
 
 def _connections(run: PastRun) -> str:

@@ -10,7 +10,7 @@ import errno
 import fcntl
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -237,11 +237,6 @@ class _SpoolSource:
     owns_time: bool
 
 
-def has_spools(run: Path, nodes: Collection[str]) -> bool:
-    """Whether packets of a run wait to be put into its bag."""
-    return any(any((run / name / "spool").glob("*")) for name in (*nodes, LISTENER))
-
-
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
     """Whether no other process writes the bag of a run, now and within the block."""
@@ -256,8 +251,9 @@ def the_only_recorder(run: Path) -> Iterator[bool]:
 
 def needs_repair(run: Path, plan: RecordingPlan) -> bool:
     """Whether the bag of a run that has ended is not complete."""
-    bag = run / BAG_NAME
-    return (run / DAMAGED_NAME).exists() or not is_whole(bag) or has_spools(run, [*plan.streams])
+    if (run / DAMAGED_NAME).exists() or not is_whole(run / BAG_NAME):
+        return True
+    return any(any((run / name / "spool").glob("*")) for name in (*plan.streams, LISTENER))
 
 
 @dataclass(frozen=True)

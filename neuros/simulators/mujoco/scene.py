@@ -167,7 +167,11 @@ def geometry(model: Any) -> dict[str, Any]:
         ),
         "moving_cameras": moving.cameras,
         "geoms": list(_geoms(model, meshes)),
-        "sites": list(_sites(model)),
+        "sites": [
+            _shape(model, site)
+            for site in map(model.site, range(model.nsite))
+            if site.group[0] <= _MOST_GROUP
+        ],
         "meshes": meshes.found,
         "textures": [_texture(model, number) for number in range(model.ntex)],
         "lights": list(_lights(model)),
@@ -238,12 +242,6 @@ def _material(material: Any) -> dict[str, Any]:
             "is_uniform": bool(material.texuniform[0]),
         }
     return found
-
-
-def _sites(model: Any) -> Iterator[dict[str, Any]]:
-    for site in map(model.site, range(model.nsite)):
-        if site.group[0] <= _MOST_GROUP:
-            yield _shape(model, site)
 
 
 def _lights(model: Any) -> Iterator[dict[str, Any]]:
