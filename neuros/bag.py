@@ -43,7 +43,7 @@ from neuros.recording.recorder import needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
 
-__all__ = ["Bag", "RecordedTopic", "open"]
+__all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
 
 _MOST_COLUMNS = 100
 
