@@ -92,27 +92,22 @@ def _ends(project: Project, node: Node, port: Port, *, is_input: bool) -> Iterat
         topic = project.names.resolve(port.external_topic, node.name)
         yield f"      {'<-' if is_input else '->'} topic {topic}"
         return
+    own = (node.name, port.name)
     if is_input:
-        sources = [c for c in project.connections if _to(c) == (node.name, port.name)]
-        yield from (f"      <- {c.source_node}.{c.source_output}" for c in sources)
-        connected = bool(sources)
+        lines = [
+            f"<- {c.source_node}.{c.source_output}"
+            for c in project.connections
+            if (c.destination_node, c.destination_input) == own
+        ]
     else:
-        targets = [c for c in project.connections if _from(c) == (node.name, port.name)]
-        names = [".".join(_to(c)) for c in targets]
-        width = max(map(len, names), default=0)
-        for name, c in zip(names, targets, strict=True):
-            yield f"      -> {name:<{width}}   {guarantee(c)}"
-        connected = bool(targets)
-    if not connected:
-        yield "      not connected"
-
-
-def _from(connection: Connection) -> tuple[str, str]:
-    return connection.source_node, connection.source_output
-
-
-def _to(connection: Connection) -> tuple[str, str]:
-    return connection.destination_node, connection.destination_input
+        targets = {
+            f"{c.destination_node}.{c.destination_input}": c
+            for c in project.connections
+            if (c.source_node, c.source_output) == own
+        }
+        width = max(map(len, targets), default=0)
+        lines = [f"-> {name:<{width}}   {guarantee(c)}" for name, c in targets.items()]
+    yield from (f"      {line}" for line in lines or ["not connected"])
 
 
 def _external(node: Node) -> Iterator[tuple[Port, bool]]:
