@@ -15,11 +15,8 @@ from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
 
-Packet: TypeAlias = Any
-"""One ROS message."""
-
-HookFunction: TypeAlias = "Callable[..., Any]"
-"""A hook of a plugin: gets the node and its inputs, returns packets."""
+Packet: TypeAlias = Any  # one ROS message
+HookFunction: TypeAlias = "Callable[..., Any]"  # gets the node and its inputs, returns packets
 
 
 class Logger(Protocol):
@@ -131,10 +128,7 @@ class PacketRecorder(Protocol):
     """Takes the packets of a node that are recorded."""
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number by which such packets are kept; ``None``: they are not recorded.
-
-        ``name`` is that of the output or input, or the connection where ``way`` is about one.
-        """
+        """The number for packets of a port (by ``way``: connection); ``None``: not recorded."""
 
     def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
         """Keep a serialised packet, with the simulated time of the node if it owns one.
@@ -205,10 +199,7 @@ class Middleware(Protocol):
         """The real ``rclpy.node.Node`` of a node that has a transport."""
 
     def mark_own_entities(
-        self,
-        file: NodeFile,
-        enter: Callable[[], None],
-        fail: Callable[[Any, BaseException], None],
+        self, file: NodeFile, enter: Callable[[], None], fail: Callable[[Any, BaseException], None]
     ) -> None:
         """Remember what exists on a ROS node before its plugin gets hold of it.
 
@@ -415,10 +406,7 @@ class Launcher(Protocol):
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningNode]:
-        """Start all nodes or none; ``environment`` is added to the environment of each.
-
-        Raises ``EnvironmentFault``.
-        """
+        """Start all or none, with this added to their environment. Raises ``EnvironmentFault``."""
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
         """One line per thing that :meth:`start` would start."""
@@ -470,8 +458,7 @@ class NodeProgram:
         return (*(python or self.program[:1]), *self.program[1:], *self.options)
 
 
-Notice: TypeAlias = tuple[str, str]
-"""A line for the user: severity (``INFO``, ``WARN``) and text."""
+Notice: TypeAlias = tuple[str, str]  # a line for the user: severity (INFO, WARN) and text
 
 
 class Deployment(ABC):

@@ -229,19 +229,21 @@ class Processes:
 
     def how_it_failed(self, process: RunningNode, how: str, *, is_stopping: bool) -> str:
         """One sentence about a process that should not have ended."""
-        noun = "node" if len(process.names) == 1 else "nodes"
-        return f"{noun} {names_of(process)} {self._when(process, is_stopping)}: {how}"
-
-    def _when(self, process: RunningNode, is_stopping: bool) -> str:
         if is_stopping:
-            return "ended while finalising"
-        if not any(map(self._detector.is_greeted, process.names)):
+            when = "while finalising"
+        elif not any(map(self._detector.is_greeted, process.names)):
             were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
-            return f"ended before {were} wrote is above)"
-        seen = "".join(self._detector.last_seen(name) for name in process.names)
-        return f"ended unexpectedly{seen}"
+            when = f"before {were} wrote is above)"
+        else:
+            when = f"unexpectedly{''.join(map(self._detector.last_seen, process.names))}"
+        return f"{nodes_of(process)} ended {when}: {how}"
 
 
 def names_of(process: RunningNode) -> str:
     """Its nodes, for people."""
     return " and ".join(f"'{name}'" for name in process.names)
+
+
+def nodes_of(process: RunningNode) -> str:
+    """Its nodes with the noun, as in "nodes 'a' and 'b'"."""
+    return f"node{'' if len(process.names) == 1 else 's'} {names_of(process)}"

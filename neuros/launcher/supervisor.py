@@ -27,6 +27,7 @@ from neuros.launcher.outcome import (
     Phase,
     Processes,
     names_of,
+    nodes_of,
 )
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
@@ -261,9 +262,9 @@ class Supervisor:
             if self._is_cut_off(process):
                 self._processes.kill(process)
                 self._shutdown.fail(
-                    f"{'node' if len(process.names) == 1 else 'nodes'} {names_of(process)} cannot"
-                    " be reached any more: the control connection was closed at that end. Does a"
-                    " plugin close file descriptors that it has not opened?"
+                    f"{nodes_of(process)} cannot be reached any more: the control connection was"
+                    " closed at that end. Does a plugin close file descriptors that it has not"
+                    " opened?"
                 )
 
     def _is_cut_off(self, process: RunningNode) -> bool:
@@ -470,12 +471,11 @@ class Shutdown:
 
     def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
         """Its nodes have had their time."""
-        nodes = "node" if len(process.names) == 1 else "nodes"
         late = [name for name in process.names if not self._outcome.has_final_report(name)]
         unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
         why = "; ".join(unfinished) or "its process did not end"
         self._outcome.fail(
-            f"{nodes} {names_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
+            f"{nodes_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
         )
 
     def _unfinished(self, name: str, now_s: float) -> list[str]:
