@@ -93,7 +93,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport.memory": set(),
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
-    "snn.nir.graph": {"numpy", "h5py"},
+    "snn.nir.network_file": {"numpy", "h5py"},
     "tf": {"geometry_msgs"},
     "snn.nest": {"numpy", "nest"},
     "simulators.convert": {"mujoco", "numpy"},

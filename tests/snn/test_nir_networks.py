@@ -20,8 +20,8 @@ from neuros.backends.docker.back_end import _check_modules
 from neuros.errors import ProjectError
 from neuros.project.model import Node, Port
 from neuros.project.split import project_to_json
-from neuros.snn.nir.graph import NetworkError, read_graph
 from neuros.snn.nir.network import Network, discretisation_of, problems_of
+from neuros.snn.nir.network_file import NetworkError, read_graph
 from neuros.testing import PluginHarness
 
 h5py = pytest.importorskip("h5py", reason="there is none in the lock files for this Python")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neuros.project.model import Node, Port
 from neuros.project.suggest import did_you_mean, listed
-from neuros.snn.nir.graph import MOST_VALUES, NEURONS, Graph, NetworkError, Part, read_graph
+from neuros.snn.nir.network_file import MOST_VALUES, NEURONS, Graph, NetworkError, Part, read_graph
 
 Values: TypeAlias = NDArray[np.float32]
 _Step: TypeAlias = "Callable[[Values], Values]"
