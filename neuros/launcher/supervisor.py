@@ -2,7 +2,7 @@
 
 The supervisor takes no part in the data path. It hears of the nodes over the control channel, of
 their processes from the back end, and of the user by signals; all in one thread, which never waits
-for a node or for a reader of its output. :class:`Shutdown` brings the run to its end.
+for a node or for a reader of its output.
 """
 
 from __future__ import annotations
@@ -11,27 +11,24 @@ import signal
 import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import neuros.control as control
-from neuros.control import Drain, Leave, Message, Report, Stop
+from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, Overheard, PauseState, Settling
 from neuros.launcher.outcome import (
-    EXIT_CODES,
-    SIGNAL_NAMES,
     Outcome,
     Output,
     Phase,
     Processes,
-    names_of,
     nodes_of,
 )
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
-from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector, with_stack
+from neuros.launcher.shutdown import STOP_S, Shutdown
+from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 from neuros.stacks import remove_stack_files
@@ -345,181 +342,3 @@ class Supervisor:
             return
         if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
             self._shutdown.fail(self._probing.why_dead())
-
-
-STOP_S = 5.0
-"""What nodes have for their finalise hooks and for flushing, in all."""
-
-# What closing a node that peers have heard may take, before it would be killed.
-_CLOSING_S = 1.0
-
-
-@dataclass
-class Shutdown:
-    """The phase of a run, and what leads to the next.
-
-    Running, then perhaps draining, then stopping, and at worst killed; never back.
-
-    Args:
-        _signals: numbers of the signals that have arrived, appended to by a signal handler.
-    """
-
-    _channels: Channels
-    _processes: Processes
-    _detector: StallDetector
-    _declarations: Declarations
-    _probing: Probing
-    _peers: Peers
-    _outcome: Outcome
-    _output: Output
-    _signals: list[int]
-    phase: Phase = Phase.RUNNING
-    _deadline_s: float = 0.0
-
-    @property
-    def is_hopeless(self) -> bool:
-        """Whether something outlasts even SIGKILL; the reaper will try on for a while."""
-        return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
-
-    def excuse(self, still_s: float) -> None:
-        """The run stood still for so long: what nodes have for their end begins where it was."""
-        self._deadline_s += still_s
-
-    def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
-        """Let packets under way arrive, and then end; only a run that is not ending already.
-
-        ``stopped`` is the node that asks for it, and starts no further hook.
-        """
-        if self.phase is not Phase.RUNNING:
-            return
-        self.phase = Phase.DRAINING
-        now_s = time.monotonic()
-        self._outcome.begin_to_end(now_s)
-        self._outcome.reason = reason
-        self._deadline_s = now_s + drain_s
-        self._output.log("INFO", f"{reason}; letting packets under way arrive")
-        self._peers.drain(reason, drain_s)
-        # A node that is still loading has sent nothing, and nobody could send to it yet.
-        for process in self._processes.not_loaded():
-            self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
-            self._processes.kill(process)
-        self._channels.send(Drain(self._declarations.last_round(stopped)))
-        self._probing.drain(self._processes.killed, now_s)
-
-    def fail(self, reason: str, exit_code: int = 1) -> None:
-        """End as failed, at once."""
-        self._outcome.fail(reason, exit_code)
-        if self.phase in (Phase.RUNNING, Phase.DRAINING):
-            self._stop()
-
-    def heed_signals(self) -> None:
-        """End as the user wishes."""
-        while self._signals:
-            number = signal.Signals(self._signals.pop(0))
-            name = SIGNAL_NAMES[number]
-            if self.phase in (Phase.RUNNING, Phase.DRAINING):
-                self._output.log("INFO", f"{name}: stopping (a second one kills at once)")
-                self._stop_with(EXIT_CODES[number], f"ended by {name}")
-                self._outcome.is_signalled = True
-            elif self.phase is Phase.STOPPING and self._outcome.is_signalled:
-                self._output.log("WARN", f"{name} again: killing what is left")
-                self._outcome.end_by_force(EXIT_CODES[number], name)
-                self._kill_all()
-            elif self.phase is Phase.STOPPING:
-                self._outcome.is_signalled = True
-                self._output.log("INFO", f"{name}: already ending (a second one kills at once)")
-
-    def heed_peers(self) -> None:
-        """End where the project has ended elsewhere, and as it did there."""
-        if self.phase not in (Phase.RUNNING, Phase.DRAINING):
-            return
-        end = self._peers.end(time.monotonic())
-        if end is None:
-            return
-        if end.exit_code == 0:
-            self.drain(end.reason, end.drain_s)
-        elif end.exit_code in EXIT_CODES.values():
-            self._output.log("INFO", f"{end.reason}; stopping")
-            self._stop_with(end.exit_code, end.reason)
-        else:
-            self.fail(end.reason)
-
-    def look(self, now_s: float) -> None:
-        """Go on to the next phase where it is time."""
-        if self.phase is Phase.STOPPING:
-            self._look_at_stopping(now_s)
-        elif self.phase is Phase.DRAINING:
-            if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
-                self._outcome.has_drained = True
-                self._stop()
-            elif now_s >= self._deadline_s:
-                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
-                self._output.log("WARN", f"not drained in time: {why}")
-                self._outcome.late_drain = why
-                self._outcome.has_drained = True
-                self._stop()
-
-    def _look_at_stopping(self, now_s: float) -> None:
-        if now_s >= self._deadline_s:
-            for process in self._processes:
-                self._fail_to_end(process, now_s)
-            self._kill_all()
-        elif self._peers.exist and self._processes.have_reported():
-            may_go = self._peers.finish(self._outcome.reports, now_s)
-            if may_go or self._deadline_s - now_s < _CLOSING_S:
-                self._channels.send(Leave())
-
-    def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
-        """Its nodes have had their time."""
-        late = [name for name in process.names if not self._outcome.has_final_report(name)]
-        unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
-        why = "; ".join(unfinished) or "its process did not end"
-        self._outcome.fail(
-            f"{nodes_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
-        )
-
-    def _unfinished(self, name: str, now_s: float) -> list[str]:
-        """Clauses about a node that has not made its final report."""
-        hook, is_finalising = self._detector.executing(name), self._declarations.is_finalising(name)
-        clauses = self._declarations.unfinished(name)
-        if hook and not is_finalising:
-            clauses.insert(0, f"'{name}' was still executing '{hook}'")
-        if clauses:
-            return clauses
-        if is_finalising:
-            return [f"'{name}' had finalised, but did not make its final report"]
-        silent_s = self._detector.silent_s(name, now_s)
-        silence = f" and had not reported for {silent_s:.0f} s" if silent_s >= SILENT_S else ""
-        return [f"'{name}' did not begin to finalise{silence}"]
-
-    def _stop_with(self, exit_code: int, reason: str) -> None:
-        self._outcome.exit_code, self._outcome.reason = exit_code, reason
-        self._stop()
-
-    def _stop(self) -> None:
-        self.phase = Phase.STOPPING
-        now_s = time.monotonic()
-        self._outcome.begin_to_end(now_s)
-        self._deadline_s = now_s + STOP_S
-        self._peers.stop(self._outcome.exit_code, self._outcome.reason)
-        self._channels.send(Stop())
-        for process in self._processes.not_loaded():
-            self._processes.kill(process)  # it has not come as far as anything worth finalising
-
-    def _kill_all(self) -> None:
-        self.phase = Phase.KILLED
-        self._deadline_s = time.monotonic() + STOP_S
-        for process in self._processes:
-            first, stacks = process.names[0], self._outcome.stacks
-            for name in process.names:
-                if stack := self._detector.stack_of(name):
-                    stacks[name] = stack.text
-                    text = f"{name} was at this point when it was killed"
-                    self._output.log("ERROR", with_stack(text, stack))
-            if stacks.keys().isdisjoint(process.names) and (
-                text := self._detector.threads_of(first)
-            ):
-                stacks[first] = text
-                where = f"{names_of(process)} stood when killed, the most recent call first"
-                self._output.log("ERROR", f"where the threads of {where}:\n{text}")
-            self._processes.kill(process)

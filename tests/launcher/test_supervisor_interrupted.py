@@ -260,7 +260,7 @@ def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
 def test_a_run_that_was_stopped_while_it_ended_has_its_time_afterwards(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.launcher.supervisor.STOP_S", 1.0)
+    monkeypatch.setattr("neuros.launcher.shutdown.STOP_S", 1.0)
 
     def stand_still() -> None:
         time.sleep(1.5)  # as under SIGSTOP
