@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -47,13 +48,21 @@ WRONG = {
 }
 
 
-def checked(*paths: Path, monkeypatch: pytest.MonkeyPatch, stubs: Path) -> list[str]:
-    """What mypy says is wrong."""
-    monkeypatch.setenv("MYPYPATH", f"{stubs}:{ROOT}")
-    options = ["--strict", "--config-file=", "--follow-imports=silent", "--no-incremental"]
-    output, errors, _ = mypy.run([*options, *map(str, paths)])
-    assert not errors
-    return re.findall(r"error: .*", output)
+@pytest.fixture
+def checked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., list[str]]:
+    """What mypy says is wrong with files, where the stubs are in a folder."""
+    cache = tmp_path_factory.getbasetemp() / "mypy_cache"  # of all tests here
+
+    def check(*paths: Path, stubs: Path) -> list[str]:
+        monkeypatch.setenv("MYPYPATH", f"{stubs}:{ROOT}")
+        options = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={cache}"]
+        output, errors, _ = mypy.run([*options, *map(str, paths)])
+        assert not errors
+        return re.findall(r"error: .*", output)
+
+    return check
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +76,15 @@ def typings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_plugin_with_annotations_is_checked(
-    typings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    typings: Path, tmp_path: Path, checked: Callable[..., list[str]]
 ) -> None:
     plugin = tmp_path / "plugin.py"
     plugin.write_text(PLUGIN)
-    assert checked(plugin, monkeypatch=monkeypatch, stubs=typings) == []
+    assert checked(plugin, stubs=typings) == []
 
 
 def test_what_a_message_does_not_have_is_named(
-    typings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    typings: Path, tmp_path: Path, checked: Callable[..., list[str]]
 ) -> None:
     text = PLUGIN
     for right, (wrong, _) in WRONG.items():
@@ -83,14 +92,14 @@ def test_what_a_message_does_not_have_is_named(
         text = text.replace(right, wrong)
     plugin = tmp_path / "plugin.py"
     plugin.write_text(text)
-    found = checked(plugin, monkeypatch=monkeypatch, stubs=typings)
+    found = checked(plugin, stubs=typings)
     assert len(found) == len(WRONG), found
     for _, said in WRONG.values():
         assert any(said in each for each in found), (said, found)
 
 
 def test_every_message_of_ros_has_a_stub_that_is_right(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, checked: Callable[..., list[str]]
 ) -> None:
     types = {
         "/".join((*each.__module__.split(".")[:2], each.__name__)) for each in message_classes()
@@ -102,7 +111,7 @@ def test_every_message_of_ros_has_a_stub_that_is_right(
         for name in re.findall(r"^class (\w+):", file.read_text(), re.MULTILINE)
     }
     assert types <= found
-    assert checked(*files, monkeypatch=monkeypatch, stubs=tmp_path) == []
+    assert checked(*files, stubs=tmp_path) == []
 
 
 def test_pyright_finds_services_beside_the_stubs_and_no_import_without_use(tmp_path: Path) -> None:
