@@ -70,7 +70,7 @@ nitpicky = True
 # Types of other projects are not linked, since no network is needed, nor private ones.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!neuros\.).*"),
-    ("py:class", r".*\._\w+"),
+    ("py:(class|obj)", r".*\._\w+"),
     ("py:(class|obj)", r"neuros\.registry\.Part"),  # a type variable
 ]
 
