@@ -197,7 +197,8 @@ class Project:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
             RunError: if it has ended meanwhile.
         """
-        from neuros.api.session import Held, Session, with_session_inputs  # they bring rclpy
+        from neuros.api.session import Session  # brings rclpy
+        from neuros.api.session_link import Held, with_session_inputs
 
         if options.nodes:
             raise UsageError("nodes: a session holds all nodes of its project")

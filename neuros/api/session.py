@@ -14,18 +14,16 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from neuros.analysis.run_record import run_table
-from neuros.api.live import LiveRun
 from neuros.api.loading import seed_variables
 from neuros.api.run import Run
-from neuros.api.session_link import SessionLink
+from neuros.api.session_link import Held, SessionLink, connections_to, declared_at, port_of
 from neuros.backends.control_sockets import connect
 from neuros.control import (
     TO_OBSERVERS,
@@ -42,10 +40,7 @@ from neuros.control.link import ControlLink
 from neuros.control.steps import Advanced
 from neuros.errors import RunError, UsageError
 from neuros.project.graph import graph_svg
-from neuros.project.model import Node, Port, Project
-from neuros.project.names import SESSION
-from neuros.project.scanner import display_name, place_of
-from neuros.project.suggest import did_you_mean
+from neuros.project.model import Node, Port
 from neuros.transport.messages import RosPackets, checked
 
 _CONNECT_S = 0.01
@@ -232,7 +227,7 @@ class Session:
 
     def __getitem__(self, output: str) -> SessionOutput:
         """An output, ``robot.imu``. Raises ``UsageError`` if there is none of that name."""
-        node, port = _port(self._project, output, is_input=False)
+        node, port = port_of(self._project, output, is_input=False)
         return SessionOutput(self, f"{node.name}.{port.name}", port)
 
     def send(self, input_name: str, message: Any) -> None:
@@ -248,14 +243,15 @@ class Session:
             RunError: if the run has ended.
         """
         if input_name not in self._ports:
-            self._ports[input_name] = _port(self._project, input_name, is_input=True)
+            self._ports[input_name] = port_of(self._project, input_name, is_input=True)
         node, port = self._ports[input_name]
         name = f"{node.name}.{port.name}"
         if name not in self._inputs:
+            feeding = " and ".join(connections_to(self._project, name))
             raise UsageError(
-                f"{name}: {' and '.join(_feeding(self._project, name))} feeds this input: take it"
-                f' over with session(take_over="{name}"), or send to another;'
-                f" {_where(node)}"
+                f"{name}: {feeding} feeds this input: take it over with"
+                f' session(take_over="{name}"), or send to another;'
+                f" {declared_at(node)}"
             )
         packet = checked(port, message)
         content = self._packets.encode(packet)
@@ -439,22 +435,6 @@ class Session:
 
 
 @dataclass(frozen=True)
-class Held:
-    """A run that stands still from its start, for a session.
-
-    Attributes:
-        project: as it is described, without the inputs of the session.
-        inputs: the names of these.
-        messages: folders of its message packages, for ``sys.path``.
-    """
-
-    live: LiveRun
-    project: Project
-    inputs: frozenset[str]
-    messages: Sequence[Path]
-
-
-@dataclass(frozen=True)
 class SessionOutput:
     """An output of a node, as a session sees it: ``session["robot.imu"]``.
 
@@ -506,33 +486,6 @@ class SessionOutput:
         return f"<{self.name}: {self.count} packets of {self._port.type}>"
 
 
-def with_session_inputs(project: Project, taken: Sequence[str]) -> tuple[Project, tuple[str, ...]]:
-    """The project with the inputs that a session feeds bound to it, and the names of these.
-
-    They are the inputs that nothing is connected to, those with an external topic, and those that
-    are ``taken`` over, which lose their connections.
-
-    Raises:
-        UsageError: if a name is that of no input.
-    """
-    chosen = {f"{node.name}.{port.name}" for node, port in (_input(project, n) for n in taken)}
-    connections = [c for c in project.connections if _end_of(c) not in chosen]
-    connected = {_end_of(c) for c in connections}
-    nodes, names = [], []
-    for node in project.nodes:
-        inputs = []
-        for port in node.inputs:
-            name = f"{node.name}.{port.name}"
-            if name not in connected:
-                names.append(name)
-                if port.external_topic is None:
-                    port = replace(port, external_topic=f"{SESSION}{node.name}/{port.name}")
-            inputs.append(port)
-        nodes.append(replace(node, inputs=tuple(inputs)))
-    bound = replace(project, nodes=tuple(nodes), connections=tuple(connections))
-    return bound, tuple(names)
-
-
 def check_length(rounds: int, sim_s: float | None) -> None:
     """Refuse a length of a step that is no length; raises ``UsageError``."""
     if rounds < 0:
@@ -543,41 +496,3 @@ def check_length(rounds: int, sim_s: float | None) -> None:
 def _check_seconds(name: str, seconds: float | None) -> None:
     if seconds is not None and not 0 <= seconds < math.inf:
         raise UsageError(f"{name}={seconds:g}: give 0 or more seconds")
-
-
-def _input(project: Project, name: str) -> tuple[Node, Port]:
-    return _port(project, name, is_input=True)
-
-
-def _end_of(connection: Any) -> str:
-    return f"{connection.destination_node}.{connection.destination_input}"
-
-
-def _feeding(project: Project, name: str) -> list[str]:
-    return [str(c) for c in project.connections if _end_of(c) == name]
-
-
-def _port(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]:
-    """A port by ``node.port``.
-
-    Raises:
-        UsageError: if there is none of that name; it says where the node is declared.
-    """
-    node_name, _, port_name = name.partition(".")
-    nodes = {node.name: node for node in project.nodes}
-    if node_name not in nodes or not port_name:
-        hint = did_you_mean(node_name, nodes) or f"it has {', '.join(nodes)}"
-        file = display_name(project.file)
-        raise UsageError(f"'{name}': {file} has no node '{node_name}' ({hint}); say node.port")
-    node = nodes[node_name]
-    ports = {port.name: port for port in (node.inputs if is_input else node.outputs)}
-    if port_name not in ports:
-        hint = did_you_mean(port_name, ports) or f"it has {', '.join(ports) or 'none'}"
-        side = "input" if is_input else "output"
-        raise UsageError(f"'{name}': no such {side} ({hint}); {_where(node)}")
-    return node, ports[port_name]
-
-
-def _where(node: Node) -> str:
-    line, column = place_of(node.file, node.pointer)
-    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"

@@ -1,4 +1,4 @@
-"""Connection of a session with its run: it asks, and waits for the answer.
+"""What a session holds of its run, and their connection: it asks, and waits for the answer.
 
 Where one process holds all nodes, steps go straight to it. The supervisor is a thread of the
 program that steps, and takes turns with it: through the supervisor, a step takes several times as
@@ -11,15 +11,39 @@ import base64
 import contextlib
 import select
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from neuros.api.live import LiveRun
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect_unix
 from neuros.control import Deliver, Ended, Message, Settle, Settled, StepAll
 from neuros.control.link import ControlLink
 from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.errors import UsageError
+from neuros.project.model import Node, Port, Project
+from neuros.project.names import SESSION
+from neuros.project.scanner import display_name, place_of
+from neuros.project.suggest import did_you_mean
 
 _MOST_UNSENT = 64
+
+
+@dataclass(frozen=True)
+class Held:
+    """A run that stands still from its start, for a session.
+
+    Attributes:
+        project: as it is described, without the inputs of the session.
+        inputs: the names of these.
+        messages: folders of its message packages, for ``sys.path``.
+    """
+
+    live: LiveRun
+    project: Project
+    inputs: frozenset[str]
+    messages: Sequence[Path]
 
 
 class SessionLink:
@@ -176,3 +200,67 @@ class SessionLink:
     def _send_to(self, nodes: StepLink[Advanced], rounds: int, known: Mapping[str, int]) -> None:
         nodes.send(Advance(self._number, rounds, known, tuple(self._unsent)))
         self._unsent.clear()
+
+
+def with_session_inputs(project: Project, taken: Sequence[str]) -> tuple[Project, tuple[str, ...]]:
+    """The project with the inputs that a session feeds bound to it, and the names of these.
+
+    They are the inputs that nothing is connected to, those with an external topic, and those that
+    are ``taken`` over, which lose their connections.
+
+    Raises:
+        UsageError: if a name is that of no input.
+    """
+    ends = (port_of(project, name, is_input=True) for name in taken)
+    chosen = {f"{node.name}.{port.name}" for node, port in ends}
+    connections = [c for c in project.connections if _end_of(c) not in chosen]
+    connected = {_end_of(c) for c in connections}
+    nodes, names = [], []
+    for node in project.nodes:
+        inputs = []
+        for port in node.inputs:
+            name = f"{node.name}.{port.name}"
+            if name not in connected:
+                names.append(name)
+                if port.external_topic is None:
+                    port = replace(port, external_topic=f"{SESSION}{node.name}/{port.name}")
+            inputs.append(port)
+        nodes.append(replace(node, inputs=tuple(inputs)))
+    bound = replace(project, nodes=tuple(nodes), connections=tuple(connections))
+    return bound, tuple(names)
+
+
+def _end_of(connection: Any) -> str:
+    return f"{connection.destination_node}.{connection.destination_input}"
+
+
+def connections_to(project: Project, name: str) -> list[str]:
+    """The connections that feed an input."""
+    return [str(c) for c in project.connections if _end_of(c) == name]
+
+
+def port_of(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]:
+    """A port by ``node.port``.
+
+    Raises:
+        UsageError: if there is none of that name; it says where the node is declared.
+    """
+    node_name, _, port_name = name.partition(".")
+    nodes = {node.name: node for node in project.nodes}
+    if node_name not in nodes or not port_name:
+        hint = did_you_mean(node_name, nodes) or f"it has {', '.join(nodes)}"
+        file = display_name(project.file)
+        raise UsageError(f"'{name}': {file} has no node '{node_name}' ({hint}); say node.port")
+    node = nodes[node_name]
+    ports = {port.name: port for port in (node.inputs if is_input else node.outputs)}
+    if port_name not in ports:
+        hint = did_you_mean(port_name, ports) or f"it has {', '.join(ports) or 'none'}"
+        side = "input" if is_input else "output"
+        raise UsageError(f"'{name}': no such {side} ({hint}); {declared_at(node)}")
+    return node, ports[port_name]
+
+
+def declared_at(node: Node) -> str:
+    """Where a node is declared, for messages."""
+    line, column = place_of(node.file, node.pointer)
+    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"
