@@ -1,6 +1,6 @@
 """A project as files for Docker Compose, Docker Swarm or Kubernetes, which then start its nodes.
 
-That for Slurm is in :mod:`neuros.api.slurm_script`.
+For Slurm it is a batch script (:func:`neuros.executors.slurm.slurm_script`).
 
 The folder that is written holds all that a run needs, but for the images that nodes run in::
 
@@ -21,6 +21,7 @@ import json
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,14 +33,17 @@ import yaml
 
 from neuros.api.part import parts_to_json
 from neuros.api.request import ExportOptions
-from neuros.api.slurm_script import script_of
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
 from neuros.errors import UsageError
+from neuros.executors.executor import JobResources
+from neuros.executors.slurm import slurm_script
 from neuros.options import options_of
+from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
 from neuros.project.split import split, translated
+from neuros.project.suggest import did_you_mean
 
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "lib/workspace", run=ROOT / "runs")
@@ -268,7 +272,7 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
             raise UsageError(f"{each.flags[-1]} is not for {options.form}")
     if options.form != "slurm":
         return Export(project, messages, options).write()
-    script = script_of(project, options)
+    script = _slurm_script_of(project, options)
     folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
     with _new(folder):
         (folder / "job.sh").write_text(script, "utf-8")
@@ -527,3 +531,38 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
 
 
 _Dumper.add_representer(str, _text)
+
+
+def _slurm_script_of(project: Project, options: ExportOptions) -> str:
+    """The script for a checked project, with the resources that its nodes declare.
+
+    Raises:
+        UsageError: if a node is placed that the project lacks.
+    """
+    names = [node.name for node in project.nodes]
+    places = {name: number for number, name in enumerate(names)} if options.spread else {}
+    for name, number in options.place:
+        if name not in names:
+            hint = did_you_mean(name, names) or f"it has {', '.join(names)}"
+            raise UsageError(f"--place {name}={number}: the project has no such node; {hint}")
+        places[name] = number
+    on_each = [
+        tuple(node for node in project.nodes if places.get(node.name, 0) == number)
+        for number in range(max(places.values(), default=0) + 1)
+    ]
+    beside = Path(sys.executable).with_name("neuros")
+    changes = options.set or ()
+    if isinstance(changes, Mapping):
+        changes = [f"{path}={json.dumps(value)}" for path, value in changes.items()]
+    given: list[tuple[str, object]] = [("-d", options.domain_id), ("--duration", options.duration)]
+    given += [("--namespace", options.namespace), *(("--set", each) for each in changes)]
+    given += [("--remap", each) for each in options.remap or ()]
+    return slurm_script(
+        project.file if project.file.name != PROJECT_FILE else project.folder,
+        places,
+        neuros=str(beside) if beside.exists() else "neuros",
+        options=[part for flag, value in given if value is not None for part in (flag, str(value))],
+        resources=JobResources.most(
+            JobResources.of(replace(project, nodes=nodes)) for nodes in on_each
+        ),
+    )

@@ -1,4 +1,4 @@
-"""What a session holds of its run, and their connection: it asks, and waits for the answer.
+"""The run that a session holds, and their connection: it asks, and waits for the answer.
 
 Where one process holds all nodes, steps go straight to it. The supervisor is a thread of the
 program that steps, and takes turns with it: through the supervisor, a step takes several times as

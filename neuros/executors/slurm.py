@@ -1,4 +1,4 @@
-"""Runs of a sweep as jobs of Slurm: one array, submitted with submitit.
+"""Slurm: runs of a sweep as jobs, in an array submitted with submitit; a project as a batch script.
 
 submitit leaves a file with what a job has returned. Whether a job has ended without one is asked of
 ``squeue``, and not of ``sacct`` as submitit does, which needs an accounting database.
@@ -7,12 +7,15 @@ submitit leaves a file with what a job has returned. Whether a job has ended wit
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import re
+import shlex
 import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +23,14 @@ from types import FrameType
 from typing import Any
 
 from neuros.errors import EnvironmentFault
-from neuros.executors.executor import Job, Jobs, SweepExecutor, SweepPlan, not_installed
+from neuros.executors.executor import (
+    Job,
+    JobResources,
+    Jobs,
+    SweepExecutor,
+    SweepPlan,
+    not_installed,
+)
 from neuros.installation.machine import answer_of
 
 FOLDER = ".slurm"
@@ -35,6 +45,35 @@ _OVER = {
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL"),
     *("OUT_OF_MEMORY", "PREEMPTED", "TIMEOUT"),
 }
+_SCRIPT = """\
+#!/bin/sh
+#SBATCH --job-name={name}
+#SBATCH --nodes={count}
+#SBATCH --ntasks-per-node=1
+#SBATCH --output={name}-%j.log
+{resources}\
+# Submit it with sbatch. The launcher runs on the first node of the allocation, and so do the nodes
+# of the project that the deployment does not name; agents run the others.
+if [ "${{SLURM_JOB_NUM_NODES:-0}}" -lt {count} ]; then
+    echo "this needs a Slurm allocation of {count} node(s): submit it with sbatch" >&2
+    exit 4
+fi
+deployment=$(mktemp --suffix=.json) || exit 4
+trap 'rm -f "$deployment"' EXIT
+trap 'kill -TERM "$launcher"' TERM
+cat >"$deployment" <<'END'
+{deployment}
+END
+{command} --deployment "$deployment" "$@" &
+launcher=$!
+wait "$launcher"
+code=$?
+# A signal ends the first wait, and not the launcher.
+while kill -0 "$launcher" 2>/dev/null; do wait "$launcher"; code=$?; done
+exit "$code"
+"""
+# The steps share what the job has with the batch step, where the launcher is.
+_STEP = ("srun", "--overlap", "--mem=0", "--nodes=1", "--ntasks=1", "--mpi=none")
 
 
 class SlurmExecutor(SweepExecutor):
@@ -203,3 +242,46 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 SLURM = SlurmExecutor()
+
+
+def slurm_script(
+    project: str | os.PathLike[str],
+    places: Mapping[str, int],
+    *,
+    neuros: str = "neuros",
+    options: Sequence[str] = (),
+    resources: JobResources | None = None,
+) -> str:
+    """A script for ``sbatch`` that runs a project on the nodes of its allocation.
+
+    Args:
+        project: the project, as the first node of the allocation sees it.
+        places: by node of the project, the number of the cluster's node in the allocation, from 0;
+            what is not named runs beside the launcher, on number 0.
+        neuros: the command ``neuros`` on all of them.
+        options: further ones of ``neuros launch``.
+        resources: what each of them has to have.
+    """
+    elsewhere = {node: number for node, number in places.items() if number}
+    numbers = sorted({*elsewhere.values()})
+    hosts = {
+        f"node{number}": {"through": [*_STEP, f"--relative={number}"], "neuros": neuros}
+        for number in numbers
+    }
+    nodes = {node: f"node{number}" for node, number in elsewhere.items()}
+    name = os.path.basename(os.path.abspath(project)).removesuffix(".json")
+    return _SCRIPT.format(
+        name=name,
+        count=max(numbers, default=0) + 1,
+        resources="".join(f"#SBATCH {line}\n" for line in _lines(resources or JobResources())),
+        deployment=json.dumps({"hosts": hosts, "nodes": nodes}, indent=2),
+        command=shlex.join([neuros, "launch", os.fspath(project), *options]),
+    )
+
+
+def _lines(needs: JobResources) -> list[str]:
+    return [
+        *([f"--cpus-per-task={needs.cpus}"] if needs.cpus else []),
+        *([f"--mem={-(-needs.mem_bytes // _MEBIBYTE)}M"] if needs.mem_bytes else []),
+        *([f"--gpus-per-node={needs.gpus}"] if needs.gpus else []),
+    ]

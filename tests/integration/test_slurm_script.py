@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from slurm import slurm_cluster
 
-from neuros.api.slurm_script import slurm_script
 from neuros.cli.main import main
+from neuros.executors.slurm import slurm_script
 from neuros.project.deployment import DeploymentFile, load_deployment
 
 STREAM = Path(__file__).parent / "network" / "stream"
