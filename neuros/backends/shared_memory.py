@@ -35,7 +35,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
@@ -115,7 +115,7 @@ def _holders(folder: Path, started_s: float) -> dict[_Files, set[int]]:
         for base, group in _groups(folder).items()
         if _is_ours(group.files.values(), started_s if not _LTTNG.fullmatch(base) else 0.0)
     ]
-    used = _users(folder) if any(not group.locks for group in fresh) else {}
+    used = _users(folder, {name for group in fresh if not group.locks for name in group.files})
     owners = _lock_owners() if any(group.locks for group in fresh) else {}
     held = {}
     for group in fresh:
@@ -169,11 +169,17 @@ def _lock_owners() -> Mapping[str, set[int]]:
     return owners
 
 
-def _users(folder: Path) -> Mapping[str, set[int]]:
-    """The processes, as far as they can be seen, that have a name in ``folder`` mapped."""
+def _users(folder: Path, names: Set[str]) -> Mapping[str, set[int]]:
+    """Processes, as far as they can be seen, that have ``names`` in ``folder`` mapped.
+
+    One or more for each name in use: the mappings of all processes are megabytes, and the oldest
+    users are the same in the next look.
+    """
     prefix = f"{folder}/"
     users: dict[str, set[int]] = {}
-    for pid in map(int, filter(str.isdigit, os.listdir("/proc"))):
+    for pid in sorted(map(int, filter(str.isdigit, os.listdir("/proc")))):
+        if users.keys() >= names:
+            break
         # Processes end while we look, and those of other users do not let us in.
         with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
             for line in maps:
