@@ -217,6 +217,7 @@ def make_plan(
     Raises:
         UsageError, ProjectError, EnvironmentFault: if that cannot be run.
     """
+    _check_folder(project.folder)
     network = chosen_network(request.network, request.peers)
     names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
@@ -279,6 +280,14 @@ def _check_deployment(request: Request) -> None:
 def _say(severity: str, text: str) -> None:
     """What is going on on other machines, before there is a console."""
     print(f"neuros: {'' if severity == 'INFO' else 'warning: '}{text}", file=sys.stderr, flush=True)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a name that is no text: a plugin that logs gives ROS the path of its file."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        raise UsageError(f"{folder}: the name is not UTF-8, as ROS needs it: rename it") from None
 
 
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:

@@ -32,6 +32,21 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
+def test_a_folder_whose_name_is_no_text_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / os.fsdecode(b"odd\xff")
+    folder.mkdir()
+    node = {"name": "a", "container": "neuros_python", "plugin": "a.py"}
+    (folder / "project.json").write_text(json.dumps({"nodes": [node], "connections": []}))
+    (folder / "a.py").write_text(PLUGIN)
+    assert main(["validate", str(folder)]) == 0
+    assert main(["launch", str(folder), "--dry-run"]) == 2
+    assert (
+        r"odd\udcff: the name is not UTF-8, as ROS needs it: rename it" in capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize("command", ["validate", "launch", "report", "logs", "bag info", "types"])
 def test_a_name_that_is_too_long_is_one_sentence(
     command: str, capsys: pytest.CaptureFixture[str]
