@@ -15,7 +15,7 @@ from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
-from neuros.errors import HookError, NeurosError
+from neuros.errors import ControlError, HookError, NeurosError
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
@@ -286,8 +286,15 @@ class NodeRuntime:
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
-        """A session sends a packet to one of its inputs."""
-        port = self.file.node.input(input_name)
+        """A session sends a packet to one of its inputs.
+
+        Raises:
+            ControlError: if it is none of them.
+            ProtocolError: if the bytes are no message of its type.
+        """
+        port = next((p for p in self.file.node.inputs if p.name == input_name), None)
+        if port is None or port.external_topic is None:
+            raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
         self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:

@@ -191,8 +191,7 @@ def fields_of(type_name: str, packages: MessagePackages) -> Mapping[str, Message
 def parts_of_type(text: str) -> tuple[bool, str, str]:
     """Of a type as classes have it: whether it is a sequence, of what, and the size of an array.
 
-    >>> parts_of_type("sequence<geometry_msgs/Point, 3>")
-    (True, 'geometry_msgs/Point', '')
+    ``sequence<geometry_msgs/Point, 3>`` is ``(True, "geometry_msgs/Point", "")``.
     """
     found = _OF_CLASS.fullmatch(text)
     assert found is not None, text

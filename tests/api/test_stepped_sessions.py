@@ -271,6 +271,26 @@ def test_a_step_goes_by_the_supervisor_where_the_nodes_are_out_of_reach(
         assert poses(s, 1) == [8.125]
 
 
+@pytest.mark.parametrize(
+    ("input_name", "data", "reason"),
+    [
+        ("nothing", "AAAA", "a packet came for 'robot.nothing', no session's input"),
+        ("wheels", "AAAA", "a packet came for 'robot.wheels', no session's input"),
+        ("push", "AAAA", "3 bytes are not a std_msgs/Float64"),
+        ("push", "A", "a packet came that is not in base64"),
+    ],
+)
+def test_a_wrong_packet_on_the_control_channel_fails_the_run_in_a_sentence(
+    tmp_path: Path, input_name: str, data: str, reason: str
+) -> None:
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        s._link.send(Deliver("robot", input_name, data))
+        run = s._live.wait(DEADLINE_S)
+    assert run.exit_code == 1
+    assert reason in run.reason
+    assert "Traceback" not in (s.folder / "robot" / "node.log").read_text("utf-8")
+
+
 def test_what_is_sent_before_a_free_run_arrives_before_it(tmp_path: Path) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
     with project.session(backend="in-process", take_over="robot.wheels") as s:
