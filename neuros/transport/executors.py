@@ -223,18 +223,20 @@ class WaitSetExecutor:
 
     def _run_one_of_ros(self, wait_s: float) -> bool:
         """Run one callback; returns False if there was none, or a task or a waker came first."""
-
-        def has_other_work() -> bool:
-            # Without waiting, what ROS has comes first.
-            return bool(wait_s) and (self._is_woken or bool(self._tasks))
-
+        # rclpy begins anew, without coroutines that wait, unless it gets equal conditions.
+        condition = self._has_other_work if wait_s else self._has_no_other_work
         try:
-            task, _, _ = self._ros.wait_for_ready_callbacks(
-                timeout_sec=wait_s, condition=has_other_work
-            )
+            task, _, _ = self._ros.wait_for_ready_callbacks(timeout_sec=wait_s, condition=condition)
         except (TimeoutException, ConditionReachedException):
             return False
         task()
         if task.exception() is not None:
             raise task.exception()
         return True
+
+    def _has_other_work(self) -> bool:
+        return self._is_woken or bool(self._tasks)
+
+    def _has_no_other_work(self) -> bool:
+        """Never: without waiting, what ROS has comes first."""
+        return False

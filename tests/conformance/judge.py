@@ -700,9 +700,12 @@ class Judge:
         last = self.log[c.source_node][-1:] if self.seen.exit_code == 130 else []
         if sent != seen and not (last and sent == seen - (c.source_output in last[0].sent)):
             yield f"{seen} packets were sent, run.json says {sent}"
-        if sent != received + lost or received != consumed + discarded + unread:
+        in_flight = books["in_flight"]
+        if sent != received + in_flight + lost or received != consumed + discarded + unread:
             yield f"the counters do not add up: {dict(books)}"
-        if lost and c.is_reliable and self.seen.exit_code != 130:
+        if in_flight and (self.seen.exit_code == 0 or not c.is_reliable):
+            yield f"{in_flight} packets are in flight"
+        if lost and c.is_reliable:
             yield f"lost {lost} on a reliable connection"
         if discarded and c.discard_limit == 0:
             yield f"discarded {discarded} with limit 0"

@@ -112,6 +112,7 @@ class Story:
             "connection": str(c),
             "sent": sent,
             "received": sent,
+            "in_flight": 0,
             "lost": 0,
             "consumed": len(consumed),
             "discarded": gone,
@@ -375,6 +376,7 @@ def test_a_hook_that_is_starved_by_a_faster_input():
         {"received": 49},
         {"consumed": 49, "unread": 1},
         {"received": 49, "lost": 1, "consumed": 49},
+        {"received": 49, "in_flight": 1, "consumed": 49},
         {"discarded": 1, "consumed": 49},
     ],
 )
