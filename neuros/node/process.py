@@ -204,6 +204,8 @@ class NodeProcess:
         """Do a step of the session, if the run is not at its end."""
         self._settling = step
         for name, input_name, content in step.packets:
+            if name not in self._by_name:
+                raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
             self._by_name[name].deliver(input_name, content)
         if step.rounds:
             engines = [node.engine for node in self._nodes if node.engine is not None]

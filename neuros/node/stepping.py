@@ -106,7 +106,7 @@ class SessionSteps:
         packets = {}
         for name, known in asked.known.items():
             node, _, output = name.partition(".")
-            newest = nodes[node].newest.by_output.get(output)
+            newest = nodes[node].newest.by_output.get(output) if node in nodes else None
             if newest is not None and newest[0] > known:
                 packets[name] = newest
         times = {name: float(s) for name, node in nodes.items() if (s := node.sim_time) is not None}

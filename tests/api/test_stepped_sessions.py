@@ -291,6 +291,15 @@ def test_a_wrong_packet_on_the_control_channel_fails_the_run_in_a_sentence(
     assert "Traceback" not in (s.folder / "robot" / "node.log").read_text("utf-8")
 
 
+def test_a_step_with_a_packet_for_no_node_fails_the_run_in_a_sentence(tmp_path: Path) -> None:
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        s._link.deliver("nobody", "push", b"")
+        s._link.advance(1, {"nobody.pose": 0}, time.monotonic() + DEADLINE_S)
+        run = s._live.wait(DEADLINE_S)
+    assert run.exit_code == 1
+    assert "a packet came for 'nobody.push', no session's input" in run.reason
+
+
 def test_what_is_sent_before_a_free_run_arrives_before_it(tmp_path: Path) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
     with project.session(backend="in-process", take_over="robot.wheels") as s:
