@@ -222,6 +222,9 @@ class NodeProcess:
         assert self._middleware is not None
         loop = self._middleware.loop
         if asked is not self._settling:
+            if isinstance(asked, Advance) and isinstance(self._settling, control.Settle):
+                assert self._steps is not None
+                loop.post_loop_back(self._steps.take)  # a later step of it is heard all the same
             return
         if loop.has_waiting_events or not loop.has_taken_in:
             loop.post_loop_back(lambda: self._settle(asked))

@@ -390,6 +390,27 @@ def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> 
     assert held["robot.pose"].count == before + 2
 
 
+def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_from_being_heard(
+    tmp_path: Path,
+) -> None:
+    project = cart(tmp_path)
+    waits = """
+    while not (node.run_dir / "go").exists():
+        time.sleep(0.05)
+"""
+    head = "def decide(node, pose):\n"
+    brain = BRAIN.replace(head, head + waits.lstrip("\n"))
+    (project / "brain.py").write_text(f"import time\n{brain}")
+    with neuros.Project.from_file(project).session(backend="in-process") as s:
+        assert s["robot.pose"].count == 0
+        with pytest.raises(TimeoutError):
+            s.step(timeout_s=0.5)
+        s._link._supervisor.send(Settle(10_000, {}))
+        (s.folder / "brain" / "go").touch()
+        s.step(timeout_s=DEADLINE_S)
+        assert s["robot.pose"].count == 2
+
+
 @pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
 def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
     tmp_path: Path,

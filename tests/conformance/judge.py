@@ -703,8 +703,9 @@ class Judge:
         in_flight = books["in_flight"]
         if sent != received + in_flight + lost or received != consumed + discarded + unread:
             yield f"the counters do not add up: {dict(books)}"
-        if in_flight and (self.seen.exit_code == 0 or not c.is_reliable):
-            yield f"{in_flight} packets are in flight"
+        may_be_in_flight = c.window if c.is_reliable and self.seen.exit_code else 0
+        if in_flight > may_be_in_flight:
+            yield f"{in_flight} packets are in flight, {may_be_in_flight} may be"
         if lost and c.is_reliable:
             yield f"lost {lost} on a reliable connection"
         if discarded and c.discard_limit == 0:
