@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 import struct
 from dataclasses import MISSING, fields
 from itertools import accumulate
@@ -30,8 +31,9 @@ from neuros.control import (
     Probed,
     Report,
 )
+from neuros.control import steps as step_module
 from neuros.control.link import ControlLink, decode, encode, kind_of
-from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
@@ -252,3 +254,40 @@ def test_a_frame_that_is_no_step_is_refused_by_the_name_of_its_sender(
     frame = struct.pack("<II", len(head), len(body)) + head + body
     with pytest.raises(ControlError, match=r"the session sent a frame that is no step: ."):
         read_in_pieces(frame, Advance, [len(frame)])
+
+
+class Poll:
+    """Stands for ``select.poll``: nothing is ever readable. It notes how long it may sleep."""
+
+    def __init__(self) -> None:
+        self.asked_ms: list[float | None] = []
+
+    def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
+        self.asked_ms.append(timeout_ms)
+        return []
+
+
+def test_waits_in_vain_sleep_at_once_more_and_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    poll = Poll()
+    monkeypatch.setattr(step_module, "select", SimpleNamespace(poll=lambda: poll))
+    arrivals, awake = Arrivals(), []
+    for _ in range(1 + 1 + 1 + 3 + 1 + 7):
+        assert arrivals.wait(5.0) == []
+        awake.append(0 in poll.asked_ms)
+        assert poll.asked_ms[-1] == 5.0
+        poll.asked_ms.clear()
+    assert awake == [True, False, True, *[False] * 3, True, *[False] * 7]
+
+
+@pytest.mark.parametrize("vain", [0, 1, 2])
+def test_what_is_readable_is_found_awake_or_asleep(vain: int) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        arrivals = Arrivals()
+        arrivals.register(ours)
+        for _ in range(vain):
+            assert arrivals.wait(0.0) == []
+        theirs.sendall(b"!")
+        assert arrivals.wait(None) == [ours.fileno()]
+        arrivals.unregister(ours)
+        assert arrivals.wait(0.0) == []

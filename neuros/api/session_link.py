@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import select
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from neuros.api.live import LiveRun
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect_unix
 from neuros.control import Deliver, Ended, Message, Settle, Settled, StepAll
 from neuros.control.link import ControlLink
-from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
 from neuros.errors import UsageError
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
@@ -58,8 +57,8 @@ class SessionLink:
         self._supervisor = supervisor
         self._folder = folder
         self._nodes: StepLink[Advanced] | None = None
-        self._arrivals = select.poll()
-        self._arrivals.register(supervisor, select.POLLIN)
+        self._arrivals = Arrivals()
+        self._arrivals.register(supervisor)
         self._unsent: list[tuple[str, str, bytes]] = []
         self._number = self._answered = 0
 
@@ -103,7 +102,7 @@ class SessionLink:
             with contextlib.suppress(OSError):  # they are in several processes, or out of reach
                 stream = connect_unix(self._folder / SESSION_SOCKET_NAME)
                 self._nodes = StepLink(stream, Advanced, "the nodes")
-                self._arrivals.register(stream, select.POLLIN)
+                self._arrivals.register(stream)
         packets = {
             name: (newest.number, base64.b64decode(newest.data))
             for name, newest in found[0].packets.items()
@@ -128,7 +127,7 @@ class SessionLink:
         self._send_to(self._nodes, rounds, known)
         while self._nodes is not None:
             is_over = False
-            for number, _ in self._ready(end_s):
+            for number in self._ready(end_s):
                 if number == self._supervisor.fileno():
                     is_over = self._hear_supervisor(lambda _: False) is not None
                     continue
@@ -148,7 +147,7 @@ class SessionLink:
             TimeoutError: if neither comes until ``end_s`` (monotonic, seconds).
         """
         while True:
-            for number, _ in self._ready(end_s):
+            for number in self._ready(end_s):
                 if number != self._supervisor.fileno():
                     self._hear_nodes()  # an answer that is no longer waited for
                 elif (is_there := self._hear_supervisor(is_wanted)) is not None:
@@ -167,10 +166,10 @@ class SessionLink:
         """Hang up."""
         self._supervisor.close()
 
-    def _ready(self, end_s: float | None) -> list[tuple[int, int]]:
-        """Descriptors of the connections on which something has come, each with what."""
+    def _ready(self, end_s: float | None) -> list[int]:
+        """Descriptors of the connections on which something has come."""
         left_ms = None if end_s is None else max(0.0, end_s - time.monotonic()) * 1e3
-        ready = self._arrivals.poll(left_ms)
+        ready = self._arrivals.wait(left_ms)
         if not ready:
             raise TimeoutError(f"the run has not come to rest in time: {self._folder}")
         return ready

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import selectors
 import socket
 from collections.abc import Callable, Mapping
 
-from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
 from neuros.node.node import NodeRuntime
 from neuros.ports import ControlListener
 
@@ -45,8 +44,8 @@ class SessionSteps:
         self._link: StepLink[Advance] | None = None
         self._waker = os.eventfd(0, os.EFD_NONBLOCK)
         self._is_waiting = False
-        self._arrivals = select.poll()
-        self._arrivals.register(self._waker, select.POLLIN)
+        self._arrivals = Arrivals()
+        self._arrivals.register(self._waker)
 
     def listen(self, selector: selectors.BaseSelector) -> None:
         """Have the control thread wait for the session by its selector, and later for steps."""
@@ -58,7 +57,7 @@ class SessionSteps:
         if stream is not None:
             self._selector.unregister(self._listener)
             self._link = StepLink(stream, Advance, "the session")
-            self._arrivals.register(stream, select.POLLIN)
+            self._arrivals.register(stream)
             self._watch()
         return True
 
@@ -85,9 +84,9 @@ class SessionSteps:
         """
         assert self._link is not None
         self._is_waiting = True
-        arrived = self._arrivals.poll(_LINGER_MS)
+        arrived = self._arrivals.wait(_LINGER_MS)
         self._is_waiting = False
-        if (self._waker, select.POLLIN) in arrived or not arrived:
+        if self._waker in arrived or not arrived:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._waker)
             self._watch()
