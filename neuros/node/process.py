@@ -290,7 +290,13 @@ class NodeProcess:
         self._middleware.take_in()
 
     def _open_middleware(self) -> None:
-        middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+        # Its modules stay: rounds of the garbage collector would go through them for nothing.
+        gc.disable()
+        try:
+            middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+        finally:
+            gc.freeze()
+            gc.enable()
         with self._early_lock:
             self._middleware = middleware
             for event in self._early_events:
