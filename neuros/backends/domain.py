@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from neuros.backends.reaper_program import is_same_file, remove_lock
 from neuros.errors import EnvironmentFault, UsageError
 
 AUTOMATIC = range(1, 102)
@@ -92,14 +93,6 @@ def choose_domain(
     )
 
 
-def remove_lock(descriptor: int, path: Path) -> None:
-    """Remove the lock file unless another run holds it, too, or has made a new one."""
-    with contextlib.suppress(OSError):
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if _is_same_file(descriptor, path):
-            path.unlink()
-
-
 def _told(domain: int, reason: str, folder: Path) -> DomainLock:
     lock = _lock(folder, domain, fcntl.LOCK_SH)
     if lock is None:
@@ -129,7 +122,7 @@ def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:
         except OSError:
             os.close(descriptor)
             return None
-        if _is_same_file(descriptor, path):
+        if is_same_file(descriptor, path):
             return path, descriptor
         os.close(descriptor)  # its former holder has just removed it
 
@@ -160,13 +153,6 @@ def _open(path: Path) -> int | None:
         ) from error
     os.fchmod(descriptor, 0o666)  # whatever the umask: all users take part
     return descriptor
-
-
-def _is_same_file(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
-    except FileNotFoundError:
-        return False
 
 
 def _shared_folder() -> Path:

@@ -7,6 +7,7 @@ that, and for nothing else. So what takes longer to import, and only removes fil
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
 import json
 import os
@@ -14,9 +15,12 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RunProcesses
+
+if TYPE_CHECKING:  # it takes longer to import
+    from pathlib import Path
 
 READY = b"ready\n"
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
@@ -92,9 +96,6 @@ def _read_orders() -> Iterator[tuple[str, object]]:
 def _import_the_rest() -> None:
     """Now, and not when it is needed: who knows what becomes of the disk until then."""
     with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
-        import shutil  # noqa: F401
-
-        import neuros.backends.domain
         import neuros.backends.shared_memory  # noqa: F401
 
 
@@ -117,7 +118,6 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
 
     from pathlib import Path
 
-    from neuros.backends.domain import remove_lock
     from neuros.backends.shared_memory import remove_dead_runs, remove_segments, sweep
 
     remove_segments(run_id)
@@ -170,3 +170,19 @@ def _remove(paths: Iterable[str]) -> None:
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 os.unlink(path)
+
+
+def remove_lock(descriptor: int, path: Path) -> None:
+    """Remove the lock file of a domain unless another run holds it, too, or has made a new one."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if is_same_file(descriptor, path):
+            path.unlink()
+
+
+def is_same_file(descriptor: int, path: Path) -> bool:
+    """Whether an open file is the one of this path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    except FileNotFoundError:
+        return False
