@@ -39,9 +39,9 @@ from neuros.recording.columns import (
     library,
     trains_of,
 )
-from neuros.recording.recorder import needs_repair, recorded_counts, repair
+from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
-from neuros.recording.stored import StoredTopics, damage_of, opened, stored_messages
+from neuros.recording.stored import StoredTopics, are_left, damage_of, faults_of, opened
 
 __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
 
@@ -232,11 +232,7 @@ class Bag:
             self.topics = {
                 name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
             }
-        self.missing = {
-            name: lost
-            for name, count in (recorded or {}).items()
-            if (lost := count - (self.topics[name].count if name in self.topics else 0)) > 0
-        }
+        self.missing = lost_of(recorded or {}, {name: t.count for name, t in self.topics.items()})
         self._stored = StoredTopics(folder, self.refuse)
         self._packets: dict[str, list[RawPacket]] = {}
 
@@ -245,15 +241,18 @@ class Bag:
         """The missing packets, in a sentence."""
         if not self.missing:
             return None
-        topics = ", ".join(f"{lost} of {name}" for name, lost in self.missing.items())
-        return f"{self.folder} has been damaged since the run; packets that are missing: {topics}"
+        missing = named(self.missing)
+        return f"{self.folder} has been damaged since the run; packets that are missing: {missing}"
 
     def check(self) -> str | None:
         """What is wrong with the bag, in a sentence; reads all of it."""
-        faults: list[str] = []
-        for _ in stored_messages(self.folder, faults.append):
-            pass
+        faults = faults_of(self.folder, {name: topic.count for name, topic in self.topics.items()})
         return "; ".join([*([self.damage] if self.damage else []), *faults]) or None
+
+    def expect(self, name: str, left: int) -> None:
+        """Refuse fewer packets of a topic than there should be."""
+        if left < (count := self.topics[name].count):
+            self.refuse(are_left(self.folder, name, count, left))
 
     def refuse(self, fault: str) -> None:
         """Raise a fault of its files, which readers of packets cannot pass over."""
@@ -297,9 +296,7 @@ class Bag:
                 RawPacket(log_ns, publish_ns, data)
                 for _, log_ns, publish_ns, data, _ in self._stored.messages(name)
             ]
-            count = self.topics[name].count
-            if len(packets) < count:
-                self.refuse(f"{self.folder}: of {count} packets of {name} {len(packets)} are left")
+            self.expect(name, len(packets))
             packets.sort(key=itemgetter(0))
             self._packets[name] = packets
         return self._packets[name]
@@ -340,11 +337,11 @@ def open_bag(run: str | os.PathLike[str]) -> Bag:
         if not (folder.parent / PLAN_NAME).is_file():
             return Bag(folder, {})
         folder = folder.parent
-    plan = load_plan(folder)
+    plan, recorded = load_plan(folder), recorded_counts(folder)
     if needs_repair(folder, plan):
         _repair_if_possible(folder)
     connections = {topic.name: topic.connection for topic in plan.topics}
-    return Bag(folder / BAG_NAME, connections, recorded_counts(folder))
+    return Bag(folder / BAG_NAME, connections, recorded)
 
 
 def _repair_if_possible(run: Path) -> None:

@@ -179,11 +179,11 @@ class RecordedPackets:
         return found is not None and found[1]
 
     def _digests_of(self, run: Path, connection: str) -> tuple[Numbers, bool] | None:
-        topic = self._topic(run, connection)
-        if topic is None:
+        topic, bag = self._topic(run, connection), self._bags[run]
+        if topic is None or bag is None:
             return None
         if run not in self._digests:
-            self._digests[run] = _digests(self._bags[run])
+            self._digests[run] = _digests(bag)
         nothing = np.array([], np.uint64), True
         return self._digests[run].get(topic.name, nothing)
 
@@ -198,23 +198,27 @@ class RecordedPackets:
         if not (run / PLAN_NAME).exists():
             return None
         try:
-            return open_bag(run)
+            bag = open_bag(run)
         except NeurosError as error:
             self.remarks.append(str(error))
             return None
+        self.remarks += [bag.damage] if bag.damage else []
+        return bag
 
 
-def _digests(bag: Bag | None) -> dict[str, tuple[Numbers, bool]]:
+def _digests(bag: Bag) -> dict[str, tuple[Numbers, bool]]:
     """By topic, digests in the order in which packets were sent, and whether all are small."""
     times: dict[str, array[int]] = {}
     digests: dict[str, array[int]] = {}
     large: set[str] = set()
-    for topic, log_ns, _, data, _ in stored_messages(bag.folder, bag.refuse) if bag else ():
+    for topic, log_ns, _, data, _ in stored_messages(bag.folder, bag.refuse):
         times.setdefault(topic, array("q")).append(log_ns)
         padded = data + bytes(-len(data) % 4)
         digests.setdefault(topic, array("Q")).append(xxh3_64_intdigest(padded))
         if len(data) >= _LARGE_BYTES:
             large.add(topic)
+    for name in bag.topics:
+        bag.expect(name, len(times.get(name, ())))
     found = {}
     for topic, at_ns in times.items():
         order = np.argsort(np.frombuffer(at_ns, np.int64), kind="stable")

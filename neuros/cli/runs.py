@@ -242,7 +242,7 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _repair(options: argparse.Namespace) -> int:
-    from neuros.recording.recorder import KEPT_NAME, repair
+    from neuros.recording.recorder import KEPT_NAME, named, repair
 
     def complain(text: str) -> None:
         print(f"neuros: {text}", file=sys.stderr)
@@ -253,8 +253,9 @@ def _repair(options: argparse.Namespace) -> int:
         return 0
     counts = repaired.counts
     print(f"{options.run}: completed, {sum(counts.values())} packets on {len(counts)} topics")
-    if not repaired.changed:
-        return 0
-    what = "kept" if options.keep_changed else f"left out: {KEPT_NAME} has them"
-    complain(f"{repaired.changed} packets, any of which may have changed, are {what}")
-    return EXIT_DAMAGED
+    if repaired.changed:
+        what = "kept" if options.keep_changed else f"left out: {KEPT_NAME} has them"
+        complain(f"{repaired.changed} packets, any of which may have changed, are {what}")
+    if repaired.lost:
+        complain(f"packets that were recorded, and are not in the bag: {named(repaired.lost)}")
+    return EXIT_DAMAGED if repaired.changed or repaired.lost else 0

@@ -34,8 +34,8 @@ from neuros.recording.recording_plan import Topic
 
 _CHUNK_BYTES = 1 << 20
 MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
-_MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX = 0x07, 0x08, 0x0B, 0x0C, 0x0D
+HEADER, _FOOTER, _SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
+_MESSAGE_INDEX, CHUNK_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX = 0x07, 0x08, 0x0B, 0x0C, 0x0D
 _SUMMARY_OFFSET, DATA_END = 0x0E, 0x0F
 RECORD_HEAD = Struct("<BQ")  # kind, length
 MESSAGE_HEAD = Struct("<HIQQ")  # channel, number within the channel, log time, publish time
@@ -223,7 +223,7 @@ class _McapFile:
         self._summary = b""
         self._size = 0  # with all that is pending
         self._pending: list[bytes] = []
-        self._add(MAGIC, _record(_HEADER, _text("ros2"), _text(f"neuros-{__version__}")))
+        self._add(MAGIC, _record(HEADER, _text("ros2"), _text(f"neuros-{__version__}")))
         self._chunk: list[bytes] = []
         self._chunk_size = 0
         self._schemas: dict[str, bytes] = {}
@@ -311,7 +311,7 @@ class _McapFile:
             self._add(_record(_MESSAGE_INDEX, index))
         self._chunk_indexes.append(
             _record(
-                _CHUNK_INDEX,
+                CHUNK_INDEX,
                 pack("<QQQQ", first_ns, last_ns, start, length),
                 _text(offsets),
                 pack("<Q", self._size - start - length),
@@ -339,7 +339,7 @@ class _McapFile:
         for kind, records in (
             (_SCHEMA, self._schemas.values()),
             (CHANNEL, self._channels.values()),
-            (_CHUNK_INDEX, self._chunk_indexes),
+            (CHUNK_INDEX, self._chunk_indexes),
             (_METADATA_INDEX, [_record(_METADATA_INDEX, place, name)]),
             (_STATISTICS, [_record(_STATISTICS, statistics, _text(counts))]),
         ):

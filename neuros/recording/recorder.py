@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -34,7 +35,7 @@ from neuros.recording.spool import (
     forget_listened,
     listened_topics,
 )
-from neuros.recording.stored import Stored, is_whole, opened, stored_messages
+from neuros.recording.stored import Stored, faults_of, is_whole, opened, stored_messages
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
 # running. Readers of bags sort, so a packet that comes later is only less convenient.
@@ -263,10 +264,12 @@ class Repaired:
     Attributes:
         counts: by topic, the packets in the bag.
         changed: how many packets may have changed, since the checksum of their part was wrong.
+        lost: by topic, how many packets were in the bag when the run ended, and are not now.
     """
 
     counts: dict[str, int]
     changed: int
+    lost: dict[str, int]
 
 
 def repair(
@@ -287,7 +290,7 @@ def repair(
         with the_only_recorder(run) as is_alone:
             if not is_alone or _is_fed(run, plan):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
-            if not needs_repair(run, plan) and not _has_damage(run / BAG_NAME):
+            if not needs_repair(run, plan) and not faults_of(run / BAG_NAME, counts_of(run)):
                 return None
             return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:
@@ -298,12 +301,27 @@ def repair(
 
 
 def recorded_counts(run: Path) -> dict[str, int]:
-    """By topic, the packets that were in the bag when the run ended, as far as is known."""
-    try:
+    """By topic, the packets that were in the bag when the run ended, or when it was last written,
+    as far as is known."""
+    with contextlib.suppress(UsageError, EnvironmentFault, KeyError):
         topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
-    except (UsageError, EnvironmentFault, KeyError):
-        return {}
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        information = json.loads((run / BAG_NAME / "metadata.yaml").read_text("utf-8"))
+        topics = information["rosbag2_bagfile_information"]["topics_with_message_count"]
+        return {topic["topic_metadata"]["name"]: int(topic["message_count"]) for topic in topics}
+    return {}
+
+
+def lost_of(recorded: Mapping[str, int], there: Mapping[str, int]) -> dict[str, int]:
+    """By topic, how many packets fewer there are than were recorded."""
+    lost = {name: count - there.get(name, 0) for name, count in recorded.items()}
+    return {name: count for name, count in lost.items() if count > 0}
+
+
+def named(lost: Mapping[str, int]) -> str:
+    """Missing packets in words."""
+    return ", ".join(f"{count} of {name}" for name, count in lost.items())
 
 
 def counts_of(run: Path) -> dict[str, int]:
@@ -315,15 +333,6 @@ def counts_of(run: Path) -> dict[str, int]:
         raise OSError(errno.EIO, str(error)) from error
 
 
-def _has_damage(bag: Path) -> bool:
-    """Whether a part of a file is not as it was written; reads all of it."""
-    faults: list[str] = []
-    for _ in stored_messages(bag, faults.append):
-        if faults:
-            break
-    return bool(faults)
-
-
 def _is_fed(run: Path, plan: RecordingPlan) -> bool:
     """Whether a node of the run goes on, though its recorder does not."""
     return any(SpoolReader(run / name).is_fed for name in (*plan.streams, LISTENER))
@@ -332,7 +341,7 @@ def _is_fed(run: Path, plan: RecordingPlan) -> bool:
 def _rebuild(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object], *, keeps_changed: bool
 ) -> Repaired:
-    bag, damaged = run / BAG_NAME, run / DAMAGED_NAME
+    bag, damaged, recorded = run / BAG_NAME, run / DAMAGED_NAME, recorded_counts(run)
     if not damaged.exists():
         if bag.exists():
             bag.rename(damaged)
@@ -363,14 +372,14 @@ def _rebuild(
         recorder.abandon()
         raise
     counts = recorder.counts()
-    is_less = any(counts.get(name, 0) < count for name, count in recorded_counts(run).items())
+    lost = lost_of(recorded, counts)
     # In this order: cut off in between, the next repair finds all that is not in the bag.
     if damaged.exists():
         kept = run / KEPT_NAME
-        if (faults or is_less) and not kept.exists():
+        if (faults or lost) and not kept.exists():
             damaged.rename(kept)
             complain(f"the damaged bag is kept in {kept}")
         else:
             shutil.rmtree(damaged)
     recorder.clean_up()
-    return Repaired(counts, changed)
+    return Repaired(counts, changed, lost)

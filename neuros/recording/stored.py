@@ -9,11 +9,14 @@ from __future__ import annotations
 import os
 import sqlite3
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
-from struct import unpack
+from struct import error as struct_error
+from struct import unpack, unpack_from
+from textwrap import shorten
 from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
@@ -26,7 +29,9 @@ from neuros.recording.bag_files import (
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,
+    CHUNK_INDEX,
     DATA_END,
+    HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
@@ -63,7 +68,7 @@ def stored_messages(
             for topic, log_ns, publish_ns, _, data, is_right in _of_mcap(file, complain):
                 yield Stored(topic, log_ns, publish_ns, bytes(data), not is_right)
     for path in sorted(folder.glob("*.db3")):
-        yield from _of_sqlite(path)
+        yield from _of_sqlite(path, complain)
 
 
 class StoredTopics:
@@ -93,8 +98,31 @@ class StoredTopics:
                     data = os.pread(file.fileno(), size, start)
                     found.append(Stored(topic, log_ns, publish_ns, data))
         for path in sorted(self._folder.glob("*.db3")):
-            found += _of_sqlite(path, topic)
+            found += _of_sqlite(path, self._complain, topic)
         return found
+
+
+def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
+    """What is not as it was written, a sentence each; reads all of a bag.
+
+    Args:
+        counts: by topic, how many messages there should be.
+
+    Raises:
+        EnvironmentFault: as :func:`stored_messages`.
+    """
+    faults: list[str] = []
+    found = Counter(message.topic for message in stored_messages(folder, faults.append))
+    return faults or [
+        are_left(folder, name, count, found[name])
+        for name, count in counts.items()
+        if found[name] < count
+    ]
+
+
+def are_left(folder: Path, topic: str, count: int, left: int) -> str:
+    """A sentence on messages that are not there."""
+    return f"{folder}: of {count} packets of {topic} {left} are left"
 
 
 def is_whole(folder: Path) -> bool:
@@ -131,7 +159,7 @@ def damage_of(folder: Path) -> Iterator[None]:
     except EnvironmentFault:
         raise
     except Exception as error:
-        why = " ".join(str(error).split()) or type(error).__name__
+        why = shorten(str(error), 200, placeholder=" ...") or type(error).__name__
         raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
 
 
@@ -152,14 +180,26 @@ def _check_summaries(folder: Path) -> None:
     """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says."""
     for path in folder.glob("*.mcap"):
         with open(path, "rb") as file:
-            end = file.seek(0, os.SEEK_END) - len(MAGIC) - 4
-            if end < 16:
-                raise ReaderError(f"{path.name} has no end")
-            file.seek(end - 16)
-            start, _, checksum = unpack("<QQI", file.read(20))
-            file.seek(min(start, end))
-            if checksum and crc32(file.read(end - min(start, end))) != checksum:
-                raise ReaderError(f"the summary of {path.name} is not what was written")
+            _summary_of(file)
+
+
+def _summary_of(file: BinaryIO) -> bytes:
+    """The records between the data of an MCAP file and its end, and the start of the last one.
+
+    Raises:
+        ReaderError: if their checksum is wrong.
+    """
+    name = Path(file.name).name
+    end = file.seek(0, os.SEEK_END) - len(MAGIC) - 4
+    if end < 16:
+        raise ReaderError(f"{name} has no end")
+    file.seek(end - 16)
+    start, _, checksum = unpack("<QQI", file.read(20))
+    file.seek(min(start, end))
+    summary = file.read(end - min(start, end))
+    if checksum and crc32(summary) != checksum:
+        raise ReaderError(f"the summary of {name} is not what was written")
+    return summary
 
 
 def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
@@ -175,13 +215,69 @@ _Found = tuple[str, int, int, int, memoryview, bool]
 checksum of the part that they are in is right."""
 
 
+class _Index(NamedTuple):
+    """What the summary of an MCAP file says: topics by channel; start and length of each chunk."""
+
+    topics: dict[int, str]
+    chunks: list[tuple[int, int]]
+
+
+def _index_of(file: BinaryIO) -> _Index | None:
+    """``None`` where the summary is not as it was written, or knows of no chunk.
+
+    Raises:
+        EnvironmentFault: if the chunks are compressed.
+    """
+    index = _Index({}, [])
+    try:
+        summary, at = _summary_of(file), 0
+        while at + RECORD_HEAD.size <= len(summary):
+            kind, size = RECORD_HEAD.unpack_from(summary, at)
+            content = summary[at + RECORD_HEAD.size : at + RECORD_HEAD.size + size]
+            at += RECORD_HEAD.size + size
+            if kind == CHANNEL:
+                _add_channel(content, index.topics)
+            elif kind == CHUNK_INDEX:
+                *_, start, length, offsets = unpack_from("<QQQQI", content)
+                _refuse_compressed(file, *unpack_from("<I", content, 36 + offsets + 8))
+                index.chunks.append((start, length))
+    except (ReaderError, struct_error):
+        return None
+    size = os.fstat(file.fileno()).st_size
+    is_known = all(
+        RECORD_HEAD.size + CHUNK_HEAD.size <= length <= size - start
+        for start, length in index.chunks
+    )
+    return index if index.chunks and is_known else None
+
+
 def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
-    file_size = os.fstat(file.fileno()).st_size
-    start = file.read(len(MAGIC))
-    if start != MAGIC:
-        if not MAGIC.startswith(start):  # else it has been cut off
-            complain(f"{file.name} does not begin as an MCAP file")
+    """Chunk by chunk, as the summary has them; without a summary, record by record."""
+    index = _index_of(file)
+    file.seek(0)
+    if not MAGIC.startswith(file.read(len(MAGIC))):  # else it is right, or has been cut off
+        complain(f"{file.name} does not begin as an MCAP file")
+    if index is None:
+        yield from _one_by_one(file, complain)
         return
+    kind, size = RECORD_HEAD.unpack(file.read(RECORD_HEAD.size))
+    before = file.tell(), min(start for start, _ in index.chunks)
+    if kind != HEADER or size > before[1] - before[0]:
+        complain(f"{file.name} is damaged between bytes {before[0]} and {before[1]}")
+    for start, length in index.chunks:
+        file.seek(start)
+        head, content = file.read(RECORD_HEAD.size), file.read(length - RECORD_HEAD.size)
+        records = len(content) - CHUNK_HEAD.size
+        _, _, size, _, compression, also_size = CHUNK_HEAD.unpack_from(content)
+        is_right = _has_checksum(content)
+        heads = (*RECORD_HEAD.unpack(head), size, compression, also_size)
+        if not is_right or heads != (CHUNK, len(content), records, 0, records):
+            complain(f"{file.name} is damaged between bytes {start} and {start + length}")
+        yield from _of_chunk(content, start + RECORD_HEAD.size, index.topics, is_right)
+
+
+def _one_by_one(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
+    file_size = os.fstat(file.fileno()).st_size
     topics: dict[int, str] = {}
     while len(head := file.read(RECORD_HEAD.size)) == RECORD_HEAD.size:
         kind, size = RECORD_HEAD.unpack(head)
@@ -192,6 +288,8 @@ def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Fou
         content = file.read(min(size, file_size - offset))
         if kind == CHUNK:
             whole = content[: CHUNK_HEAD.size + _size_in(content)]
+            if len(content) >= CHUNK_HEAD.size:
+                _refuse_compressed(file, CHUNK_HEAD.unpack_from(content)[4])
             is_right = _is_as_written(whole)
             if not is_right or len(whole) < len(content):
                 complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
@@ -224,9 +322,12 @@ def _size_in(chunk: bytes) -> int:
 
 
 def _is_as_written(chunk: bytes) -> bool:
-    """Whether the checksum of a chunk is right; a chunk without one, or cut off, counts as that."""
-    if len(chunk) < CHUNK_HEAD.size + _size_in(chunk):
-        return True
+    """Whether the checksum of a chunk is right; a chunk that was cut off counts as that."""
+    return len(chunk) < CHUNK_HEAD.size + _size_in(chunk) or _has_checksum(chunk)
+
+
+def _has_checksum(chunk: bytes) -> bool:
+    """Whether the checksum of a whole chunk is right, if it has one."""
     checksum = CHUNK_HEAD.unpack_from(chunk)[3]
     return not checksum or crc32(memoryview(chunk)[CHUNK_HEAD.size :]) == checksum
 
@@ -237,8 +338,6 @@ def _of_chunk(
     """The messages of a chunk without compression; ``topics`` grows by its channels."""
     if len(content) < CHUNK_HEAD.size:
         return
-    if CHUNK_HEAD.unpack_from(content)[4]:
-        raise EnvironmentFault("its chunks are compressed, which this reader does not read")
     at = CHUNK_HEAD.size
     view = memoryview(content)
     while at + RECORD_HEAD.size <= len(content):
@@ -248,9 +347,7 @@ def _of_chunk(
         if end > len(content):
             return
         if kind == CHANNEL:
-            length = int.from_bytes(content[at + 4 : at + 8], "little")
-            number = int.from_bytes(content[at : at + 2], "little")
-            topics[number] = content[at + 8 : at + 8 + length].decode(errors="replace")
+            _add_channel(content[at:end], topics)
         elif kind == MESSAGE and size >= MESSAGE_HEAD.size:
             number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content, at)
             start = at + MESSAGE_HEAD.size
@@ -260,15 +357,33 @@ def _of_chunk(
         at = end
 
 
-def _of_sqlite(path: Path, only: str | None = None) -> Iterator[Stored]:
+def _add_channel(record: bytes, topics: dict[int, str]) -> None:
+    length = int.from_bytes(record[4:8], "little")
+    number = int.from_bytes(record[:2], "little")
+    topics.setdefault(number, record[8 : 8 + length].decode(errors="replace"))
+
+
+def _refuse_compressed(file: BinaryIO, name_length: int) -> None:
+    """Raise ``EnvironmentFault`` where the name of a compression is not empty."""
+    if name_length:
+        raise EnvironmentFault(
+            f"{file.name}: its chunks are compressed, which this reader does not read"
+        )
+
+
+def _of_sqlite(
+    path: Path, complain: Callable[[str], object], only: str | None = None
+) -> Iterator[Stored]:
     query = (
         "SELECT topics.name, timestamp, data FROM messages"
         " JOIN topics ON topics.id = topic_id WHERE ?1 IS NULL OR topics.name = ?1"
         " ORDER BY messages.id"
     )
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
+        connection.text_factory = partial(str, encoding="utf-8", errors="replace")
         try:
             for topic, log_ns, data in connection.execute(query, (only,)):
-                yield Stored(topic, log_ns, log_ns, data)
-        except sqlite3.DatabaseError:
-            return
+                if [type(topic), type(log_ns), type(data)] == [str, int, bytes] and log_ns >= 0:
+                    yield Stored(topic, log_ns, log_ns, data)
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:  # texts of errors quote names
+            complain(f"{path} is damaged ({error})")
