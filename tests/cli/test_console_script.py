@@ -50,6 +50,24 @@ def test_ctrl_c_while_packages_are_imported_waits_for_the_command(tmp_path: Path
     assert (done.stdout, done.stderr, done.returncode) == ("interrupted\n", "", 130)
 
 
+def test_launching_spares_the_restart_that_the_ros_wheels_would_make(tmp_path: Path) -> None:
+    """They start Python once more, with their libraries in ``LD_LIBRARY_PATH``."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os\nprint('started with', os.environ.get('LD_LIBRARY_PATH', 'no libraries'))\n"
+    )
+    guards = ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+    own = {key: value for key, value in os.environ.items() if key not in guards}
+    done = subprocess.run(
+        [sys.executable, "-S", SCRIPT, "launch", "--help"],
+        env={**own, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert done.stdout.startswith("started with no libraries\nusage: neuros launch ")
+
+
 @pytest.mark.parametrize(
     ("line", "fitting"),
     [
