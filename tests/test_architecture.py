@@ -77,7 +77,6 @@ GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "int
 GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 # What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
-    "project.validate": {"jsonschema", "referencing"},
     "time": {"builtin_interfaces"},
     "control": {"typing_extensions"},
     "transport": {
@@ -261,7 +260,7 @@ def test_an_import_that_breaks_the_table_is_named_with_its_line(
     [
         ("neuros.engine.engine", "from neuros.engine import hook\nfrom .metrics import Rest"),
         ("neuros.engine.engine", "from neuros import errors, hooks\nimport heapq"),
-        ("neuros.project.validate", "import jsonschema\nfrom neuros.project.model import Node"),
+        ("neuros.api.export", "import yaml\nfrom neuros.project.model import Node"),
         ("neuros.cli.launch", "from neuros.transport.ros import x\nfrom neuros import __version__"),
         ("neuros.installation.machine", "from neuros.errors import EnvironmentFault"),
     ],
@@ -353,6 +352,18 @@ def test_the_reaper_starts_without_what_takes_long_to_import() -> None:
         "program._import_the_rest()\n"
         "assert 'neuros.backends.shared_memory' in sys.modules\n"
         "assert not {'dataclasses', 'inspect', 'tempfile'} & {*sys.modules}",
+    )
+
+
+def test_a_launch_starts_without_what_only_some_launches_need() -> None:
+    run_python(
+        "-c",
+        "import sys; sys.path.insert(0, '.')\n"
+        "import neuros.api.execution, neuros.cli.environments, neuros.cli.launch\n"
+        "import neuros.backends.process_launchers\n"
+        "heavy = {'concurrent.futures', 'ctypes', 'docker', 'importlib.metadata', 'jsonschema'}\n"
+        "heavy |= {'numpy', 'platform', 'psutil', 'rclpy', 'ssl', 'tabulate'}\n"
+        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}",
     )
 
 
