@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import subprocess
 import sys
 import threading
@@ -29,12 +28,12 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
         run_folder: where nodes have noted their versions.
     """
     nodes = list(nodes)
-    own = python_versions()
+    own, kernel = python_versions(), os.uname()
     return {
         "command": list(command),
         "versions": {
             "neuros": __version__,
-            "kernel": f"{platform.system()} {platform.release()}",
+            "kernel": f"{kernel.sysname} {kernel.release}",
             **own,
             "nodes": {
                 node.name: noted
@@ -50,7 +49,7 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
 def python_versions() -> dict[str, Any]:
     """Of this Python and of what it finds."""
     return {
-        "python": platform.python_version(),
+        "python": sys.version.split()[0],
         "executable": sys.executable,
         "packages": installed_packages(sys.path),
     }
@@ -87,8 +86,8 @@ def installed_packages(folders: Iterable[str]) -> dict[str, str]:
 def machine() -> dict[str, Any]:
     """The machine, as far as figures depend on it."""
     return {
-        "name": platform.node(),
-        "processor": _first("/proc/cpuinfo", "model name") or platform.machine(),
+        "name": os.uname().nodename,
+        "processor": _first("/proc/cpuinfo", "model name") or os.uname().machine,
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
