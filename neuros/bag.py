@@ -17,7 +17,7 @@ import datetime
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -25,8 +25,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Connection, QosDurability, QosReliability
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.columns import (
@@ -41,7 +39,7 @@ from neuros.recording.columns import (
 )
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
-from neuros.recording.stored import StoredTopics, are_left, damage_of, faults_of, opened
+from neuros.recording.stored import StoredTopics, are_left, damage_of, faults_of, opened, store_of
 
 __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
 
@@ -228,7 +226,7 @@ class Bag:
             self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
             self.start_ns, self.duration_s = reader.start_time, reader.duration / 1e9
             found = {c.topic: c for c in reader.connections}
-            self.store = _store_of(found.values())
+            self.store = store_of(found.values())
             self.topics = {
                 name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
             }
@@ -351,13 +349,3 @@ def _repair_if_possible(run: Path) -> None:
     except EnvironmentFault:
         if not (run / BAG_NAME / "metadata.yaml").is_file():
             raise
-
-
-def _store_of(connections: Iterable[Connection]) -> Typestore:
-    """The types as the bag defines them."""
-    store = get_typestore(Stores.EMPTY)
-    types: dict[str, Any] = {}
-    for connection in connections:
-        types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
-    store.register(types)
-    return store

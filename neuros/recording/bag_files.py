@@ -64,7 +64,7 @@ def _define(type_name: str, store: Typestore) -> None:
             f" (share/{type_name}.msg) is not installed here"
         )
     types = get_types_from_msg(path.read_text("utf-8"), type_name)
-    for used in _types_of_fields(types[type_name][1]):
+    for used in types_of_fields(types[type_name][1]):
         if used.endswith("/msg/wstring"):
             raise EnvironmentFault(
                 f"message type {type_name} cannot be recorded: it has a wstring, which the"
@@ -75,14 +75,14 @@ def _define(type_name: str, store: Typestore) -> None:
     store.register(types)
 
 
-def _types_of_fields(fields: object) -> Iterator[str]:
+def types_of_fields(fields: object) -> Iterator[str]:
     """The message types in rosbags' description of fields."""
     if isinstance(fields, str):
         if "/" in fields:
             yield fields
     elif isinstance(fields, (list, tuple)):
         for part in fields:
-            yield from _types_of_fields(part)
+            yield from types_of_fields(part)
 
 
 class BagWriter:

@@ -10,19 +10,21 @@ import os
 import sqlite3
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack, unpack_from
 from textwrap import shorten
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
-from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault
 from neuros.recording.bag_files import (
@@ -36,6 +38,7 @@ from neuros.recording.bag_files import (
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    types_of_fields,
 )
 
 
@@ -126,9 +129,10 @@ def are_left(folder: Path, topic: str, count: int, left: int) -> str:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether readers will open a bag: metadata, and beginning and end of its files."""
+    """Whether readers will open a bag: metadata, beginning and end of its files, and types."""
     try:
-        with opened(folder):
+        with opened(folder) as reader, damage_of(folder):
+            store_of(reader.connections)
             return True
     except EnvironmentFault:
         return False
@@ -149,6 +153,19 @@ def opened(folder: Path) -> Iterator[Reader]:
             stack.callback(reader.close)
             _check_definitions(reader)
         yield reader
+
+
+def store_of(connections: Iterable[Connection]) -> Typestore:
+    """The types as a bag defines them. Raises ``ReaderError``, and whatever the parser raises."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    for connection in connections:
+        types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+    store.register(types)
+    for name, (_, fields) in types.items():
+        if unknown := next((used for used in types_of_fields(fields) if used not in types), None):
+            raise ReaderError(f"it does not define {unknown}, which {name} has")
+    return store
 
 
 @contextmanager

@@ -225,6 +225,17 @@ def test_an_sqlite_bag_that_has_lost_packets_says_how_many(
     assert (other / "bag.before_repair").is_dir()
 
 
+@pytest.mark.parametrize("new", [b"inq32 data", b"int32 ####", b"\xffnt32 data"])
+def test_a_definition_that_has_changed_costs_no_packet(
+    in_sqlite: Path, tmp_path: Path, new: bytes
+) -> None:
+    run = Path(shutil.copytree(in_sqlite, tmp_path / "run"))
+    file = run / "bag/bag.db3"
+    file.write_bytes(file.read_bytes().replace(b"int32 data", new))
+    assert main(["bag", "repair", str(run)]) == 0
+    assert values_in(neuros.bag.open(run)) == VALUES
+
+
 def test_no_packet_is_compared_with_another_because_one_before_it_is_missing(
     in_sqlite: Path, tmp_path: Path
 ) -> None:
