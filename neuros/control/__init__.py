@@ -283,7 +283,7 @@ class AtRest(Message):
 
 
 class WasReset(Message):
-    """Answer to ``reset``; ``why_not``: why a new run has to be started instead."""
+    """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
 
     why_not: str
 
@@ -351,7 +351,7 @@ class Settle(Message):
 
 
 class Reset(Message):
-    """While nothing moves, return to the start; ``variables``: of the environments, by node."""
+    """While paused, return to the start and stay paused; ``variables``: environments, by node."""
 
     variables: Mapping[str, Mapping[str, str]]
 

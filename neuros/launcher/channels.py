@@ -309,9 +309,9 @@ class Observers:
                 if self._channels.process_count == 1:
                     self._channels.send(message)
                 else:
-                    self._channels.send_to(
-                        link, control.WasReset("its nodes are in several processes")
-                    )
+                    is_early = not self._channels.process_count
+                    why = "have not started yet" if is_early else "are in several processes"
+                    self._channels.send_to(link, control.WasReset(f"its nodes {why}"))
             case control.WasReset():
                 self.tell(message)
             case control.Deliver(node=node):

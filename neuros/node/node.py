@@ -156,6 +156,11 @@ class NodeRuntime:
         return self._time.now_s
 
     @property
+    def is_paused(self) -> bool:
+        """Whether its hooks stand still, but for steps."""
+        return self._loaded.is_paused
+
+    @property
     def waiting_threads(self) -> set[threading.Thread]:
         """Threads that wait until the packets that they have offered are sent."""
         return self._services.waiting_threads
@@ -198,8 +203,9 @@ class NodeRuntime:
     def reset(self, variables: Mapping[str, str]) -> None:
         """Be as after :meth:`load`, with these variables in the environment.
 
-        Nothing may be under way to the node or from it. A plugin with reset hooks stays loaded, and
-        these take the place of its initialise hooks; any other is finalised and loaded anew.
+        It is paused, and stays so; nothing may be under way to it or from it. A plugin with reset
+        hooks stays loaded, and these take the place of its initialise hooks; any other is finalised
+        and loaded anew.
 
         Raises:
             PluginError, HookError: as :meth:`load`.
@@ -226,6 +232,7 @@ class NodeRuntime:
         else:
             self._load_plugin()
         engine = self._make()
+        engine.pause()
         self.reports.begin_anew(engine)
         for connection in engine.send_windows:
             engine.on_registered(connection)

@@ -239,13 +239,16 @@ class NodeProcess:
             loop.post_loop_back(self._steps.take)
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
-        """Bring all nodes back to their start, if nothing of theirs is beyond reach."""
+        """Bring all nodes back to their start, once no event waits, if they can be."""
         assert self._middleware is not None
-        why_not = next((why for node in self._nodes if (why := node.why_not_reset)), "")
-        threads = [t for t in threading.enumerate() if not isinstance(t, ControlThread)]
-        if threads != [threading.main_thread()]:
-            why_not = why_not or f"a plugin has a thread ({threads[-1].name})"
+        loop = self._middleware.loop
+        why_not = self._why_not_reset()
         if not why_not:
+            for node in self._nodes:
+                node.pause()  # takes back what is left of steps, which might go on for ever
+            if loop.has_waiting_events or not loop.has_taken_in:
+                loop.post_loop_back(lambda: self._reset(variables))
+                return
             for node in self._nodes:
                 try:
                     node.reset(variables.get(node.name, {}))
@@ -255,8 +258,22 @@ class NodeProcess:
                 self._tell(declared(node.name, node.specs))
             self._has_been_reset = True
             for node in self._nodes:
-                self._middleware.loop.post(node.start)
+                loop.post(node.start)
         self._tell(control.WasReset(why_not))
+
+    def _why_not_reset(self) -> str:
+        """Why the nodes cannot be reset where they are; empty if they can."""
+        if not all(node.is_paused for node in self._nodes):
+            return "the run is not paused: pause it first"
+        connections = [c for file in self._files for c in file.connections]
+        ends = {name for c in connections for name in (c.source_node, c.destination_node)}
+        if not self._by_name.keys() >= ends:
+            return "its nodes are in several processes"
+        if why := next((why for node in self._nodes if (why := node.why_not_reset)), ""):
+            return why
+        threads = [t for t in threading.enumerate() if not isinstance(t, ControlThread)]
+        is_alone = threads == [threading.main_thread()]
+        return "" if is_alone else f"a plugin has a thread ({threads[-1].name})"
 
     def _explain(self) -> None:
         """Report why nothing moves, but for nodes whose hook runs."""

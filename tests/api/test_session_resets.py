@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,22 @@ from test_stepped_sessions import ACCEPTANCE, BRAIN, DEADLINE_S, EVERY_BACK_END,
 
 import neuros
 from containers import require_containers
+from neuros.api.live import LiveRun
 from neuros.api.session import Session
+from neuros.backends.control_sockets import connect
+from neuros.control import (
+    TO_OBSERVERS,
+    LookAll,
+    Message,
+    NodeStatus,
+    Pause,
+    Reset,
+    Resume,
+    StepAll,
+    WasReset,
+    Watch,
+)
+from neuros.control.link import ControlLink
 from neuros.errors import RunError, UsageError
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
@@ -223,3 +239,51 @@ def test_a_plugin_that_cannot_be_loaded_again_fails_the_run(tmp_path: Path) -> N
         (made / "brain.py").write_text(BRAIN)
         s.reset()
         assert poses(s, 2) == [1.0, 0.5]
+
+
+def observed(live: LiveRun) -> ControlLink:
+    """An observer of the run, as soon as it can be observed."""
+    while True:
+        with contextlib.suppress(OSError):
+            link = ControlLink(connect(live.control_address), TO_OBSERVERS, "the supervisor")
+            link.send(Watch())
+            return link
+
+
+def answer(link: ControlLink, *wishes: Message) -> WasReset:
+    """What the observer hears of a reset."""
+    for wish in wishes:
+        link.send(wish)
+    while True:
+        for message in link.receive() or ():
+            if isinstance(message, WasReset):
+                return message
+
+
+def counted(link: ControlLink) -> tuple[str, int]:
+    """The state of the thrower, and how many dice it has thrown."""
+    link.send(LookAll({}))
+    while True:
+        for message in link.receive() or ():
+            if isinstance(message, NodeStatus) and message.node == "thrower":
+                assert message.counters is not None
+                (sent,) = message.counters.metrics["outgoing"].values()
+                return message.counters.metrics["state"]["state"], sent["sent"]
+
+
+def test_an_observer_resets_a_run_only_while_that_is_paused(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(dice(tmp_path, ENDLESS))
+    with project.start(backend="in-process", output=tmp_path / "run") as live:
+        link = observed(live)
+        while answer(link, Reset({})).why_not == "its nodes have not started yet":
+            pass
+        while counted(link)[1] == 0:
+            pass
+        assert answer(link, Reset({})).why_not == "the run is not paused: pause it first"
+        assert answer(link, Pause(), StepAll(1_000_000), Reset({})).why_not == ""
+        assert counted(link) == ("paused", 0)
+        link.send(Resume())
+        while counted(link)[1] == 0:
+            pass
+        link.close()
+    assert live.wait().exit_code == 0
