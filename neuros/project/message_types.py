@@ -105,7 +105,7 @@ def unknown_type(
             f"unknown message type '{type_name}': there is no message package '{package}' here",
             _similar_package(package)
             or f"a message of your own is workspace/{package}/msg/{name}.msg beside the project"
-            " file: docs/messages.md",
+            f" file, with workspace/{package}/package.xml: docs/messages.md",
         )
     names = _IMPORTED.findall((folder / "__init__.py").read_text(encoding="utf-8"))
     if name in names or imported(package, name) is not None:

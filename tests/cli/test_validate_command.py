@@ -161,3 +161,13 @@ def test_a_message_type_of_which_a_container_of_ones_own_says_nothing_is_a_warni
     assert main(["validate", "."]) == 0
     said = "/nodes/0/inputs/0/type: unknown message type 'arm_msgs/msg/Joints': there is no message"
     assert (said in capsys.readouterr().err) is is_said
+
+
+def test_a_message_package_that_is_not_there_is_described_with_its_manifest(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    port = {"name": "joints", "type": "arm_msgs/msg/Joints", "external_topic": "joints"}
+    write(f"{HEAD}@neuros_function('joints')\ndef f(node, x): ...", inputs=[port])
+    assert main(["validate", "."]) == 3
+    hint = "workspace/arm_msgs/msg/Joints.msg beside the project file, with"
+    assert f"{hint} workspace/arm_msgs/package.xml" in capsys.readouterr().err
