@@ -71,6 +71,7 @@ class Run:
         in_process: bool = False,
         duration_s: float | None = None,
         elsewhere: tuple[str, ...] = (),
+        on_stop: Act = lambda: None,
         **acts: str,
     ) -> Outcome:
         """Run nodes that do as the text under their names says, to the end."""
@@ -86,6 +87,7 @@ class Run:
             listener=self.listener(self.folder),
             duration_s=duration_s,
             peers=Peers("this run", elsewhere, files),
+            on_stop=on_stop,
         )
         start_s = time.monotonic()
         outcome = supervisor.run()

@@ -55,6 +55,7 @@ class Reaper:
         self._run_id = run_id
         self._process = process
         self._pipe: int | None = pipe
+        self._has_finished = False
         self._orders = Orders()
 
     @classmethod
@@ -125,18 +126,27 @@ class Reaper:
         depth = module.count(".") + (file.name == "__init__.py")
         self._tell("clean", [module, str(file.parents[depth]), argument])
 
-    def finish(self, grace_s: float = 0.0) -> None:
-        """Leave the rest to the reaper and wait for it.
+    def leave(self, grace_s: float = 0.0) -> None:
+        """Leave the rest to the reaper; what still runs gets ``grace_s`` seconds to end by itself.
 
-        What still runs gets ``grace_s`` seconds to end by itself. A second call has no effect.
+        A second call has no effect.
         """
-        if self._pipe is None:
+        if self._pipe is not None:
+            self._tell("grace", grace_s)
+            os.close(self._pipe)
+            self._pipe = None
+
+    def finish(self, grace_s: float = 0.0) -> None:
+        """Leave the rest to the reaper, if that was not done, and wait for it.
+
+        A second call has no effect.
+        """
+        self.leave(grace_s)
+        if self._has_finished:
             return
-        self._tell("grace", grace_s)
-        os.close(self._pipe)
-        self._pipe = None
+        self._has_finished = True
         try:
-            self._process.wait(grace_s + KILL_DEADLINE_S + 5.0)
+            self._process.wait(self._orders.grace_s + KILL_DEADLINE_S + 5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

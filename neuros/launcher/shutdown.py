@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from neuros.control import Drain, Leave, Stop
@@ -39,6 +40,7 @@ class Shutdown:
 
     Args:
         _signals: numbers of the signals that have arrived, appended to by a signal handler.
+        _on_stop: called once nodes have been told to end.
     """
 
     _channels: Channels
@@ -50,6 +52,7 @@ class Shutdown:
     _outcome: Outcome
     _output: Output
     _signals: list[int]
+    _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
 
@@ -182,6 +185,7 @@ class Shutdown:
         self._channels.send(Stop())
         for process in self._processes.not_loaded():
             self._processes.kill(process)  # it has not come as far as anything worth finalising
+        self._on_stop()
 
     def _kill_all(self) -> None:
         self.phase = Phase.KILLED

@@ -10,7 +10,7 @@ from __future__ import annotations
 import signal
 import socket
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import neuros.control as control
@@ -59,6 +59,7 @@ class Supervisor:
         duration_s: wall time from the first hook to a drained end, ``None``: no limit.
         peers: who starts the other nodes of the project, where not all are started here.
         is_held: whether the nodes start paused, for a session.
+        on_stop: called once nodes have been told to end; it must not take long.
         waker: bytes arrive here whenever a signal does, SIGCHLD too; without it signals, and
             processes that end before they have connected, are seen a fifth of a second late.
 
@@ -85,6 +86,7 @@ class Supervisor:
         peers: Peers | None = None,
         waker: socket.socket | None = None,
         is_held: bool = False,
+        on_stop: Callable[[], object] = lambda: None,
     ) -> None:
         self._files = files
         self._run_folder = run_folder
@@ -118,6 +120,7 @@ class Supervisor:
             self.outcome,
             output,
             signals,
+            on_stop,
         )
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:

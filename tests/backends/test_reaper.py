@@ -203,6 +203,16 @@ def test_finish_kills_at_once_what_is_left(run_id: str, reaper: Reaper) -> None:
     assert not reaper.is_on_duty
 
 
+def test_a_launcher_may_go_on_while_its_reaper_kills_what_is_left(
+    run_id: str, reaper: Reaper
+) -> None:
+    process = _start(run_id, IGNORES_SIGTERM)
+    reaper.leave()
+    assert _end(process) == -signal.SIGKILL
+    reaper.finish()
+    assert not reaper.is_on_duty
+
+
 def test_processes_that_end_within_the_grace_period_are_not_killed(
     run_id: str, reaper: Reaper
 ) -> None:

@@ -30,6 +30,16 @@ def test_a_node_ends_the_project(run: Run) -> None:
     assert outcome.started_s < outcome.ending_s < outcome.ended_s
 
 
+def test_what_is_to_be_done_meanwhile_begins_before_the_nodes_have_ended(run: Run) -> None:
+    alive: list[bool] = []
+
+    def note() -> None:
+        alive.extend(host.poll() is None for host in run.hosts)
+
+    run(a=SHUTS_DOWN, b=WELL_BEHAVED, on_stop=note)
+    assert alive == [True, True]
+
+
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
     too_late = "host.up(); host.wait_for('drain'); host.tell('shutdown', reason='', drain_s=0)"
     outcome = run(a=SHUTS_DOWN, b=f"{too_late}; host.serve()")
