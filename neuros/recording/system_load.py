@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from neuros.tables import table
+
 FILE_NAME = "system_load.csv"
 
 LAUNCHER = "launcher"
@@ -172,8 +174,6 @@ class _Extremes:
 
 def load_table(summary: Mapping[str, Any]) -> str:
     """The summary as text; one line where there is nothing to sum up."""
-    from tabulate import tabulate
-
     machine = summary["machine"]
     if machine is None:
         return "system load: the run was shorter than the first sample"
@@ -183,15 +183,11 @@ def load_table(summary: Mapping[str, Any]) -> str:
         if load is not None
     ]
     rows.append(["(whole machine)", *_cells(machine, "memory_used_bytes_max"), ""])
-    table = tabulate(
-        rows,
-        headers=["system load", "cpu mean", "cpu max", "memory max", "threads max"],
-        disable_numparse=True,
-        colalign=("left", "right", "right", "right", "right"),
-    )
+    header = ["system load", "cpu mean", "cpu max", "memory max", "threads max"]
     cores = machine["cores"]
     samples = f"{summary['samples']} sample{'' if summary['samples'] == 1 else 's'}"
-    return f"{table}\n100% is one core of {cores}; {samples}: {summary['file']}"
+    text = table(header, rows, right=range(1, 5))
+    return f"{text}\n100% is one core of {cores}; {samples}: {summary['file']}"
 
 
 def _cells(load: Mapping[str, float], memory: str) -> list[str]:
