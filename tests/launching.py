@@ -27,9 +27,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from tests.preloaded import PreloadedLauncher, may_fork
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXAMPLES = REPOSITORY / "examples"
 BACKENDS = ("process", "in-process")
+LAUNCH = (sys.executable, "-m", "neuros.cli", "launch")
 
 _RECORD = re.compile(r"\[[A-Z]+\] \[[\d.]+\] \[(?P<name>[^\]]+)\]: (?P<text>.*)")
 _UNWANTED = ("ROS_DOMAIN_ID", "NEUROS_GUI", "NEUROS_RUN_DIR", "RCUTILS_COLORIZED_OUTPUT")
@@ -66,7 +69,9 @@ class Finished:
 class Running:
     """A launcher at work. As a context manager it leaves nothing behind."""
 
-    def __init__(self, process: subprocess.Popen[bytes], cwd: Path, before: set[Path]) -> None:
+    def __init__(
+        self, process: subprocess.Popen[bytes] | PreloadedLauncher, cwd: Path, before: set[Path]
+    ) -> None:
         self.process = process
         self._cwd = cwd
         self._before = before
@@ -145,21 +150,24 @@ def start(
     *arguments: str,
     cwd: Path,
     through: Sequence[str] = (),
-    program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "launch"),
+    program: Sequence[str] = (),
     stdin: int | IO[bytes] = subprocess.DEVNULL,
     **environment: str,
 ) -> Running:
     """Start ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd``; ``-o`` is relative to it.
 
     ``through`` is a command that executes the one that follows it, with the same process id;
-    ``program`` is what launches.
+    ``program`` is what launches, if that is to be another command than ours.
     """
     inherited = {key: value for key, value in os.environ.items() if key not in _UNWANTED}
+    whole = {**inherited, **environment}
     before = _run_folders(cwd)
+    if not through and not program and stdin == subprocess.DEVNULL and may_fork(whole):
+        return Running(PreloadedLauncher([str(project), *arguments], cwd, whole), cwd, before)
     process = subprocess.Popen(
-        [*through, *program, str(project), *arguments],
+        [*through, *(program or LAUNCH), str(project), *arguments],
         cwd=cwd,
-        env={**inherited, **environment},
+        env=whole,
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
