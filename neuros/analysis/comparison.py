@@ -20,7 +20,6 @@ from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
 from neuros.recording.recording_plan import PLAN_NAME
 from neuros.recording.stored import stored_messages
-from neuros.tables import table
 
 _Figures = dict[tuple[str, int], float | None]
 """Values by their name and the digits after the point."""
@@ -57,7 +56,10 @@ def figures_of(runs: Sequence[PastRun]) -> dict[str, list[float | None]]:
 
 def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """The rows as text."""
-    return table(header, rows, range(1, len(header)))
+    from tabulate import tabulate
+
+    align = ("left", *("right" for _ in header[1:])) if rows else None
+    return str(tabulate(rows, headers=header, disable_numparse=True, colalign=align))
 
 
 def _side_by_side(runs: Sequence[PastRun]) -> dict[tuple[str, int], list[float | None]]:

@@ -19,7 +19,6 @@ from neuros.project.model import Budgets, Connection, NodeFile, Project
 from neuros.project.split import project_to_json
 from neuros.recording.run_file import FORMAT, RUN_FILE, check_record, read_object, read_run_file
 from neuros.registry import ran_in_one_process
-from neuros.tables import table
 
 if TYPE_CHECKING:
     from neuros.analysis.packets import Numbers, Packets, Trace
@@ -72,6 +71,8 @@ def run_record(
 
 def run_table(record: Mapping[str, Any]) -> str:
     """The record as text: connections, nodes, and times."""
+    from tabulate import tabulate
+
     counts: tuple[str, ...] = _COUNTS
     for count in ("in_flight", "foreign"):
         if any(c.get(count) for c in record["connections"]):
@@ -80,10 +81,10 @@ def run_table(record: Mapping[str, Any]) -> str:
     header = ("connection", *(count.replace("_", " ") for count in counts))
     nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
     parts = [
-        table(header, rows, range(1, 1 + count_of_numbers))
-        for header, rows, count_of_numbers in (
-            (header, connections, len(counts)),
-            (("node", *_STATES, "remark"), nodes, len(_STATES)),
+        tabulate(rows, header, missingval="?", disable_numparse=True, colalign=("left", *right))
+        for header, rows, right in (
+            (header, connections, ["right"] * len(counts)),
+            (("node", *_STATES, "remark"), nodes, ["right"] * len(_STATES)),
         )
         if rows
     ]

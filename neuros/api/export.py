@@ -25,6 +25,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,8 @@ _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
+# What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
+_VENDORED = "tabulate"
 
 _DOCKERFILE = f"""\
 # The image of a container, and on top of it NeuROS and the project. It takes no network.
@@ -248,6 +251,9 @@ class Export:
         shutil.copytree(PACKAGE, image / "lib/neuros", ignore=_NOT_COPIED)
         if WORKSPACE.is_dir():
             shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=_NOT_COPIED)
+        spec = find_spec(_VENDORED)
+        for place in (spec.submodule_search_locations or ()) if spec else ():
+            shutil.copytree(place, image / "lib" / _VENDORED, ignore=_NOT_COPIED)
         for python in self._messages:
             folder = image / "messages" / python.parent.name
             shutil.copytree(python.parent, folder, ignore=_NOT_COPIED)

@@ -29,7 +29,6 @@ from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, 
 from neuros.executors.executor import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
 from neuros.recording.run_file import RUN_FILE
-from neuros.tables import table
 
 _PLAN_NAME = "sweep.json"
 _LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
@@ -330,13 +329,17 @@ def _write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
 
 def _table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """For people: without folders, times and counts."""
+    from tabulate import tabulate
+
     hidden = ("folder", "wall_s", "sim_s")
     names = [n for n in _columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
     names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
-    return table(
-        [name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
+    table: str = tabulate(
         [[_cell(name, row.get(name)) for name in names] for row in rows],
+        headers=[name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
+        disable_numparse=True,
     )
+    return table
 
 
 def _is_shown(value: Any) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
-from neuros.tables import table
 
 if TYPE_CHECKING:
     from neuros.simulators.convert.elements import NotTaken
@@ -112,8 +111,11 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
 
 
 def _table(notes: Sequence[NotTaken]) -> str:
+    from tabulate import tabulate
+
     rows = [
         [note.place, note.path, f"{note.count} x" if note.count > 1 else "", note.why]
         for note in notes
     ]
-    return table(["where", "what", "", "reason, or what is different"], rows)
+    headers = ["where", "what", "", "reason, or what is different"]
+    return str(tabulate(rows, headers=headers, disable_numparse=True))

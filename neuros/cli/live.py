@@ -27,7 +27,6 @@ from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.options import positive_number
 from neuros.project.suggest import did_you_mean, listed
-from neuros.tables import table
 
 if TYPE_CHECKING:
     from neuros.control import NodeStatus
@@ -141,6 +140,8 @@ def _rows(session: Session) -> Iterator[_RunningNode]:
 
 
 def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:
+    from tabulate import tabulate
+
     cells = []
     for row in rows:
         since = datetime.fromtimestamp(row.since).strftime("%Y-%m-%d %H:%M:%S")
@@ -149,7 +150,7 @@ def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:
         cells.append([*head, row.node, row.backend, since, row.state])
     users = ["user"] if shows_users else []
     header = ["run", *users, "project", "node", "back end", "since", "state"]
-    return table(header, cells)
+    return str(tabulate(cells, headers=header))
 
 
 def _user_name(user: int) -> str:
@@ -275,13 +276,15 @@ def add_topic(topic: argparse.ArgumentParser) -> None:
 
 
 def _list(options: argparse.Namespace) -> int:
+    from tabulate import tabulate
+
     topics = _topics(_run(options.run))
     if options.format == JSON:
         shown = ("name", "type", "connection")
         print_json([{key: getattr(each, key) or None for key in shown} for each in topics])
     else:
         rows = [[each.connection or each.node, each.type, each.name] for each in topics]
-        print(table(["connection or node", "type", "topic"], rows))
+        print(tabulate(rows, headers=["connection or node", "type", "topic"]))
     return 0
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.project.suggest import counted
-from neuros.tables import table
 
 if TYPE_CHECKING:
     from neuros.analysis.run_record import PastRun
@@ -227,11 +226,13 @@ def add_bag(bag: argparse.ArgumentParser) -> None:
 
 
 def _info(options: argparse.Namespace) -> int:
+    from tabulate import tabulate
+
     from neuros.bag import open_bag
 
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
-        print(table(["topic", "type", "packets"], rows))
+        print(tabulate(rows, headers=["topic", "type", "packets"], disable_numparse=True))
         print(f"\n{opened.folder}: {opened.duration_s:.2f} s, project {opened.project or '?'}")
         damage = opened.check()
     if damage is None:

@@ -244,7 +244,8 @@ class _Proof:
 _ROS = _Proof(
     "ROS 2",
     "ros-jazzy-rclpy",
-    "import psutil, rclpy, sensor_msgs.msg\nrclpy.utilities.get_rmw_implementation_identifier()",
+    "import jsonschema, rclpy, sensor_msgs.msg\n"
+    "rclpy.utilities.get_rmw_implementation_identifier()",
 )
 _PROOFS = {
     "mujoco": _Proof(

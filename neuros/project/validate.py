@@ -9,12 +9,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from neuros.errors import Problem
 from neuros.project.model import Project
@@ -34,15 +33,6 @@ _KINDS = {
     "integer": "a whole number",
     "boolean": "true or false",
     "null": "null",
-}
-
-
-_TYPES: Mapping[str, type] = {
-    "object": dict,
-    "array": list,
-    "string": str,
-    "boolean": bool,
-    "null": type(None),
 }
 
 
@@ -68,12 +58,8 @@ def mistake(content: Any, name: str, part: str = "") -> str:
 
     ``part`` of the schema of that name is its form, as ``"#/$defs/node_file"``.
     """
-    validator = Validator(f"{name}.schema.json", part.removeprefix("#"), is_strict=name == "run")
-    error = next(validator.violations(content), None)
-    if error is None:
-        return ""
-    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in error.path)
-    return f"${''.join(steps)}: {_sentence(error)[0]}"
+    error = next(_validator(name, part).iter_errors(content), None)
+    return "" if error is None else f"{error.json_path}: {_sentence(error)[0]}"
 
 
 def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tuple[Problem, ...]:
@@ -98,195 +84,96 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
 
 def violations_in(element: Element, name: str) -> list[Problem]:
     """Everything in a document that violates the schema of that name."""
-    errors = Validator(f"{name}.schema.json").violations(element.plain)
+    errors = _validator(name).iter_errors(element.plain)
     found = (problem for error in errors for problem in _sentences(error, element))
     return [*islice(found, MOST_PROBLEMS)]
 
 
-class Violation(NamedTuple):
-    """A keyword of the schema that a value does not keep to, as ``minimum``.
+@cache
+def _validator(name: str, part: str = "") -> Any:
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
+    from jsonschema.validators import extend
+    from referencing import Registry
+    from referencing.jsonschema import DRAFT202012
 
-    Attributes:
-        wanted: what the schema says of it.
-        part: the part of the schema that says so.
-        path: names and places from the root to the value.
-        is_name: whether the value is the name of a member of the object there.
-    """
+    def pattern(_: Any, expected: str, instance: Any, __: Any) -> Iterator[ValidationError]:
+        # Python's '$' also matches before a final line feed, the one of JSON Schema does not.
+        end_exactly = re.sub(r"\$$", r"\\Z", expected)
+        if isinstance(instance, str) and not re.search(end_exactly, instance):
+            yield ValidationError(f"does not match {expected}")
 
-    keyword: str
-    wanted: Any
-    found: Any
-    part: Mapping[str, Any]
-    path: tuple[str | int, ...]
-    is_name: bool = False
+    def unique(validator: Any, wanted: bool, instance: Any, of: Any) -> Iterator[ValidationError]:
+        # It takes the square of their number, and there may be millions.
+        if not isinstance(instance, list) or len(instance) <= of["maxItems"]:
+            yield from Draft202012Validator.VALIDATORS["uniqueItems"](
+                validator, wanted, instance, of
+            )
 
-
-@dataclass(frozen=True)
-class Validator:
-    """Compares values with a part of a schema, in those keywords that NeuROS's own schemas use.
-
-    ``jsonschema`` knows all keywords, but its import would be a tenth of each launch. A test holds
-    both against each other.
-
-    Args:
-        file: of the schema.
-        is_strict: whether 2.0 is no whole number: in what NeuROS has written.
-    """
-
-    file: str
-    pointer: str = ""
-    is_strict: bool = False
-
-    def violations(self, value: Any) -> Iterator[Violation]:
-        """All of them, in the order of the schema."""
-        return self._in(value, {"$ref": f"{self.file}#{self.pointer}"}, self.file, ())
-
-    def _in(
-        self, value: Any, part: Mapping[str, Any], file: str, path: tuple[str | int, ...]
-    ) -> Iterator[Violation]:
-        for keyword, wanted in part.items():
-            if keyword == "$ref":
-                name, _, pointer = wanted.partition("#")
-                yield from self._in(value, _part_of(name or file, pointer), name or file, path)
-            elif keyword == "if":
-                branch = "then" if self._fits(value, wanted, file) else "else"
-                yield from self._in(value, part.get(branch, {}), file, path)
-            elif keyword == "allOf":
-                for each in wanted:
-                    yield from self._in(value, each, file, path)
-            elif keyword == "items" and isinstance(value, list):
-                for place, item in enumerate(value):
-                    yield from self._in(item, wanted, file, (*path, place))
-            elif keyword == "properties" and isinstance(value, dict):
-                for name in (name for name in wanted if name in value):
-                    yield from self._in(value[name], wanted[name], file, (*path, name))
-            elif keyword == "propertyNames" and isinstance(value, dict):
-                for name in value:
-                    for each in self._in(name, wanted, file, path):
-                        yield each._replace(is_name=True)
-            elif keyword == "additionalProperties" and isinstance(wanted, dict):
-                for name in _additional(value, part):
-                    yield from self._in(value[name], wanted, file, (*path, name))
-            elif not self._keeps_to(keyword, wanted, value, part, file):
-                yield Violation(keyword, wanted, value, part, path)
-
-    def _fits(self, value: Any, part: Mapping[str, Any], file: str) -> bool:
-        return next(self._in(value, part, file, ()), None) is None
-
-    def _keeps_to(
-        self, keyword: str, wanted: Any, value: Any, part: Mapping[str, Any], file: str
-    ) -> bool:
-        match keyword:
-            case "type":
-                kinds = [wanted] if isinstance(wanted, str) else wanted
-                return any(self._is(value, kind) for kind in kinds)
-            case "const":
-                return _same(value) == _same(wanted)
-            case "enum":
-                return _same(value) in map(_same, wanted)
-            case "not":
-                return not self._fits(value, wanted, file)
-            case "oneOf":
-                return sum(self._fits(value, each, file) for each in wanted) == 1
-        if isinstance(value, dict):
-            if keyword == "required":
-                return all(name in value for name in wanted)
-            return keyword != "additionalProperties" or next(_additional(value, part), None) is None
-        if isinstance(value, str):
-            # Python's '$' also matches before a final line feed, the one of JSON Schema does not.
-            if keyword == "pattern":
-                return re.search(re.sub(r"\$$", r"\\Z", wanted), value) is not None
-            return _is_within(len(value), keyword, "Length", wanted)
-        if isinstance(value, list):
-            # To look for equal ones takes long, and there may be millions.
-            if keyword == "uniqueItems" and len(value) <= part["maxItems"]:
-                return len({*map(_same, value)}) == len(value)
-            return _is_within(len(value), keyword, "Items", wanted)
-        return not self._is(value, "number") or _is_within(value, keyword, "imum", wanted)
-
-    def _is(self, value: Any, kind: str) -> bool:
-        if kind not in ("number", "integer"):
-            return isinstance(value, _TYPES[kind])
-        if isinstance(value, int):
-            return not isinstance(value, bool)
+    def finite(_: Any, instance: Any) -> bool:
         # JSON has no other numbers, but Python's reader takes NaN, with which nothing compares.
-        if not isinstance(value, float) or not math.isfinite(value):
-            return False
-        return kind == "number" or (value.is_integer() and not self.is_strict)
+        is_number = isinstance(instance, (int, float)) and not isinstance(instance, bool)
+        return is_number and (isinstance(instance, int) or math.isfinite(instance))
+
+    schemas = {key: schema(key) for key in ("project", "node", "run", "deployment")}
+    for content in schemas.values():
+        del content["$schema"]  # where a reference leads to one, it would undo what is extended
+    registry = Registry().with_resources(
+        (content["$id"], DRAFT202012.create_resource(content)) for content in schemas.values()
+    )
+    own = {"pattern": pattern, "uniqueItems": unique}
+    form = {"$ref": schemas[name]["$id"] + part}
+
+    def whole(_: Any, instance: Any) -> bool:
+        return type(instance) is int
+
+    types = Draft202012Validator.TYPE_CHECKER.redefine("number", finite)
+    if name == "run":  # others are converted: in a project, 2.0 is a whole number
+        types = types.redefine("integer", whole)
+    return extend(Draft202012Validator, own, type_checker=types)(form, registry=registry)
 
 
-def _is_within(size: float, keyword: str, of: str, limit: Any) -> bool:
-    if keyword == f"min{of}":
-        return bool(size >= limit)
-    if keyword == f"max{of}":
-        return bool(size <= limit)
-    return keyword != "exclusiveMinimum" or of != "imum" or bool(size > limit)
-
-
-def _additional(value: Any, part: Mapping[str, Any]) -> Iterator[str]:
-    """The names of an object that its part of the schema does not have."""
-    known = part.get("properties", ())
-    return (name for name in value if name not in known) if isinstance(value, dict) else iter(())
-
-
-def _same(value: Any) -> str:
-    """A text that only equal values share: 2.0 is 2, and true is not 1."""
-    is_whole = isinstance(value, float) and value.is_integer()
-    return json.dumps(int(value) if is_whole else value, sort_keys=True)
-
-
-@cache
-def _part_of(file: str, pointer: str) -> dict[str, Any]:
-    part = _content(file)
-    for step in pointer.split("/")[1:]:
-        part = part[step]
-    return part
-
-
-@cache
-def _content(file: str) -> dict[str, Any]:
-    return schema(file.removesuffix(".schema.json"))
-
-
-def _sentences(error: Violation, root: Element) -> Iterator[Problem]:
-    element = root.at(error.path)
-    if error.keyword == "oneOf" and not isinstance(element.value, dict):
+def _sentences(error: Any, root: Element) -> Iterator[Problem]:
+    element = root.at(error.absolute_path)
+    if error.validator == "oneOf" and not isinstance(element.value, dict):
         return  # its type is told
-    if error.is_name:
-        member = element.value[error.found]
-        yield member.key_problem(f"'{error.found}' is not allowed as a name here", _hint(error))
-    elif error.keyword == "additionalProperties":
-        allowed = error.part["properties"]
+    if "propertyNames" in error.schema_path:
+        member = element.value[error.instance]
+        yield member.key_problem(
+            f"'{error.instance}' is not allowed as a name here", _hint(error.schema)
+        )
+    elif error.validator == "additionalProperties":
+        allowed = error.schema["properties"]
         for key in [key for key in element.value if key not in allowed]:
             hint = did_you_mean(key, set(allowed) - set(element.value))
             yield element.value[key].key_problem(f"unknown key '{key}'", hint)
-    elif error.keyword == "required":
-        for key in [key for key in error.wanted if key not in element.value]:
+    elif error.validator == "required":
+        for key in [key for key in error.validator_value if key not in element.value]:
             yield element.problem(f"the key '{key}' is missing")
-    elif error.keyword == "not":
-        key = error.path[-1]
+    elif error.validator == "not":
+        key = error.absolute_path[-1]
         yield element.key_problem(f"'{key}' has no meaning for this kind of sensor")
     else:
         text, hint = _sentence(error)
         yield element.problem(text, hint)
 
 
-def _sentence(error: Violation) -> tuple[str, str]:
+def _sentence(error: Any) -> tuple[str, str]:
     """The problem with a value, and a hint."""
-    expected, found = error.wanted, error.found
-    if error.keyword == "type":
+    expected, found = error.validator_value, error.instance
+    if error.validator == "type":
         kinds = [expected] if isinstance(expected, str) else expected
         allowed = " or ".join(_KINDS[kind] for kind in kinds)
         return f"must be {allowed}, but is {_kind_of(found)}", ""
-    if error.keyword == "pattern":
-        title = error.part.get("title", "text").lower()
-        return f"{_shown(found)} is not allowed as {title}", _hint(error)
-    if error.keyword == "enum":
+    if error.validator == "pattern":
+        title = error.schema.get("title", "text").lower()
+        return f"{_shown(found)} is not allowed as {title}", _hint(error.schema)
+    if error.validator == "enum":
         hint = did_you_mean(found, expected) if isinstance(found, str) else ""
         return f"must be {listed(expected)}, but is {_shown(found)}", hint
-    if error.keyword == "oneOf":
+    if error.validator == "oneOf":
         return "needs exactly one of " + listed(option["required"][0] for option in expected), ""
-    if error.keyword == "required":
+    if error.validator == "required":
         missing = next(key for key in expected if key not in found)
         return f"the key '{missing}' is missing", ""
     numbers = {
@@ -299,11 +186,11 @@ def _sentence(error: Violation) -> tuple[str, str]:
         "maxLength": f"is longer than {expected} characters",
         "uniqueItems": "contains the same item twice",
     }
-    return numbers.get(error.keyword, f"must be {_shown(expected)}"), ""
+    return numbers.get(error.validator, error.message), ""
 
 
-def _hint(error: Violation) -> str:
-    return str(error.part.get("$comment", ""))
+def _hint(schema_part: dict[str, Any]) -> str:
+    return str(schema_part.get("$comment", ""))
 
 
 def _kind_of(value: Any) -> str:

@@ -19,8 +19,6 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from neuros.tables import table
-
 FILE_NAME = "system_load.csv"
 
 LAUNCHER = "launcher"
@@ -174,6 +172,8 @@ class _Extremes:
 
 def load_table(summary: Mapping[str, Any]) -> str:
     """The summary as text; one line where there is nothing to sum up."""
+    from tabulate import tabulate
+
     machine = summary["machine"]
     if machine is None:
         return "system load: the run was shorter than the first sample"
@@ -183,11 +183,15 @@ def load_table(summary: Mapping[str, Any]) -> str:
         if load is not None
     ]
     rows.append(["(whole machine)", *_cells(machine, "memory_used_bytes_max"), ""])
-    header = ["system load", "cpu mean", "cpu max", "memory max", "threads max"]
+    table = tabulate(
+        rows,
+        headers=["system load", "cpu mean", "cpu max", "memory max", "threads max"],
+        disable_numparse=True,
+        colalign=("left", "right", "right", "right", "right"),
+    )
     cores = machine["cores"]
     samples = f"{summary['samples']} sample{'' if summary['samples'] == 1 else 's'}"
-    text = table(header, rows, right=range(1, 5))
-    return f"{text}\n100% is one core of {cores}; {samples}: {summary['file']}"
+    return f"{table}\n100% is one core of {cores}; {samples}: {summary['file']}"
 
 
 def _cells(load: Mapping[str, float], memory: str) -> list[str]:
