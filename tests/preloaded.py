@@ -17,7 +17,10 @@ from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
 _FORKING = multiprocessing.get_context("forkserver")
-_FORKING.set_forkserver_preload(["neuros.cli.launch", "neuros.api.execution", "jsonschema"])
+# Without NumPy, which starts threads.
+_FORKING.set_forkserver_preload(
+    ["tests.preloaded", "neuros.cli.launch", "neuros.api.execution", "jsonschema", "tabulate"]
+)
 _READ_AT_START = ("LD_", "PYTHON")
 
 
