@@ -6,6 +6,7 @@ What runs is the same: ``neuros launch`` in a process, session, folder and envir
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import subprocess
@@ -74,7 +75,8 @@ class PreloadedLauncher:
     def send_signal(self, number: int) -> None:
         """Send it a signal, unless it has ended."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with contextlib.suppress(ProcessLookupError):  # it ends, and is reaped, meanwhile
+                os.kill(self.pid, number)
 
     def kill(self) -> None:
         """Kill it."""
