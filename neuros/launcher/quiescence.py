@@ -116,14 +116,24 @@ class Probing:
         return self.verdict
 
     def why_dead(self) -> str:
-        """The deadlock in one sentence, with its cycle and its cures."""
-        ring = cycle(waits(self._probes, self._connections))
-        why = "; ".join(f"{node} {reason}" for node, reason in ring) or "no hook can run"
-        return (
-            f"deadlock: nothing can ever run again: {why}. To break the loop, take the returning"
-            " input in a separate hook without outputs; or require it, and send a first packet"
-            " from an initialise hook; or leave out discard_limit on one connection of the loop"
-        )
+        """The deadlock in one sentence, with its cycle, or what it lacks, and its cures."""
+        found = waits(self._probes, self._connections)
+        said = "; ".join(f"{node} {reason}" for node, reason in cycle(found)) or "no hook can run"
+        others = {other for why in found.values() for other in why}
+        if others and not any(_ring_through(node, found) for node in found):
+            ends = sorted(others - {node for node, why in found.items() if why})
+            cures = (
+                f"No hook of {' or '.join(ends)} is left to run: let one send or take what is"
+                " waited for; or leave out discard_limit where a sender is blocked; or end the run"
+                " with node.shutdown"
+            )
+        else:
+            cures = (
+                "To break the loop, take the returning input in a separate hook without outputs; or"
+                " require it, and send a first packet from an initialise hook; or leave out"
+                " discard_limit on one connection of the loop"
+            )
+        return f"deadlock: nothing can ever run again: {said}. {cures}"
 
     def what_is_left(self, now_s: float) -> list[str]:
         """Why it is not drained: who does not answer, or else where packets are or wait."""

@@ -51,6 +51,8 @@ class StallDetector:
         self._named_as_mute: set[str] = set()
         self._named_as_held: set[str] = set()
         self._next_remark_s = now_s + _FIRST_REMARK_S
+        self._starving: dict[str, tuple[str, float]] = {}  # by node, what it lacks, since when
+        self._named_as_starving: set[tuple[str, str]] = set()
 
     def greet(self, names: Sequence[str]) -> None:
         """These nodes' process is there."""
@@ -75,6 +77,11 @@ class StallDetector:
             self._moved[name] = moved
             self._moved_s = now_s
             self._has_explained = False
+        lacks = _lacks(report)
+        if not lacks:
+            self._starving.pop(name, None)
+        elif self._starving.get(name, ("",))[0] != lacks:
+            self._starving[name] = lacks, now_s
 
     def is_greeted(self, name: str) -> bool:
         """Whether the process of a node has said hello."""
@@ -99,6 +106,7 @@ class StallDetector:
         """Something has kept the nodes still that is no standstill of their own."""
         self._moved_s = now_s
         self._has_explained = False
+        self._starving.clear()
 
     def excuse(self, still_s: float) -> None:
         """Nobody could be heard for so long: that is no silence and no standstill of a node."""
@@ -135,6 +143,15 @@ class StallDetector:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
+            elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
+                yield from self._remarks_on_starving(now_s)
+
+    def _remarks_on_starving(self, now_s: float) -> Iterator[tuple[str, str]]:
+        """Nodes that have never got what they wait for, while others move."""
+        for name, (lacks, since_s) in self._starving.items():
+            if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
+                self._named_as_starving.add((name, lacks))
+                yield "INFO", f"{name} still waits for {lacks}, where nothing has ever come"
 
     def remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
         """Hooks that run for long, each once, with their stacks."""
@@ -223,6 +240,21 @@ class StallDetector:
     def _executing(self, name: str) -> ExecutingHook | None:
         metrics = self._reports[name].metrics
         return metrics["executing"] if metrics else None
+
+
+def _lacks(report: Report) -> str:
+    """The input that a node waits for and its sources, if no packet has ever come; else empty."""
+    metrics = report.metrics
+    if metrics is None or metrics["state"]["state"] != "waiting":
+        return ""
+    port = metrics["state"]["cause"]
+    end = f" -> {report.node}.{port}"
+    received = {key: c["received"] for key, c in metrics["incoming"].items() if key.endswith(end)}
+    if not received or any(received.values()):
+        return ""
+    ways = [key.removesuffix(end) for key in received]
+    sources = [f"topic {way}" if way[0] == "/" else way.partition(".")[0] for way in ways]
+    return f"`{port}` from {' or '.join(dict.fromkeys(sources))}"
 
 
 def with_stack(text: str, stack: Stack | None) -> str:

@@ -276,9 +276,10 @@ class NodeProcess:
         return "" if is_alone else f"a plugin has a thread ({threads[-1].name})"
 
     def _explain(self) -> None:
-        """Report why nothing moves, but for nodes whose hook runs."""
-        for node in tuple(self._nodes):
-            if node.engine is None or node.engine.executing is None:
+        """Report why nothing moves; while a hook runs, that is what all nodes here wait for."""
+        nodes = tuple(self._nodes)
+        if not any(node.engine is not None and node.engine.executing for node in nodes):
+            for node in nodes:
                 self._tell(control.Explanation(node.name, tuple(node.reports.explain())))
 
     # ------------------------------------------------------------------ inside

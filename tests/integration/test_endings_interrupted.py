@@ -288,6 +288,8 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
     assert f'  File "{bench.folder}/a.py", line ' in finished.output
     if bench.back_end == "process":
         assert not any(text.startswith("a executes") for text in said), "that was said before"
+    else:
+        assert not any(" waits for " in text for text in said), "all wait for that hook"
 
 
 def test_waiting_connections_are_named_after_five_seconds(tmp_path: Path) -> None:

@@ -395,6 +395,22 @@ def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> 
     assert "leave out discard_limit" in text
 
 
+def test_where_there_is_no_loop_the_deadlock_names_the_node_that_has_nothing_left_to_run() -> None:
+    asked: list[int] = []
+    probing = Probing("ab", [AB], asked_into(asked))
+    for now_s in (10.0, 11.0):
+        probing.look(now_s, now_s)
+        probing.take(sender(AB, 0, 0, number=asked[-1]))
+        waits_for_x = receiver(AB, 0, 0, number=asked[-1])
+        waits_for_x.metrics["state"].update(state="waiting", cause="x")
+        waits_for_x.metrics["incoming"][str(AB)]["unread"] = 0
+        probing.take(waits_for_x)
+    assert probing.look(11.1, 11.1) is Verdict.DEAD
+    text = probing.why_dead()
+    assert "b waits for `x` from a. No hook of a is left to run: let one send" in text
+    assert "loop" not in text
+
+
 def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:
     asked: list[int] = []
     probing = Probing("ab", [AB], asked_into(asked))

@@ -21,8 +21,10 @@ def report(
     executing: dict[str, Any] | None = None,
     waiting_for: tuple[str, ...] = (),
     acknowledged: int = 0,
+    lacks: str = "",
 ) -> Report:
     metrics: Any = {
+        "state": {"state": "waiting" if lacks else "idle", "cause": lacks},
         "hooks": {"step": {"executions": executions}},
         "incoming": {"b.o -> a.x": {"received": received}},
         "outgoing": {"a.o -> c.x": {"acknowledged": acknowledged}},
@@ -101,6 +103,24 @@ def test_rest_is_the_time_since_the_last_movement(steps: list[tuple[float, bool]
             count, moved_s = count + 1, now_s
         detector.report(report("a", executions=count), now_s)
         assert detector.rested_s(now_s) == now_s - moved_s
+
+
+def test_a_node_that_has_never_got_its_input_is_named_once_while_others_move() -> None:
+    detector = detector_of("a", "c")
+    said = []
+    for second in range(1, 40):
+        detector.report(report("a", lacks="x"), second)
+        detector.report(report("c", executions=second), second)
+        said += [(second, text) for _, text in detector.remarks(second)]
+    assert said == [(15, "a still waits for `x` from b, where nothing has ever come")]
+
+
+def test_a_node_that_has_got_its_input_before_may_wait_for_long() -> None:
+    detector = detector_of("a", "c")
+    for second in range(1, 40):
+        detector.report(report("a", received=1, lacks="x"), second)
+        detector.report(report("c", executions=second), second)
+        assert list(detector.remarks(second)) == []
 
 
 def test_nothing_rests_while_a_hook_executes() -> None:
