@@ -79,7 +79,6 @@ GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
     "time": {"builtin_interfaces"},
-    "control": {"typing_extensions"},
     "transport": {
         "numpy",
         "rclpy",

@@ -171,22 +171,6 @@ def test_a_probe_is_a_report() -> None:
     assert not isinstance(REPORT, Probed)
 
 
-def test_messages_are_equal_if_their_class_and_fields_are() -> None:
-    assert control.Say("a") == control.Say("a")
-    assert control.Say("a") != control.Say("b")
-    assert control.Stop() != control.Leave()
-
-
-def test_a_message_shows_its_fields() -> None:
-    assert repr(control.Step(3, is_driven=True)) == "Step(count=3, is_driven=True)"
-
-
-def test_of_a_message_nothing_is_compiled_but_its_constructor() -> None:
-    """Each process would do it at its start, for all of them."""
-    compiled = {name for each in MESSAGES for name, value in vars(each).items() if callable(value)}
-    assert compiled == {"__init__"}
-
-
 def test_every_class_of_messages_has_a_sender() -> None:
     classes = [each for each in vars(control).values() if isinstance(each, type)]
     assert {each for each in classes if issubclass(each, Message)} == {Message, *MESSAGES}

@@ -50,8 +50,7 @@ class Packets:
     @property
     def consumed(self) -> Numbers:
         """The digests of the packets that hooks have started on, each once, in order."""
-        places = np.sort(self.taken)  # np.unique would import numpy.ma at the end of each run
-        places = places[np.diff(places, prepend=0) > 0]
+        places = np.unique(self.taken)
         found: Numbers = self.received[places[places <= len(self.received)] - 1]
         return found
 
@@ -133,10 +132,7 @@ def _latency_ms(packets: Packets, may_lose: bool) -> dict[str, float] | None:
     latencies_ns = packets.latencies_ns(may_lose=may_lose)
     if latencies_ns is None or not len(latencies_ns):
         return None
-    last = len(latencies_ns) - 1
-    places = [last * p / 100 for p in PERCENTILES]
-    # np.percentile does the same, and imports numpy.ma at the end of each run.
-    percentiles = np.interp(places, np.arange(last + 1), np.sort(latencies_ns)) / 1e6
+    percentiles = np.percentile(latencies_ns, PERCENTILES) / 1e6
     return {
         **{f"p{p}": float(ms) for p, ms in zip(PERCENTILES, percentiles, strict=True)},
         "max": float(latencies_ns.max()) / 1e6,

@@ -15,12 +15,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import secrets
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -265,10 +267,8 @@ def _passed(connection: Mapping[str, Any]) -> int | None:
 
 def _custom_data(project: Project) -> dict[str, str]:
     """What the metadata of the bag says about the run; each value is text."""
-    from importlib import metadata  # not above: it takes 9 ms, and few runs are recorded
-
     content = json.dumps(project_to_json(project), sort_keys=True)
-    versions = {"neuros": __version__, "python": sys.version.split()[0]}
+    versions = {"neuros": __version__, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)

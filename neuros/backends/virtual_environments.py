@@ -25,6 +25,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import importlib.metadata
 import json
 import os
 import re
@@ -46,8 +47,6 @@ from neuros.installation.packages import Installer, explain_machine, find_uv
 from neuros.installation.progress import Progress
 
 if TYPE_CHECKING:
-    from importlib.metadata import Distribution
-
     from packaging.requirements import Requirement
 
 Version = tuple[int, int]
@@ -177,10 +176,10 @@ class Choice:
 
 def own_needs() -> list[str]:
     """The requirements of NeuROS itself; empty if it is not installed here."""
-    # Every launch reads it: importlib.metadata takes 15 ms to import and to parse it.
-    files = (file for here in packages_here() for file in here.glob("neuros-*.dist-info/METADATA"))
-    head = next((file.read_text("utf-8").partition("\n\n")[0] for file in files), "")
-    needs = re.findall(r"^Requires-Dist: (.*)", head, re.MULTILINE)
+    try:
+        needs = importlib.metadata.requires("neuros") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
     return [need for need in needs if "extra ==" not in need]
 
 
@@ -484,18 +483,16 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             pending += [(need, name) for need in needs]
 
 
-def _installed(name: str) -> Distribution | None:
+def _installed(name: str) -> importlib.metadata.Distribution | None:
     """A package of this environment; ``None`` also for what an interrupted pip has left of one."""
-    from importlib.metadata import PackageNotFoundError, distribution
-
     try:
-        found = distribution(name)
+        found = importlib.metadata.distribution(name)
         return found if found.version else None
-    except (PackageNotFoundError, FileNotFoundError, KeyError):
+    except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
         return None
 
 
-def _fits(wanted: Requirement, installed: Distribution) -> bool:
+def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
     if wanted.url:
         origin = installed.read_text("direct_url.json")
         return origin is not None and json.loads(origin).get("url") == wanted.url

@@ -134,7 +134,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         command = _command_in(arguments)
         try:
-            options = parser(command, is_alone=command == arguments[0]).parse_args(arguments)
+            options = parser(command).parse_args(arguments)
         except SystemExit:  # after a help or a version
             _flush()
             raise
@@ -173,11 +173,8 @@ def main(arguments: Sequence[str]) -> int:
         return EXIT_USAGE
 
 
-def parser(command: str | None = None, *, is_alone: bool = False) -> argparse.ArgumentParser:
-    """The parser of the command line; ``command``: with the options of this one alone.
-
-    ``is_alone``: and without the other commands, which each node process would add for nothing.
-    """
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The parser of the command line; ``command``: with the options of this one alone."""
     result = _Parser(
         prog="neuros",
         description="Run closed loops of simulators, spiking networks and robots on ROS 2.",
@@ -186,9 +183,8 @@ def parser(command: str | None = None, *, is_alone: bool = False) -> argparse.Ar
     )
     result.add_argument("--version", action="version", version=f"neuros {__version__}")
     commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    names = [command] if is_alone and command in COMMANDS else COMMANDS
-    for name in names:
-        COMMANDS[name].add_to(commands, name, is_whole=command in (None, name))
+    for name, each in COMMANDS.items():
+        each.add_to(commands, name, is_whole=command in (None, name))
     return result
 
 

@@ -13,18 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
-
-if TYPE_CHECKING:
-    from typing_extensions import dataclass_transform
-else:  # in typing from Python 3.11 on
-
-    def dataclass_transform(**_: object) -> object:
-        return lambda kind: kind
-
 
 CONTROL_VARIABLE = "NEUROS_CONTROL"
 """The environment variable with the address at which the supervisor of a run listens."""
@@ -116,35 +108,22 @@ class HookDeclaration:
     outputs: tuple[str, ...] = ()
 
 
-@dataclass_transform(frozen_default=True)
 class Message:
-    """Base of all messages: makes a dataclass of each.
-
-    What ``dataclass`` would compile for each besides ``__init__`` is here once, for all: processor
-    time of 10 ms in each launcher and node process. That none is changed is for mypy to see.
-    """
-
-    def __init_subclass__(cls, *, kw_only: bool = False) -> None:
-        dataclass(eq=False, repr=False, kw_only=kw_only)(cls)
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and vars(other) == vars(self)
-
-    def __repr__(self) -> str:
-        content = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
-        return f"{type(self).__name__}({content})"
+    """Base of all messages."""
 
 
 # ---------------------------------------------------------------------- from nodes
 
 
+@dataclass(frozen=True)
 class Hello(Message):
     """A node process is up."""
 
     nodes: tuple[str, ...]
 
 
-class Report(Message, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class Report(Message):
     """State and counters of a node: once per second, on a change of state, at the end.
 
     Attributes:
@@ -177,7 +156,8 @@ class Report(Message, kw_only=True):
     is_final: bool = False
 
 
-class Probed(Report, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class Probed(Report):
     """Report of a node between two events, in answer to ``probe``.
 
     Attributes:
@@ -194,6 +174,7 @@ class Probed(Report, kw_only=True):
     is_idle: bool
 
 
+@dataclass(frozen=True)
 class Hooks(Message):
     """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
 
@@ -202,12 +183,14 @@ class Hooks(Message):
     finalise: tuple[str, ...]
 
 
+@dataclass(frozen=True)
 class FirstHook(Message):
     """A node starts its first hook."""
 
     node: str
 
 
+@dataclass(frozen=True)
 class Finalising(Message):
     """A node starts a finalise hook; ``""``: it closes its resources; ``None``: they are closed."""
 
@@ -215,6 +198,7 @@ class Finalising(Message):
     hook: str | None
 
 
+@dataclass(frozen=True)
 class Shutdown(Message):
     """A plugin has called ``node.shutdown``."""
 
@@ -223,6 +207,7 @@ class Shutdown(Message):
     drain_s: float
 
 
+@dataclass(frozen=True)
 class Failed(Message):
     """A node has failed."""
 
@@ -230,6 +215,7 @@ class Failed(Message):
     text: str
 
 
+@dataclass(frozen=True)
 class Explanation(Message):
     """Why a node does not move, in answer to ``explain``."""
 
@@ -237,6 +223,7 @@ class Explanation(Message):
     lines: tuple[str, ...]
 
 
+@dataclass(frozen=True)
 class Heard(Message):
     """State of another launcher, received from its node; ``None``: that node is gone."""
 
@@ -244,6 +231,7 @@ class Heard(Message):
     text: str | None
 
 
+@dataclass(frozen=True)
 class NodeStatus(Message):
     """State and samples of a node, for the observer with this number; in answer to ``look``."""
 
@@ -262,6 +250,7 @@ class NewestPacket:
     data: str
 
 
+@dataclass(frozen=True)
 class AtRest(Message):
     """No event waits in a node process, and no hook may start: answer to ``settle``.
 
@@ -282,6 +271,7 @@ class AtRest(Message):
     packets: Mapping[str, NewestPacket]
 
 
+@dataclass(frozen=True)
 class WasReset(Message):
     """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
 
@@ -291,44 +281,53 @@ class WasReset(Message):
 # ---------------------------------------------------------------------- to nodes
 
 
+@dataclass(frozen=True)
 class Probe(Message):
     """Report between two events."""
 
     number: int
 
 
+@dataclass(frozen=True)
 class Explain(Message):
     """Say why nothing moves."""
 
 
+@dataclass(frozen=True)
 class Drain(Message):
     """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
 
 
+@dataclass(frozen=True)
 class Stop(Message):
     """Start no further hook, finalise and end."""
 
 
+@dataclass(frozen=True)
 class Say(Message):
     """Publish the state of this launcher to its peers."""
 
     text: str
 
 
+@dataclass(frozen=True)
 class Leave(Message):
     """Peers have exchanged all their states: a node that has ended may leave."""
 
 
+@dataclass(frozen=True)
 class Pause(Message):
     """Start no further hook."""
 
 
+@dataclass(frozen=True)
 class Resume(Message):
     """Go on after a pause."""
 
 
+@dataclass(frozen=True)
 class Step(Message):
     """While paused, run ``count`` steps; ``is_driven``: some hooks start without a packet."""
 
@@ -336,6 +335,7 @@ class Step(Message):
     is_driven: bool
 
 
+@dataclass(frozen=True)
 class Look(Message):
     """Show an observer what the node does; ``wanted``: what to sample, by node and port."""
 
@@ -343,6 +343,7 @@ class Look(Message):
     asker: int
 
 
+@dataclass(frozen=True)
 class Settle(Message):
     """While paused, answer once nothing moves; ``known``: newest known packet number, by output."""
 
@@ -350,12 +351,14 @@ class Settle(Message):
     known: Mapping[str, int]
 
 
+@dataclass(frozen=True)
 class Reset(Message):
     """While paused, return to the start and stay paused; ``variables``: environments, by node."""
 
     variables: Mapping[str, Mapping[str, str]]
 
 
+@dataclass(frozen=True)
 class Deliver(Message):
     """A packet of a session for one of its inputs, in base64."""
 
@@ -367,28 +370,33 @@ class Deliver(Message):
 # ---------------------------------------------------------------------- from observers
 
 
+@dataclass(frozen=True)
 class Watch(Message):
     """An observer is there."""
 
 
+@dataclass(frozen=True)
 class LookAll(Message):
     """Ask every node for its status once; ``wanted``: what to sample, by node and port."""
 
     wanted: Mapping[str, Mapping[str, Any]]
 
 
+@dataclass(frozen=True)
 class StepAll(Message):
     """While the run is paused, run ``count`` steps."""
 
     count: int
 
 
+@dataclass(frozen=True)
 class End(Message):
     """End the run, drained, with exit code 0."""
 
     reason: str
 
 
+@dataclass(frozen=True)
 class Interrupt(Message):
     """Do what Ctrl+C does (``neuros stop``)."""
 
@@ -396,6 +404,7 @@ class Interrupt(Message):
 # ---------------------------------------------------------------------- to observers
 
 
+@dataclass(frozen=True)
 class PhaseChanged(Message):
     """Phase of the run, whenever it changes."""
 
@@ -403,6 +412,7 @@ class PhaseChanged(Message):
     is_paused: bool
 
 
+@dataclass(frozen=True)
 class Settled(Message):
     """Nothing moves in the whole run; in answer to ``settle``. Fields as in ``at_rest``."""
 
@@ -411,6 +421,7 @@ class Settled(Message):
     packets: Mapping[str, NewestPacket]
 
 
+@dataclass(frozen=True)
 class LogRecord(Message):
     """Message of the launcher to the user."""
 
@@ -418,6 +429,7 @@ class LogRecord(Message):
     text: str
 
 
+@dataclass(frozen=True)
 class Ended(Message):
     """All nodes have ended.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -43,8 +45,6 @@ class Machine:
     @classmethod
     def here(cls) -> Machine:
         """The machine, and the Python, that this runs on."""
-        import platform  # not above: every launch imports this module
-
         libc, version = platform.libc_ver()
         return cls(
             python=sys.version_info[:2],
@@ -142,8 +142,6 @@ def install_opengl() -> str:
 
 
 def _has_library(name: str) -> bool:
-    import ctypes  # not above: every launch imports this module
-
     try:
         ctypes.CDLL(name)
     except OSError:

@@ -7,6 +7,7 @@ import ast
 import os
 import re
 import shutil
+import ssl
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -288,8 +289,6 @@ def uv_settings(listing: str, environ: Mapping[str, str]) -> dict[str, str] | No
         found["SSL_CERT_FILE"] = bundle
     if not any(name in found or environ.get(name) for name in ("SSL_CERT_FILE", "SSL_CERT_DIR")):
         # Authorities of this machine, as for pip; uv has its own where there are none.
-        import ssl  # not above: every launch imports this module
-
         cafile = ssl.get_default_verify_paths().cafile
         found |= {"UV_SYSTEM_CERTS": "1"} if cafile else {}
     return {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}

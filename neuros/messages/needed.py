@@ -10,6 +10,7 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from graphlib import CycleError
 from importlib.util import find_spec
@@ -365,8 +366,6 @@ def compile_package(job: Job) -> None:
         for kind in _LIBRARIES
         for file in sorted(generated(job.source, kind, job.package).rglob("*.c*"))
     ]
-    from concurrent.futures import ThreadPoolExecutor  # not above: messages are seldom built
-
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         objects = dict(
             zip(sources, pool.map(lambda file: _compile(job, file), sources), strict=True)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import platform
 import shutil
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -162,7 +163,7 @@ class Workspaces:
         keys: dict[str, str] = {}
         for package in packages:
             digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
-            digest.update(os.uname().machine.encode())
+            digest.update(platform.machine().encode())
             for file in (Path(MANIFEST), *package.files):
                 digest.update(f"{file.as_posix()}\0".encode() + _content(package.folder / file))
             for name in sorted(package.dependencies):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import subprocess
 import sys
 import threading
@@ -28,12 +29,12 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
         run_folder: where nodes have noted their versions.
     """
     nodes = list(nodes)
-    own, kernel = python_versions(), os.uname()
+    own = python_versions()
     return {
         "command": list(command),
         "versions": {
             "neuros": __version__,
-            "kernel": f"{kernel.sysname} {kernel.release}",
+            "kernel": f"{platform.system()} {platform.release()}",
             **own,
             "nodes": {
                 node.name: noted
@@ -49,7 +50,7 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
 def python_versions() -> dict[str, Any]:
     """Of this Python and of what it finds."""
     return {
-        "python": sys.version.split()[0],
+        "python": platform.python_version(),
         "executable": sys.executable,
         "packages": installed_packages(sys.path),
     }
@@ -86,8 +87,8 @@ def installed_packages(folders: Iterable[str]) -> dict[str, str]:
 def machine() -> dict[str, Any]:
     """The machine, as far as figures depend on it."""
     return {
-        "name": os.uname().nodename,
-        "processor": _first("/proc/cpuinfo", "model name") or os.uname().machine,
+        "name": platform.node(),
+        "processor": _first("/proc/cpuinfo", "model name") or platform.machine(),
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),

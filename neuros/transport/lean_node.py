@@ -14,7 +14,6 @@ import ctypes
 import functools
 import inspect
 import os
-import sys
 import threading
 import types
 from collections import deque
@@ -25,8 +24,6 @@ from typing import Any, TypeAlias
 import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import ParameterNotDeclaredException as ParameterNotDeclaredException
-from rclpy.impl import rcutils_logger
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node as RosNode
 from rclpy.parameter import Parameter as Parameter
 from rclpy.parameter_service import ParameterService
@@ -83,7 +80,6 @@ class LeanNode(RosNode):  # type: ignore[misc]
             parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()],
             automatically_declare_parameters_from_overrides=True,
         )
-        self._logger = _Logger(super().get_logger().name)
         self._is_complete = True
         if parameters:
             self._parameter_service = ParameterService(self)
@@ -119,33 +115,6 @@ class LeanNode(RosNode):  # type: ignore[misc]
     def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
         """Wrap all callbacks that run as tasks from now on."""
         self._wrap = wrap
-
-
-# Where rclpy looks for the caller of its logger, it leaves out functions of these files.
-rcutils_logger._internal_callers.append(os.path.realpath(__file__))
-
-
-class _Logger(rcutils_logger.RcutilsLogger):  # type: ignore[misc]
-    """A logger of rclpy that sees sooner from where it is called.
-
-    rclpy has ``inspect`` find the file of each calling function: at its first message that goes
-    through all modules, for 12 ms of processor time in each node process, and then 0.2 ms each.
-    """
-
-    def log(self, message: str, severity: int, **options: Any) -> bool:
-        """As in rclpy; ``options`` (``once``, ``throttle_duration_sec``) are left to that."""
-        if options:
-            return bool(super().log(message, severity, **options))
-        if not self.is_enabled_for(severity):
-            return False
-        caller = sys._getframe(1)
-        while caller.f_back and caller.f_code.co_filename == rcutils_logger.__file__:
-            caller = caller.f_back
-        code = caller.f_code
-        rclpy_implementation.rclpy_logging_rcutils_log(
-            severity, self.name, message, code.co_name, code.co_filename, caller.f_lineno
-        )
-        return True
 
 
 class _Tasks:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib.metadata
 import os
 import sys
 from collections.abc import Mapping
@@ -21,12 +20,7 @@ from neuros.backends.pythons import (
     require_one_python,
     wanted_version,
 )
-from neuros.backends.virtual_environments import (
-    own_needs,
-    why_no_files,
-    why_no_venv,
-    why_pip_failed,
-)
+from neuros.backends.virtual_environments import why_no_files, why_no_venv, why_pip_failed
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 
@@ -190,11 +184,6 @@ class TestChoices:
         (packages / "jsonschema-3.2.dist-info").mkdir(parents=True)
         monkeypatch.syspath_prepend(str(packages))
         assert project.choice("snn").entry != before
-
-
-def test_what_neuros_itself_needs_is_what_its_metadata_says() -> None:
-    needs = importlib.metadata.requires("neuros") or []
-    assert own_needs() == [need for need in needs if "extra ==" not in need] != []
 
 
 class TestRuns:
