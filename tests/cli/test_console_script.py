@@ -115,3 +115,19 @@ def test_processes_of_multiprocessing_read_it_for_the_packages_alone(tmp_path: P
         [sys.executable, "-S", "-c", program], cwd=tmp_path, capture_output=True, check=False
     )
     assert (done.returncode, done.stdout) == (0, b""), done.stderr
+
+
+def test_the_garbage_collector_passes_over_what_a_command_imports() -> None:
+    program = """
+import gc
+from neuros.cli import main as program
+
+def parser(command):
+    assert not gc.isenabled()
+    return parser_of(command)
+
+parser_of, program.parser = program.parser, parser
+assert program.main(["example"]) == 0
+assert gc.isenabled() and gc.get_freeze_count() > 10_000
+"""
+    subprocess.run([sys.executable, "-c", program], stdout=subprocess.DEVNULL, check=True)
