@@ -120,7 +120,9 @@ class Probing:
         found = waits(self._probes, self._connections)
         said = "; ".join(f"{node} {reason}" for node, reason in cycle(found)) or "no hook can run"
         others = {other for why in found.values() for other in why}
-        if others and not any(_ring_through(node, found) for node in found):
+        if not others:
+            cures = "If the work is done, let a hook call node.shutdown"
+        elif not any(_ring_through(node, found) for node in found):
             ends = sorted(others - {node for node, why in found.items() if why})
             cures = (
                 f"No hook of {' or '.join(ends)} is left to run: let one send or take what is"
@@ -139,7 +141,7 @@ class Probing:
         """Why it is not drained: who does not answer, or else where packets are or wait."""
         silent = sorted(self._names - self._probes.keys())
         if silent and now_s - self._asked_s >= _BUSY_S:
-            return [f"{name} is busy" for name in silent]
+            return [f"{name} does not answer" for name in silent]
         probes = self._probes if not silent else self._answers
         waiting = [name for name, probe in sorted(probes.items()) if probe.is_startable]
         return [

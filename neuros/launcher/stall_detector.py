@@ -6,7 +6,7 @@ Reports come once per second, so what is said here is up to a second late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,13 @@ class StallDetector:
         self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
         self._moved_s += still_s
         self._next_remark_s += still_s
+
+    def is_held_up(self, name: str, now_s: float) -> bool:
+        """Whether a node cannot take in packets, which is said otherwise: a hook executes in its
+        process, or it does not report."""
+        folder = self._folder(name)
+        executing = (self._folder(other) for other in self._reports if self._executing(other))
+        return folder in executing or self.silent_s(name, now_s) >= SILENT_S
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
@@ -272,9 +279,15 @@ class Backlog:
 
     Args:
         connections: those among the nodes whose reports are taken.
+        is_held_up: whether a node cannot take in packets at that time, which is said otherwise.
     """
 
-    def __init__(self, connections: Sequence[Connection]) -> None:
+    def __init__(
+        self,
+        connections: Sequence[Connection],
+        is_held_up: Callable[[str, float], bool] = lambda _, __: False,
+    ) -> None:
+        self._is_held_up = is_held_up
         self._connections = {str(connection): connection for connection in connections}
         self._received: dict[str, _Samples] = {key: deque() for key in self._connections}
         self._sent: dict[str, _Samples] = {key: deque() for key in self._connections}
@@ -322,7 +335,7 @@ class Backlog:
                     f" has waited for over {BEHIND_S:g} s, and hook '{hook}' is ready for it."
                     " A smaller queue_size, or a discard_limit, keeps packets fresh",
                 )
-            elif _age_s(self._sent[key], now_s) >= BEHIND_S:
+            elif _age_s(self._sent[key], now_s) >= BEHIND_S and not self._is_held_up(node, now_s):
                 self._named.add(key)
                 yield (
                     "WARN",

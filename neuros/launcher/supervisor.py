@@ -41,6 +41,7 @@ _PARTED_S = 1.0
 """A process that has hung up ends within this time, or something has closed its descriptors."""
 _KEPT_STILL_S = 1.0
 """Between two looks at the time there is a fifth of that, unless this process may not run."""
+_NOT_BEGUN = "no hook has run yet, and --duration counts from the first one: Ctrl+C ends the run"
 
 
 class Supervisor:
@@ -106,7 +107,7 @@ class Supervisor:
         self._processes = Processes(self._detector, self.outcome)
         self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
-        self._backlog = Backlog(connections)
+        self._backlog = Backlog(connections, self._detector.is_held_up)
         peers_to_ask = self._peers if self._peers.exist else None
         self._probing = Probing(names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
@@ -339,6 +340,8 @@ class Supervisor:
             self._show(source.remarks(now_s))
         if self._detector.has_just_stalled(now_s):
             self._channels.send(control.Explain())
+            if self._duration_s is not None and self.outcome.started_s is None:
+                self._output.log("WARN", _NOT_BEGUN)
         if overdue := self._peers.overdue(now_s):
             self._shutdown.fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked

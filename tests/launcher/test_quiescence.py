@@ -411,16 +411,26 @@ def test_where_there_is_no_loop_the_deadlock_names_the_node_that_has_nothing_lef
     assert "loop" not in text
 
 
+def test_a_project_that_has_no_hook_left_is_told_to_end() -> None:
+    probing = Probing("ab", [AB], lambda _: None)
+    probing.take(sender(AB, 0, 0, number=0))
+    probing.take(receiver(AB, 0, 0, number=0))
+    assert probing.why_dead() == (
+        "deadlock: nothing can ever run again: no hook can run. If the work is done, let a hook"
+        " call node.shutdown"
+    )
+
+
 def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:
     asked: list[int] = []
     probing = Probing("ab", [AB], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
     probing.take(sender(AB, 2, 1, number=1))
-    assert probing.what_is_left(1.0) == ["b is busy"]
+    assert probing.what_is_left(1.0) == ["b does not answer"]
     probing.take(receiver(AB, 1, 1, is_startable=True, number=1))
     left = ["a packet is under way on `a.o -> b.x`", "b has a packet to work on"]
     assert probing.what_is_left(1.0) == left
     probing.look(2.0, 0.0)
     assert asked == [1, 2]
     assert probing.what_is_left(2.01) == left, "the next answers are on their way"
-    assert probing.what_is_left(3.0) == ["a is busy", "b is busy"]
+    assert probing.what_is_left(3.0) == ["a does not answer", "b does not answer"]

@@ -282,6 +282,22 @@ def test_packets_that_are_not_taken_in_are_said_too() -> None:
     assert f"`{KEY}`" in text
 
 
+def test_a_node_that_can_take_in_nothing_has_not_fallen_behind() -> None:
+    detector = StallDetector(["camera", "brain"], 0.0, Path("nowhere"))
+    detector.greet(["camera", "brain"])
+    backlog = Backlog([CONNECTION], detector.is_held_up)
+    for second in range(7):
+        backlog.report(counted(sent=3), float(second))
+        backlog.report(counted(received=2), float(second))
+        detector.report(report("brain"), float(second))
+    detector.report(report("camera", executing=executing(6.0)), 6.0)
+    assert said(backlog, 6.0) == [], "a hook executes in its process"
+    detector.report(report("camera"), 7.0)
+    assert said(backlog, 9.0) == [], "it does not report"
+    detector.report(report("brain"), 9.0)
+    assert "has taken in no packet for over 5 s" in said(backlog, 9.0)[0]
+
+
 def test_a_pause_does_not_count() -> None:
     backlog = Backlog([CONNECTION])
     backlog.report(counted(received=5, unread=5), 0.0)

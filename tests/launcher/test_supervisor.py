@@ -11,6 +11,7 @@ import pytest
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
 from neuros.errors import EnvironmentFault
+from neuros.launcher import stall_detector
 
 
 @pytest.fixture
@@ -99,7 +100,7 @@ def test_but_not_longer_than_it_was_said(run: Run) -> None:
     impatient = SHUTS_DOWN.replace("drain_s=5", "drain_s=0.2")
     outcome = run(a=impatient, b=DRAINED_AFTER_A_LONG_HOOK)
     assert outcome.exit_code == 0
-    assert "not drained in time: b is busy" in run.output.said
+    assert "not drained in time: b does not answer" in run.output.said
 
 
 PACKET_IS_LOST = """
@@ -261,6 +262,17 @@ def test_a_deadlock_names_its_cycle(run: Run) -> None:
         "deadlock: nothing can ever run again: a is blocked on `a.o -> b.x` (1 outstanding);"
         " b is blocked on `b.o -> a.x` (1 outstanding). "
     )
+
+
+def test_a_duration_that_has_not_begun_is_named_when_nothing_moves(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stall_detector, "STALL_S", 0.1)
+    run.after("no hook has run yet, and --duration counts from the first one", run.press_ctrl_c)
+    outcome = run(
+        a="host.is_idle = False; host.hello(); host.report(); host.serve()", duration_s=0.1
+    )
+    assert outcome.exit_code == 130
 
 
 def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
