@@ -31,7 +31,7 @@ from neuros.transport.values import checker
 def _import_type_support() -> None:
     """Import the package with which message classes load their code in C, but not all of it.
 
-    It also imports the generator of message packages with its parsers, for 20 ms of processor time
+    It also imports the generator of message packages with its parsers, for 10 ms of processor time
     in each node process, and goes without where that is missing.
     """
     generator = "rosidl_generator_py.generate_py_impl"
