@@ -183,7 +183,11 @@ def damage_of(folder: Path) -> Iterator[None]:
 def _check_definitions(reader: Reader) -> None:
     """Raise ``ReaderError`` where metadata and files do not agree."""
     storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
-    there = {each.topic for storage in storages for each in storage.connections}
+    stored = [each for storage in storages for each in storage.connections]
+    there = {each.topic for each in stored}
+    named = {each.topic for each in reader.connections}
+    if unnamed := next((e.topic for e in stored if e.msgcount and e.topic not in named), ""):
+        raise ReaderError(f"metadata.yaml does not name the topic {unnamed}, which its files have")
     for connection in reader.connections:
         if type(connection.msgcount) is not int or connection.msgcount < 0:
             raise ReaderError(f"{connection.topic} has {connection.msgcount} packets")

@@ -225,6 +225,16 @@ def test_an_sqlite_bag_that_has_lost_packets_says_how_many(
     assert (other / "bag.before_repair").is_dir()
 
 
+def test_a_topic_that_has_got_the_name_of_another_is_noticed(whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    file = run / "bag" / "metadata.yaml"
+    file.write_text(file.read_text().replace("number/b/number", "number/c/number"))
+    with pytest.raises(EnvironmentFault, match="does not name the topic /neuros/a/number/b/"):
+        values_in(Bag(run / "bag", {}))
+    assert values_in(neuros.bag.open(run)) == VALUES, "which repairs it"
+
+
 @pytest.mark.parametrize("new", [b"inq32 data", b"int32 ####", b"\xffnt32 data"])
 def test_a_definition_that_has_changed_costs_no_packet(
     in_sqlite: Path, tmp_path: Path, new: bytes
