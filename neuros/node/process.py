@@ -242,13 +242,13 @@ class NodeProcess:
         """Bring all nodes back to their start, once no event waits, if they can be."""
         assert self._middleware is not None
         loop = self._middleware.loop
-        why_not = self._why_not_reset()
-        if not why_not:
+        if not (why_not := self._why_not_reset()):
             for node in self._nodes:
                 node.pause()  # takes back what is left of steps, which might go on for ever
             if loop.has_waiting_events or not loop.has_taken_in:
                 loop.post_loop_back(lambda: self._reset(variables))
                 return
+            self._has_been_reset = True
             for node in self._nodes:
                 try:
                     node.reset(variables.get(node.name, {}))
@@ -256,8 +256,6 @@ class NodeProcess:
                     self._fail(node.name, error)
                     return
                 self._tell(declared(node.name, node.specs))
-            self._has_been_reset = True
-            for node in self._nodes:
                 loop.post(node.start)
         self._tell(control.WasReset(why_not))
 
@@ -265,15 +263,12 @@ class NodeProcess:
         """Why the nodes cannot be reset where they are; empty if they can."""
         if not all(node.is_paused for node in self._nodes):
             return "the run is not paused: pause it first"
-        connections = [c for file in self._files for c in file.connections]
-        ends = {name for c in connections for name in (c.source_node, c.destination_node)}
-        if not self._by_name.keys() >= ends:
+        connections = (c for file in self._files for c in file.connections)
+        if any({c.source_node, c.destination_node} - {*self._by_name} for c in connections):
             return "its nodes are in several processes"
-        if why := next((why for node in self._nodes if (why := node.why_not_reset)), ""):
-            return why
-        threads = [t for t in threading.enumerate() if not isinstance(t, ControlThread)]
-        is_alone = threads == [threading.main_thread()]
-        return "" if is_alone else f"a plugin has a thread ({threads[-1].name})"
+        threads = {t for t in threading.enumerate() if not isinstance(t, ControlThread)}
+        others = (f"a plugin has a thread ({t.name})" for t in threads - {threading.main_thread()})
+        return next(filter(None, (*(node.why_not_reset for node in self._nodes), *others)), "")
 
     def _explain(self) -> None:
         """Report why nothing moves; while a hook runs, that is what all nodes here wait for."""
