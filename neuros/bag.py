@@ -94,7 +94,7 @@ class RecordedTopic:
     def columns(self) -> dict[str, Column]:
         """A column for each field, and the two times; see :meth:`array`."""
         packets = self.raw()
-        with damage_of(self._bag.folder):
+        with damage_of(self._bag.folder, self.name):
             return {
                 LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
                 PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
@@ -284,7 +284,7 @@ class Bag:
 
     def message(self, data: bytes, type_name: str) -> Any:
         """A message of a type that the bag has. Raises ``EnvironmentFault`` for other bytes."""
-        with damage_of(self.folder):
+        with damage_of(self.folder, f"a packet of type {type_name}"):
             return self.store.deserialize_cdr(data, type_name)
 
     def packets_of(self, name: str) -> list[RawPacket]:

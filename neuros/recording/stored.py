@@ -169,15 +169,20 @@ def store_of(connections: Iterable[Connection]) -> Typestore:
 
 
 @contextmanager
-def damage_of(folder: Path) -> Iterator[None]:
-    """Turn what ``rosbags`` raises for a bag into ``EnvironmentFault``; that may be anything."""
+def damage_of(folder: Path, what: str = "") -> Iterator[None]:
+    """Turn what ``rosbags`` raises for a bag into ``EnvironmentFault``; that may be anything.
+
+    Args:
+        what: the part of the bag that is read; all of it if empty.
+    """
     try:
         yield
     except EnvironmentFault:
         raise
     except Exception as error:
         why = shorten(str(error), 200, placeholder=" ...") or type(error).__name__
-        raise EnvironmentFault(f"{folder} cannot be read: it is damaged ({why})") from error
+        place = f"{folder}: {what}" if what else str(folder)
+        raise EnvironmentFault(f"{place} cannot be read: it is damaged ({why})") from error
 
 
 def _check_definitions(reader: Reader) -> None:

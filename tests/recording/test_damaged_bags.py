@@ -246,6 +246,16 @@ def test_a_definition_that_has_changed_costs_no_packet(
     assert values_in(neuros.bag.open(run)) == VALUES
 
 
+def test_a_packet_that_is_no_message_is_named_by_its_topic(in_sqlite: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(in_sqlite, tmp_path / "run"))
+    with contextlib.closing(sqlite3.connect(run / "bag/bag.db3")) as database, database:
+        database.execute("UPDATE messages SET data = x'00010000ff' WHERE id = 3")
+    with pytest.raises(EnvironmentFault, match=f"bag: {NUMBER.name} cannot be read: it is damaged"):
+        values_in(neuros.bag.open(run))
+    with pytest.raises(EnvironmentFault, match=f"a packet of type {NUMBER.type} cannot be read"):
+        [*neuros.bag.open(run)[NUMBER.name].messages()]
+
+
 def test_no_packet_is_compared_with_another_because_one_before_it_is_missing(
     in_sqlite: Path, tmp_path: Path
 ) -> None:
