@@ -471,13 +471,15 @@ class ControlThread(threading.Thread):
         self._process = process
         self._steps = steps
         self._ended = threading.Event()
+        # Here: once the thread comes to it, a node that fails at once may have closed them.
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(link, selectors.EVENT_READ, self._on_messages)
+        self._selector.register(signalled, selectors.EVENT_READ, self._on_signal)
 
     def run(self) -> None:
         """Until the supervisor hangs up or :meth:`end`."""
         next_report_s = time.monotonic() + _REPORT_S
-        with selectors.DefaultSelector() as selector, contextlib.ExitStack() as stack:
-            selector.register(self._link, selectors.EVENT_READ, self._on_messages)
-            selector.register(self._signalled, selectors.EVENT_READ, self._on_signal)
+        with self._selector as selector, contextlib.ExitStack() as stack:
             if self._steps is not None:
                 stack.callback(self._steps.close)
                 self._steps.listen(selector)
