@@ -70,4 +70,4 @@ def test_a_node_may_have_failed_and_closed_all_before_the_thread_begins() -> Non
             thread = ControlThread(ControlLink(ours, TO_NODES, "x"), signalled, process)
         thread.end()
         thread.run()
-    assert not (process.obeyed or process.events)
+    assert process.obeyed == process.events == []
