@@ -15,7 +15,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 
 import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
@@ -337,7 +336,7 @@ class NodeProcess:
             fail=self._fail,
             recorder=None if self._open_recorder is None else self._open_recorder(file),
             make_engine=Engine if self._open_recorder is None else LoggedEngine,
-            log_file=_log_file(file) if self._own_logs else None,
+            log_file=file.folders.run / file.node.name / "node.log" if self._own_logs else None,
             duration_sim_s=self._duration_sim_s,
             is_held=self._is_held,
             on_initialised=self._keep_for_good,
@@ -596,7 +595,3 @@ def _filenames(error: BaseException) -> Iterator[str]:
     while trace is not None:
         yield trace.tb_frame.f_code.co_filename
         trace = trace.tb_next
-
-
-def _log_file(file: NodeFile) -> Path:
-    return file.folders.run / file.node.name / "node.log"
