@@ -31,14 +31,19 @@ def test_a_node_ends_the_project(run: Run) -> None:
     assert outcome.started_s < outcome.ending_s < outcome.ended_s
 
 
-def test_what_is_to_be_done_meanwhile_begins_before_the_nodes_have_ended(run: Run) -> None:
-    alive: list[bool] = []
-
-    def note() -> None:
-        alive.extend(host.poll() is None for host in run.hosts)
-
-    run(a=SHUTS_DOWN, b=WELL_BEHAVED, on_stop=note)
-    assert alive == [True, True]
+def test_what_is_to_be_done_meanwhile_begins_before_the_nodes_have_ended(
+    run: Run, tmp_path: Path
+) -> None:
+    begun = tmp_path / "begun"
+    ends_after_that = f"""
+host.up()
+host.wait_for("stop")
+while not os.path.exists({str(begun)!r}):
+    time.sleep(0.005)
+host.report(is_final=True)
+"""
+    outcome = run(a=SHUTS_DOWN, b=ends_after_that, on_stop=begun.touch)
+    assert (outcome.exit_code, outcome.failures) == (0, [])
 
 
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
