@@ -16,7 +16,7 @@ from test_python_api import thrown
 from test_stepped_sessions import ACCEPTANCE, BRAIN, DEADLINE_S, EVERY_BACK_END, ROBOT, cart, poses
 
 import neuros
-from containers import require_containers
+from containers import require_containers, wait_until
 from neuros.api.live import LiveRun
 from neuros.api.session import Session
 from neuros.backends.control_sockets import connect
@@ -281,6 +281,7 @@ def test_an_observer_resets_a_run_only_while_that_is_paused(tmp_path: Path) -> N
             pass
         assert answer(link, Reset({})).why_not == "the run is not paused: pause it first"
         assert answer(link, Pause(), StepAll(1_000_000), Reset({})).why_not == ""
+        wait_until(lambda: counted(link)[0] == "paused")  # it registers, and initialises, first
         assert counted(link) == ("paused", 0)
         link.send(Resume())
         while counted(link)[1] == 0:
