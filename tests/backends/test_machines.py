@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
 from array import array
@@ -344,6 +345,21 @@ class TestPump:
         ends.agent.end()
         wait_for(lambda: ends.lost)
         assert ends.lost == ["the connection was closed"]
+
+    def test_all_that_was_said_is_heard_though_its_end_is_noticed_by_writing(self) -> None:
+        (from_there, to_here), (taken, to_there) = os.pipe(), os.pipe()
+        fcntl.fcntl(to_here, fcntl.F_SETPIPE_SZ, 1 << 20)
+        said = [NodeEnded(f"eye{number}", "x" * 1000) for number in range(200)]
+        os.write(to_here, b"".join(map(encode, said)))  # more than is read at once
+        os.close(to_here)
+        os.close(taken)
+        heard: list[Message] = []
+        lost: list[str] = []
+        pump = Pump(from_there, to_there, FROM_AGENT, "robot", heard.append, lost.append)
+        pump.start()
+        pump.join(_SOON_S)
+        assert heard == said
+        assert lost == ["the connection was closed"]
 
     def test_who_is_silent_is_missed_after_its_time(self) -> None:
         (from_there, held), (taken, to_there) = os.pipe(), os.pipe()  # and nobody writes

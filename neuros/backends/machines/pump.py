@@ -216,8 +216,9 @@ class Pump(threading.Thread):
                 written = os.write(self._write_to, self._unsent[:_READ_BYTES])
             except BlockingIOError:
                 return ""
-            except BrokenPipeError:
-                return _CLOSED
+            except BrokenPipeError:  # it has ended; what it has said before is still to be read
+                self._unsent.clear()
+                return ""
             except OSError as error:
                 return str(error.strerror)
             del self._unsent[:written]
