@@ -82,7 +82,6 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport": {
         "numpy",
         "rclpy",
-        "rosidl_generator_py",
         "rosidl_parser",
         "rpyutils",
         "xxhash",
@@ -328,17 +327,6 @@ def test_the_command_line_starts_without_what_single_commands_need() -> None:
         "import sys; sys.path.insert(0, '.'); import neuros.cli.main\n"
         "heavy = {'asyncio', 'starlette', 'uvicorn', 'webbrowser', 'rclpy', 'docker', 'numpy'}\n"
         "assert not heavy & {*sys.modules}, heavy & {*sys.modules}",
-    )
-
-
-def test_a_node_process_finds_the_code_of_messages_without_their_generator() -> None:
-    run_python(
-        "-c",
-        "import sys; sys.path.insert(0, '.')\n"
-        "from neuros.transport.messages import message_class\n"
-        "message_class('std_msgs/msg/String')\n"
-        "parsers = {'em', 'lark', 'rosidl_generator_py.generate_py_impl'}\n"
-        "assert not parsers & {*sys.modules}, parsers & {*sys.modules}",
     )
 
 

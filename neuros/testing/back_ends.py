@@ -281,12 +281,12 @@ class BackEndChecks:
     def test_ticks_keep_their_schedule_and_a_duration_in_wall_time_ends_drained(
         self, run: Callable[..., Launched]
     ) -> None:
-        launched = run("time", "--duration", "0.5")
+        launched = run("time", "--duration", "2")
         ticks = launched.record["nodes"]["clock"]["hooks"]["step"]
-        # 50 ticks of 10 ms; a machine with other work to do misses many, and ends the run later.
+        # 200 ticks of 10 ms; a machine with other work to do may miss some, and end the run later.
         most = launched.record["wall_s"] / 0.01 + 2
-        assert 10 <= ticks["executions"] <= most
-        assert 48 <= ticks["executions"] + ticks["missed_ticks"] <= most
+        assert 140 <= ticks["executions"] <= most
+        assert 198 <= ticks["executions"] + ticks["missed_ticks"] <= most
         sent, consumed = launched.counts("clock.clock -> reader.clock", "sent", "consumed")
         assert sent == consumed == ticks["executions"]
 

@@ -12,7 +12,7 @@ so that its constructor runs once.
 from __future__ import annotations
 
 import importlib
-import sys
+import warnings
 from array import array
 from collections.abc import Callable
 from functools import cache, partial
@@ -26,22 +26,6 @@ from neuros.project.model import Port
 from neuros.transport.codecs import message_codec
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import checker
-
-
-def _import_type_support() -> None:
-    """Import the package with which message classes load their code in C, but not all of it.
-
-    It also imports the generator of message packages with its parsers, for 10 ms of processor time
-    in each node process, and goes without where that is missing.
-    """
-    generator = "rosidl_generator_py.generate_py_impl"
-    if "rosidl_generator_py" not in sys.modules:
-        sys.modules[generator] = None  # type: ignore[assignment]  # importing it fails
-        importlib.import_module("rosidl_generator_py")
-        del sys.modules[generator]
-
-
-_import_type_support()
 
 
 @cache
@@ -60,7 +44,10 @@ def message_class(type_name: str) -> type:
             " installed in this node's container?"
         ) from error
     assert isinstance(found, type)
-    check_for_type_support(found)
+    with warnings.catch_warnings():
+        # What ROS loads for its first message uses a module that Python calls deprecated.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        check_for_type_support(found)
     return found
 
 

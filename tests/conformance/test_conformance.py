@@ -45,13 +45,13 @@ def test_what_once_broke_a_rule_does_so_no_more():
 
 @pytest.mark.parametrize("backend", ["in-process", "process"])
 def test_random_projects_break_no_rule(backend: str):
-    assert not broken(cases(backend)[::4])
+    assert not broken(cases(backend)[::2])
 
 
 @pytest.mark.acceptance
 @pytest.mark.parametrize("backend", ["in-process", "process"])
 def test_further_random_projects_break_no_rule(backend: str):
-    assert not broken([case for place, case in enumerate(cases(backend)) if place % 4])
+    assert not broken(cases(backend)[1::2])
 
 
 def test_nor_do_they_in_containers():
