@@ -4,6 +4,7 @@ A run is on the back end that a test names, else on that of processes. What ``au
 depends on the machine: it has tests of its own, which name it.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -68,6 +69,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Func
         mark(item)
     if hasattr(config, "workerinput"):  # no worker has much to do when the others are done
         longest_first(items)
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector need not go through all tests and modules again and again."""
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -17,10 +17,22 @@ from multiprocessing.connection import Connection
 from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
+import pytest
+
 _FORKING = multiprocessing.get_context("forkserver")
-# Without NumPy, which starts threads.
 _FORKING.set_forkserver_preload(
-    ["tests.preloaded", "neuros.cli.launch", "neuros.api.execution", "jsonschema", "tabulate"]
+    [
+        "tests.preloaded",
+        "jsonschema",
+        "tabulate",
+        "xxhash",
+        "neuros.cli.launch",
+        "neuros.cli.environments",
+        "neuros.api.execution",
+        "neuros.api.loading",
+        "neuros.analysis.packets",
+        "neuros.backends.process_launchers",
+    ]
 )
 _READ_AT_START = ("LD_", "PYTHON")
 
@@ -37,7 +49,10 @@ def _read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
 @cache
 def _of_the_server() -> dict[str, str]:
     """Start the process that forks; returns those variables of its environment."""
-    ensure_running()
+    with pytest.MonkeyPatch.context() as patch:
+        # As in main(); and NumPy would start threads otherwise, which a fork does not take along.
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")
+        ensure_running()
     return _read_at_start(os.environ)
 
 

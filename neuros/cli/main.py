@@ -130,6 +130,8 @@ def main(arguments: Sequence[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell asks what fits: this ends the process
         _complete(os.environ.get("COMP_LINE", ""))
     _open_standard_streams()
+    # As in nodes. On its import NumPy would start threads, which spin for 50 ms.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not arguments:
         parser("").print_help(sys.stderr)
         return EXIT_USAGE
