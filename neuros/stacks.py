@@ -1,19 +1,26 @@
 """Stacks of plugins: reported for hooks that run for long, and for nodes that are killed.
 
 A node tells it in its reports (:func:`stack_in`). While a library holds Python's global lock it
-cannot report, and after its last report it does not: then a thread in C, faulthandler's, writes the
-stack to a file of the node (:class:`StackFile`), which the supervisor reads (:func:`held_stack`,
-:func:`held_threads`). No signal is needed for that, so no system call of a plugin is interrupted,
-and it also works in containers.
+cannot report, and after its last report it does not: then the stack is written to a file of the
+node (:class:`StackFile`), which the supervisor reads (:func:`held_stack`, :func:`held_threads`).
+
+A node that stood still with its machine, or had no processor for seconds, cannot be told from one
+whose lock is held. Its threads go on while the stack is written; the walk of another thread
+through their frames (``faulthandler.dump_traceback_later``) ends in a segmentation fault in one of
+twenty times or so. So the main thread writes its own stack, on a signal, and all threads are only
+written with the lock.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import ctypes
 import faulthandler
 import json
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -29,10 +36,8 @@ FILE_NAME = ".stack"
 HELD_S = 4.0
 """A global lock that is held for this long has the stack written; nodes report more often."""
 
-_RENEW_S = 1.9
-"""A timer of faulthandler is a thread: one per report is most of what an idle node does."""
-
-_THREAD = re.compile(r"(?:Current thread|Thread) 0x0*(?P<ident>[0-9a-f]+)\b.*:")
+_MAIN_THREAD = "Stack (most recent call first):"  # as faulthandler says it
+_ALL_THREADS = "Threads:"
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
 
 
@@ -59,22 +64,69 @@ class StackFile:
             name: str(path).encode("ascii", "backslashreplace").decode()
             for name, path in plugins.items()
         }
-        head = {"main": f"{threading.main_thread().ident or 0:x}", "plugins": dumped}
-        self._head = json.dumps(head).encode() + b"\n"
+        self._head = json.dumps(dumped).encode() + b"\n"
         self._descriptor = os.open(
             folder / FILE_NAME, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
         )
         os.write(self._descriptor, self._head)
-        self._renewed_s = float("-inf")
+        faulthandler.register(_Timer.SIGNAL, self._descriptor, all_threads=False)
+        self._timer = _Timer()
 
     def renew(self) -> None:
         """The process reports: only if it cannot do so again for a while the stack is written."""
-        now_s = time.monotonic()
-        if now_s - self._renewed_s > _RENEW_S:
-            self._renewed_s = now_s
-            faulthandler.dump_traceback_later(HELD_S, repeat=True, file=self._descriptor)
+        self._timer.start(HELD_S)
         if os.fstat(self._descriptor).st_size != len(self._head):
             os.ftruncate(self._descriptor, len(self._head))
+
+    def leave(self) -> None:
+        """The process has made its last report; what keeps it for a while is written."""
+        thread = threading.Timer(HELD_S, self._write_threads)
+        thread.daemon = True
+        thread.start()
+
+    def _write_threads(self) -> None:
+        os.write(self._descriptor, f"{_ALL_THREADS}\n".encode())
+        faulthandler.dump_traceback(self._descriptor)
+
+
+class _Timer:
+    """Sends the main thread a signal, also while Python's global lock is held (timer_create(2)).
+
+    That thread executes it, so a system call that it waits in begins anew. Where the kernel has no
+    such timers, nothing is sent.
+    """
+
+    SIGNAL = signal.SIGRTMAX - 1  # no plugin is likely to use it
+
+    _BY_THREAD = 4  # SIGEV_THREAD_ID
+
+    class _Event(ctypes.Structure):
+        _fields_ = (
+            ("value", ctypes.c_void_p),
+            ("signal", ctypes.c_int),
+            ("notify", ctypes.c_int),
+            ("thread", ctypes.c_int),
+            ("reserved", ctypes.c_int * 12),
+        )
+
+    def __init__(self) -> None:
+        thread = threading.main_thread().native_id or 0
+        event = self._Event(signal=self.SIGNAL, notify=self._BY_THREAD, thread=thread)
+        self._number = ctypes.c_void_p()
+        self._library = ctypes.CDLL(None)
+        if not hasattr(self._library, "timer_create"):
+            self._library = ctypes.CDLL("librt.so.1")  # before version 2.34 of glibc
+        clock, number = time.CLOCK_MONOTONIC, ctypes.byref(self._number)
+        self._is_there = self._library.timer_create(clock, ctypes.byref(event), number) == 0
+        # When Python ends it gives up its handler, and the signal would end the process.
+        atexit.register(self.start, 0.0)
+
+    def start(self, period_s: float) -> None:
+        """Send it in so many seconds, and every so many seconds from then on; 0: no more."""
+        seconds, nanoseconds = divmod(round(period_s * 1e9), 10**9)
+        if self._is_there:
+            periods = (ctypes.c_long * 4)(seconds, nanoseconds, seconds, nanoseconds)
+            self._library.timer_settime(self._number, 0, periods, None)
 
 
 def stack_in(node: str, plugin: Path) -> Stack | None:
@@ -85,36 +137,38 @@ def stack_in(node: str, plugin: Path) -> Stack | None:
 
 def held_stack(folder: Path) -> Stack | None:
     """The stack of the process with this file, ``None`` if it is able to report that itself."""
-    try:
-        head, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
-        known = json.loads(head)
-    except (OSError, ValueError):
-        return None
-    threads: dict[str, list[traceback.FrameSummary]] = {}  # of the last time that it was written
-    frames: list[traceback.FrameSummary] = []
-    for line in lines:
-        if match := _THREAD.match(line):
-            frames = threads[match["ident"]] = []
-        elif match := _FRAME.match(line):
-            frames.insert(
-                0, traceback.FrameSummary(match["file"], int(match["line"]), match["name"])
-            )
-    main = threads.pop(known["main"], [])
-    found = (_from_plugin(known["plugins"], frames) for frames in (main, *threads.values()))
-    return next((stack for stack in found if stack), None)
+    head, lines = _written(folder, _MAIN_THREAD)
+    matches = [_FRAME.match(line) for line in lines]
+    frames = [
+        traceback.FrameSummary(match["file"], int(match["line"]), match["name"])
+        for match in reversed(matches)
+        if match
+    ]
+    return _from_plugin(head, frames)
 
 
 def held_threads(folder: Path) -> str:
-    """The stacks of all threads of the process with this file when it could not report any more.
+    """Where the process with this file was when it could not report any more.
 
-    As faulthandler shows them, the most recent call first; empty if there is nothing of the kind.
+    As faulthandler shows it, the most recent call first: all threads, or else the main thread;
+    empty if there is nothing of the kind.
     """
+    return "\n".join(_written(folder, _ALL_THREADS)[1] or _written(folder, _MAIN_THREAD)[1])
+
+
+def _written(folder: Path, title: str) -> tuple[Mapping[str, str], Sequence[str]]:
+    """The plugins of the process with this file, and what was written under this title last."""
     try:
-        _, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
+        head, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
+        plugins = json.loads(head)
     except (OSError, ValueError):
-        return ""
-    begins = [place for place, line in enumerate(lines) if line.startswith("Timeout (")]
-    return "\n".join(lines[begins[-1] + 1 :]) if begins else ""
+        return {}, ()
+    titles = [place for place, line in enumerate(lines) if line in (_MAIN_THREAD, _ALL_THREADS)]
+    found = [place for place in titles if lines[place] == title]
+    if not found:
+        return plugins, ()
+    end = next((place for place in titles if place > found[-1]), None)
+    return plugins, lines[found[-1] + 1 : end]
 
 
 def remove_stack_files(folders: Sequence[Path]) -> None:

@@ -112,6 +112,7 @@ class NodeProcess:
             if self._middleware is not None:
                 self._guard(self._middleware.close)
             thread.end()
+            self._stack_file.leave()
         return 1 if self._has_failed else 0
 
     # ------------------------------------------------------------------ called by the supervisor

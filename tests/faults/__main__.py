@@ -29,8 +29,9 @@ _Run = Callable[[Path], Outcome]
 def main() -> int:
     """Run the cells; returns the exit code."""
     options = _options()
-    # In the background of a shell it is ignored, and all that is started would inherit that.
+    # In the background of a shell, or under nohup, all that is started would ignore them.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if options.launches:
         return _launch(options)
     until_s = time.monotonic() + options.hours * 3600

@@ -13,7 +13,7 @@ from typing import Any
 
 import psutil
 from endings import dead_shared_memory, stale_locks
-from launching import launch
+from launching import LAUNCH, start
 
 _PACKETS = 20
 _MARK = "FAULT_MARK"
@@ -82,13 +82,14 @@ class Launches:
     def one(self, backend: str) -> tuple[Any, ...]:
         """Launch it; returns its result, without what differs from time to time."""
         run = self._folder / uuid.uuid4().hex
-        finished = launch(
+        with start(
             self._folder / "project.json",
             *("--backend", backend, "-o", str(run)),
             cwd=self._folder,
-            timeout_s=_TIMEOUT_S,
+            program=LAUNCH,
             **{"TMPDIR": str(self._temporary), _MARK: self._mark},
-        )
+        ) as running:
+            finished = running.finish(_TIMEOUT_S)
         counted = [
             (each["sent"], each["received"], each["consumed"])
             for each in finished.record.get("connections", [])

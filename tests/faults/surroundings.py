@@ -292,6 +292,7 @@ def _suspended_at(strikes_at: str) -> Callable[[Surrounding, str, Path], Outcome
         with trial.start(backend, duration_s=duration_s) as running:
             trial.await_strike(running)
             numbers = [process.pid for process in trial.processes()]
+            assert running.process.pid in numbers
             try:
                 _signal_all(numbers, signal.SIGSTOP)
                 time.sleep(_SUSPENDED_S)

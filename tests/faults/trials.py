@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 from endings import dead_shared_memory, stale_locks
-from launching import Running, start
+from launching import LAUNCH, Running, start
 
 ENDS_WITHIN_S = 6.0
 GIVES_UP_AFTER_S = 25.0
@@ -145,6 +145,7 @@ class Trial:
         backend: str,
         *arguments: str,
         duration_s: float,
+        program: Sequence[str] = LAUNCH,  # one that is forked does not have our mark for all to see
         **more: Any,
     ) -> Running:
         """Start the run, recorded; ``more`` goes to :func:`tests.launching.start`."""
@@ -153,6 +154,7 @@ class Trial:
             *("--backend", backend, "--duration", f"{duration_s:g}"),
             *("-r", "-o", str(self.run_folder), *arguments),
             cwd=self.folder,
+            program=program,
             **{"TMPDIR": str(self.temporary), _MARK: self.mark, **more},
         )
 

@@ -119,15 +119,17 @@ def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None
 
 
 def test_of_a_process_that_does_not_end_it_is_said_where_its_threads_were(run: Run) -> None:
-    stuck = """
-import faulthandler, json, os
+    stuck = f"""
+import sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from neuros import stacks
 host.up()
 host.wait_for('stop')
 host.report(is_final=True)
-os.makedirs('b', exist_ok=True)
-file = open('b/.stack', 'wb', 0)
-file.write(json.dumps({'main': '0', 'plugins': {}}).encode() + b'\\n')
-faulthandler.dump_traceback_later(0.5, file=file)
+Path('b').mkdir(exist_ok=True)
+stacks.HELD_S = 0.5
+stacks.StackFile(Path('b'), {{}}).leave()
 def in_teardown():
     __import__('time').sleep(60)
 in_teardown()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import statistics
 import subprocess
@@ -16,7 +17,7 @@ from typing import Any
 
 import psutil
 
-from tests.launching import start
+from tests.launching import LAUNCH, start
 
 from .shapes import SHAPES, Shape
 
@@ -68,7 +69,9 @@ def run(
     load, memory = Load(name, backend), []
     options = (folder / "project.json", "--backend", backend, "-o", "run")
     deadline_s = time.monotonic() + _STARTS_WITHIN_S + packets * _MOST_PER_PACKET_S
-    with busy_processes(busy), start(*options, cwd=folder, LOAD_MARK=mark) as running:
+    # One that is forked would not show its mark.
+    starting = functools.partial(start, cwd=folder, program=LAUNCH, LOAD_MARK=mark)
+    with busy_processes(busy), starting(*options) as running:
         while running.process.poll() is None:
             if time.monotonic() > deadline_s:
                 load.problems.append("did not end")

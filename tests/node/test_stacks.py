@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+import textwrap
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from containers import wait_until
-from neuros.stacks import FILE_NAME, StackFile, held_stack, remove_stack_files, stack_in
+from neuros.stacks import FILE_NAME, held_stack, remove_stack_files, stack_in
 
 PLUGIN = """\
 import ctypes, threading
@@ -97,21 +98,48 @@ def test_a_node_that_reports_tells_it_of_its_main_thread(plugin: Path) -> None:
 
 
 def test_a_file_of_one_that_reports_says_nothing(tmp_path: Path) -> None:
-    import faulthandler
-
-    file = StackFile(tmp_path, {"a": tmp_path / "a.py"})
-    try:
+    found = run(
+        """
+        file = stacks.StackFile(folder, {"a": folder / "a.py"})
+        with open(folder / stacks.FILE_NAME, "a") as more:
+            more.write("Stack (most recent call first):\\n")
+            more.write(f'  File "{folder}/a.py", line 3 in f\\n')
+        print(stacks.held_stack(folder).hook)
         file.renew()
-        with open(tmp_path / FILE_NAME, "a") as more:
-            more.write(f"Thread 0x{threading.main_thread().ident:016x} (most recent call first):\n")
-            more.write(f'  File "{tmp_path}/a.py", line 3 in f\n')
-        stack = held_stack(tmp_path)
-        assert stack is not None
-        assert stack.hook == "f"
-        file.renew()
-        assert held_stack(tmp_path) is None
-    finally:
-        faulthandler.cancel_dump_traceback_later()
+        print(stacks.held_stack(folder))
+        """,
+        tmp_path,
+    )
+    assert (found.returncode, found.stdout) == (0, "f\nNone\n")
     remove_stack_files([tmp_path, tmp_path / "nowhere"])
     assert held_stack(tmp_path) is None
     assert not (tmp_path / FILE_NAME).exists()
+
+
+def test_a_process_that_was_only_late_goes_on_unharmed(tmp_path: Path) -> None:
+    """As after a standstill of the machine: the stack is written while other threads go on."""
+    found = run(
+        """
+        stacks.HELD_S = 0.005
+        def late():
+            until_s = time.monotonic() + 2.0
+            while time.monotonic() < until_s:
+                exec("def deep(n):\\n return n and [deep(n - 1)]\\ndeep(20)", {})
+        stacks.StackFile(folder, {}).renew()
+        thread = threading.Thread(target=late)
+        thread.start()
+        thread.join()
+        print((folder / stacks.FILE_NAME).read_text().count("in join"))
+        """,
+        tmp_path,
+    )
+    assert found.returncode == 0, "it was killed by a signal"
+    assert int(found.stdout) > 20
+
+
+def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A program in a process of its own."""
+    head = "import sys, threading, time\nfrom pathlib import Path\nfrom neuros import stacks\n"
+    head += "folder = Path(sys.argv[1])\n"
+    command = [sys.executable, "-c", head + textwrap.dedent(program), folder]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
