@@ -137,14 +137,13 @@ def stack_in(node: str, plugin: Path) -> Stack | None:
 
 def held_stack(folder: Path) -> Stack | None:
     """The stack of the process with this file, ``None`` if it is able to report that itself."""
-    head, lines = _written(folder, _MAIN_THREAD)
-    matches = [_FRAME.match(line) for line in lines]
-    frames = [
-        traceback.FrameSummary(match["file"], int(match["line"]), match["name"])
-        for match in reversed(matches)
-        if match
-    ]
-    return _from_plugin(head, frames)
+    plugins, dumps = _dumps(folder, _MAIN_THREAD)
+    for lines in dumps:
+        matches = [match for line in reversed(lines) if (match := _FRAME.match(line))]
+        frames = [traceback.FrameSummary(m["file"], int(m["line"]), m["name"]) for m in matches]
+        if stack := _from_plugin(plugins, frames):
+            return stack
+    return None
 
 
 def held_threads(folder: Path) -> str:
@@ -153,22 +152,27 @@ def held_threads(folder: Path) -> str:
     As faulthandler shows it, the most recent call first: all threads, or else the main thread;
     empty if there is nothing of the kind.
     """
-    return "\n".join(_written(folder, _ALL_THREADS)[1] or _written(folder, _MAIN_THREAD)[1])
+    dumps = [*_dumps(folder, _ALL_THREADS)[1], *_dumps(folder, _MAIN_THREAD)[1]]
+    return next(("\n".join(lines) for lines in dumps if lines), "")
 
 
-def _written(folder: Path, title: str) -> tuple[Mapping[str, str], Sequence[str]]:
-    """The plugins of the process with this file, and what was written under this title last."""
+def _dumps(folder: Path, title: str) -> tuple[Mapping[str, str], Sequence[Sequence[str]]]:
+    """The plugins of the process with this file, and what stands under this title, newest first.
+
+    The newest may not be whole yet.
+    """
     try:
         head, *lines = (folder / FILE_NAME).read_text("ascii", "replace").splitlines()
         plugins = json.loads(head)
     except (OSError, ValueError):
         return {}, ()
-    titles = [place for place, line in enumerate(lines) if line in (_MAIN_THREAD, _ALL_THREADS)]
-    found = [place for place in titles if lines[place] == title]
-    if not found:
-        return plugins, ()
-    end = next((place for place in titles if place > found[-1]), None)
-    return plugins, lines[found[-1] + 1 : end]
+    found: list[list[str]] = []
+    for line in lines:
+        if line in (_MAIN_THREAD, _ALL_THREADS):
+            found.append([line])
+        elif found:
+            found[-1].append(line)
+    return plugins, [lines for first, *lines in reversed(found) if first == title]
 
 
 def remove_stack_files(folders: Sequence[Path]) -> None:
