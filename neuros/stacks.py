@@ -92,8 +92,8 @@ class StackFile:
 class _Timer:
     """Sends the main thread a signal, also while Python's global lock is held (timer_create(2)).
 
-    That thread executes it, so a system call that it waits in begins anew. Where the kernel has no
-    such timers, nothing is sent.
+    A system call that this interrupts begins anew (``SA_RESTART``), but for a few, sleeping among
+    them (signal(7)). Where the kernel has no such timers, nothing is sent.
     """
 
     SIGNAL = signal.SIGRTMAX - 1  # no plugin is likely to use it

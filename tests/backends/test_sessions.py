@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from endings import RUNS
+from endings import KEEP_THE_GIL, RUNS
 from launching import Running, start
 
 from neuros.backends.reaper import Reaper
@@ -144,7 +144,7 @@ def test_ps_shows_the_nodes_and_stop_ends_them_as_ctrl_c_does(folder: Path, back
 
 
 def test_a_run_whose_launcher_was_killed_is_ending_until_nothing_is_left(folder: Path) -> None:
-    holding = PLUGIN.replace('"running")', '"running")\n        ctypes.PyDLL(None).sleep(60)')
+    holding = PLUGIN.replace('"running")', f'"running")\n        {KEEP_THE_GIL}')
     (folder / "demo/plugin.py").write_text("import ctypes\n" + holding)
     with start(folder / "demo", "--backend", "process", cwd=folder) as running:
         for node in ("a", "b"):

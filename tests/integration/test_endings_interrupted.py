@@ -25,7 +25,7 @@ from ending_bench import (
     last_line,
     made_bench,
 )
-from endings import GONE_WITHIN_S, RUNS
+from endings import GONE_WITHIN_S, KEEP_THE_GIL, RUNS
 from launching import BACKENDS, REPOSITORY
 
 from containers import wait_until
@@ -173,7 +173,7 @@ def hold(node):
 
 def test_nodes_that_cannot_end_are_killed(bench: Bench) -> None:
     bench.project(
-        gil=HOLDS.format("ctypes.PyDLL(None).sleep(30)"),
+        gil=HOLDS.format(KEEP_THE_GIL),
         sleeps=HOLDS.format("time.sleep(30)"),
         stopped=HOLDS.format("os.kill(os.getpid(), signal.SIGSTOP)"),
         good=RUNS,
@@ -243,7 +243,7 @@ def test_when_the_launcher_is_killed_everything_ends(bench: Bench, moments: list
 
 def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
     with made_bench(tmp_path, "process") as bench:
-        bench.project(a=HOLDS.format("ctypes.PyDLL(None).sleep(30)"), b=RUNS)
+        bench.project(a=HOLDS.format(KEEP_THE_GIL), b=RUNS)
         running = bench.start()
         running.wait_for("[a]: running")
         running.wait_for("[b]: running")
@@ -258,7 +258,7 @@ def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
 
 
 def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(bench: Bench) -> None:
-    holds = {"gil": HOLDS.format("ctypes.PyDLL(None).sleep(30)")}
+    holds = {"gil": HOLDS.format(KEEP_THE_GIL)}
     bench.project(
         "a.o -> b.x",
         "b.o -> c.x",

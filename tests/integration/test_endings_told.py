@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from ending_bench import RELAY, SINK, Bench, assert_ended, last_line, made_bench
-from endings import RUNS
+from endings import KEEP_THE_GIL, RUNS
 from launching import BACKENDS
 
 
@@ -24,7 +24,7 @@ def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
 # ------------------------------------------------------------------ killed
 
 
-HOLDS = """
+HOLDS = f"""
 @neuros_initialise(outputs="o")
 def begin(node):
     return node.make_packet("o")
@@ -33,7 +33,7 @@ def hold(node):
     node.shutdown("enough", drain_s=0.2)
     deep()
 def deep():
-    ctypes.PyDLL(None).sleep(30)
+    {KEEP_THE_GIL}
 """
 HANGS = """
 @neuros_finalise()

@@ -68,8 +68,9 @@ def loop_in_python():
 
 def loop_in_c():
     """Never come back, and never let go of the GIL."""
-    ctypes.PyDLL(None).pause()
-    loop_in_c()
+    lock = ctypes.create_string_buffer(64)
+    for _ in range(2):
+        ctypes.PyDLL(None).pthread_mutex_lock(lock)
 
 
 def exception():

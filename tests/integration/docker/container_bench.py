@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from docker import DockerClient
-from endings import GONE_WITHIN_S, dead_shared_memory
+from endings import GONE_WITHIN_S, KEEP_THE_GIL, dead_shared_memory
 from launching import Finished, Running, start
 
 from containers import nothing_left, wait_until
@@ -26,11 +26,11 @@ from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise, ne
 def save(node):
     (node.run_dir / "saved").touch()
 """
-HOLDS_THE_GIL = """
+HOLDS_THE_GIL = f"""
 @neuros_initialise()
 def hold(node):
     node.get_logger().info("running")
-    ctypes.PyDLL(None).sleep(60)
+    {KEEP_THE_GIL}
 """
 
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 from ending_bench import RELAY, Bench, assert_ended, made_bench
-from endings import RUNS
+from endings import KEEP_THE_GIL, RUNS
 
 from containers import nothing_left, require_containers
 
-HOLDS = """
+HOLDS = f"""
 @neuros_tick(seconds=1.0)
 def hold(node):
     node.shutdown("enough", drain_s=0.2)
-    ctypes.PyDLL(None).sleep(60)
+    {KEEP_THE_GIL}
 """
 HANGS = """
 @neuros_finalise()
