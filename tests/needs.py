@@ -22,6 +22,7 @@ import sys
 import sysconfig
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -72,6 +73,7 @@ NEEDS = {
     "gcc": Need(_program("gcc"), ("gcc",)),
     "g++": Need(_program("g++"), ("g++",)),
     "Python.h": Need(_has_headers, ("python3-dev",)),
+    "tkinter": Need(lambda: find_spec("_tkinter") is not None, ("python3-tk",)),
     "OpenGL": Need(lambda: bool(offscreen_opengl()), tuple(OPENGL_PACKAGES.split())),
     "OSMesa": Need(_has_osmesa, ("libosmesa6",)),
     "Xvfb": Need(_program("Xvfb"), ("xvfb",)),

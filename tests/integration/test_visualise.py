@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -30,7 +29,6 @@ from neuros.visualise import (
 )
 
 DEADLINE_S = 30.0
-HAS_TOOLKIT = importlib.util.find_spec("_tkinter") is not None
 
 
 @pytest.fixture(autouse=True)
@@ -215,7 +213,7 @@ while True:
     assert picture.stat().st_size > 1000
 
 
-@pytest.mark.skipif(not HAS_TOOLKIT, reason="this Python has no tkinter")
+@pytest.mark.needs("tkinter")
 def test_with_a_display_there_is_a_window_that_may_be_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
