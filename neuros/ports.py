@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeAlias
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
+from neuros.stacks import ProcessThreads
 
 Packet: TypeAlias = Any  # one ROS message
 HookFunction: TypeAlias = "Callable[..., Any]"  # gets the node and its inputs, returns packets
@@ -398,6 +399,9 @@ class RunningNode(Protocol):
         """Ask it to end (SIGTERM)."""
 
     def kill(self) -> None: ...
+
+    def threads(self) -> ProcessThreads:
+        """Where its threads stand in Python; empty if that cannot be read."""
 
 
 class Launcher(Protocol):

@@ -16,10 +16,7 @@ def beat(node):
         node.set_user_data("beating")
         node.get_logger().info("running")
 """
-# In a plugin: keeps Python's global lock for ever, in a system call that no signal interrupts.
-KEEP_THE_GIL = (
-    "[ctypes.PyDLL(None).pthread_mutex_lock(x) for x in 2 * [ctypes.create_string_buffer(64)]]"
-)
+KEEP_THE_GIL = "ctypes.PyDLL(None).sleep(60)"  # Python's global lock
 
 
 def dead_shared_memory(since_s: float) -> list[str]:

@@ -188,6 +188,15 @@ def launch(
         return running.finish(timeout_s)
 
 
+def killed_in_a_hook(running: Running, timeout_s: float) -> Finished:
+    """A run of ``neuros/testing/projects/stuck``, after Ctrl+C twice."""
+    running.wait_for("[reader]: computing", timeout_s)
+    running.signal(signal.SIGINT)
+    running.wait_for("a second one kills at once")
+    running.signal(signal.SIGINT)
+    return running.finish(timeout_s)
+
+
 def _run_folders(cwd: Path) -> set[Path]:
     """Folders below ``cwd`` that are run folders."""
     return {

@@ -26,6 +26,7 @@ from neuros.backends.node_command import (
 from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
+from neuros.stacks import ProcessThreads, threads_of
 
 
 class Processes(BackEnd):
@@ -185,6 +186,10 @@ class RunningProcess:
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
+
+    def threads(self) -> ProcessThreads:
+        """Where its threads stand in Python."""
+        return threads_of(self.pid)
 
 
 def end_now(processes: Sequence[RunningProcess]) -> None:

@@ -47,12 +47,14 @@ from neuros.control.machines import (
     Placed,
     Prepare,
     Prepared,
+    ReadThreads,
     Ready,
     Refused,
     Remark,
     SignalNode,
     Start,
     Started,
+    ThreadsRead,
     Took,
     Tree,
 )
@@ -60,6 +62,7 @@ from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError
 from neuros.ports import NodeProgram
 from neuros.project.split import node_file_text, node_files_from_json
+from neuros.stacks import ProcessThreads
 from neuros.transport.dds_profile import as_asked
 
 if TYPE_CHECKING:
@@ -166,6 +169,8 @@ class Agent:
                     self._start(message)
                 case SignalNode(node, name):
                     self._signal(node, name)
+                case ReadThreads(node):
+                    self._read_threads(node)
                 case Took(size):
                     self._in_flight_bytes -= size
                 case Examine():
@@ -298,6 +303,11 @@ class Agent:
         process = self._processes.get(node)
         if process is not None:
             (process.kill if name == "KILL" else process.terminate)()
+
+    def _read_threads(self, node: str) -> None:
+        process = self._processes.get(node)
+        read = ProcessThreads() if process is None else process.threads()
+        self._pump.send(ThreadsRead(node, read))
 
     def _look(self) -> bool:
         """Send what has come since; returns whether that was anything."""

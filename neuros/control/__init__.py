@@ -117,9 +117,10 @@ class Message:
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """A node process is up."""
+    """A node process is up; ``plugins``: the file of each node's plugin, as it sees it."""
 
     nodes: tuple[str, ...]
+    plugins: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neuros.control import Message
+from neuros.stacks import ProcessThreads
 
 # ---------------------------------------------------------------------- both ways
 
@@ -135,6 +136,13 @@ class SignalNode(Message):
 
 
 @dataclass(frozen=True)
+class ReadThreads(Message):
+    """Read where the threads of a node's process stand."""
+
+    node: str
+
+
+@dataclass(frozen=True)
 class Took(Message):
     """So many bytes of :class:`Chunk` have been written."""
 
@@ -223,6 +231,14 @@ class NodeEnded(Message):
 
 
 @dataclass(frozen=True)
+class ThreadsRead(Message):
+    """Where the threads of a node's process stand."""
+
+    node: str
+    read: ProcessThreads
+
+
+@dataclass(frozen=True)
 class Chunk(Message):
     """Bytes of a file of the run folder, in base64, at the offset at which it is to end before."""
 
@@ -249,10 +265,10 @@ class Finished(Message):
 BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)
 TO_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
-    *(Place, Content, Prepare, Start, SignalNode, Took, Examine, Finish),
+    *(Place, Content, Prepare, Start, SignalNode, ReadThreads, Took, Examine, Finish),
 )
 FROM_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
     *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Chunk, Examined),
-    Finished,
+    *(ThreadsRead, Finished),
 )

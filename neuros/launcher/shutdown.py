@@ -142,6 +142,7 @@ class Shutdown:
     def _look_at_stopping(self, now_s: float) -> None:
         if now_s >= self._deadline_s:
             for process in self._processes:
+                self._detector.read_threads(process.names)
                 self._fail_to_end(process, now_s)
             self._kill_all()
         elif self._peers.exist and self._processes.have_reported():
@@ -191,16 +192,14 @@ class Shutdown:
         self.phase = Phase.KILLED
         self._deadline_s = time.monotonic() + STOP_S
         for process in self._processes:
-            first, stacks = process.names[0], self._outcome.stacks
+            read, stacks = self._detector.read_threads(process.names), self._outcome.stacks
             for name in process.names:
                 if stack := self._detector.stack_of(name):
                     stacks[name] = stack.text
                     text = f"{name} was at this point when it was killed"
                     self._output.log("ERROR", with_stack(text, stack))
-            if stacks.keys().isdisjoint(process.names) and (
-                text := self._detector.threads_of(first)
-            ):
-                stacks[first] = text
-                where = f"{names_of(process)} stood when killed, the most recent call first"
-                self._output.log("ERROR", f"where the threads of {where}:\n{text}")
+            if stacks.keys().isdisjoint(process.names) and read.threads:
+                stacks[process.names[0]] = str(read)
+                text = f"where the threads of {names_of(process)} stood when killed:\n{read}"
+                self._output.log("ERROR", text)
             self._processes.kill(process)

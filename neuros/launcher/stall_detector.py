@@ -6,13 +6,12 @@ Reports come once per second, so what is said here is up to a second late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from neuros.control import ExecutingHook, Report
 from neuros.project.model import Connection
-from neuros.stacks import LONG_S, Stack, held_stack, held_threads
+from neuros.stacks import LONG_S, ProcessThreads, Stack
 
 STALL_S = 5.0
 """After this long, nodes are asked why nothing moves."""
@@ -34,13 +33,20 @@ class StallDetector:
     Args:
         names: the nodes.
         now_s: the time now; all times are seconds on one monotonic clock.
-        run_folder: that of the run, with a folder for each node.
+        threads_of: reads where the threads of a node's process stand.
     """
 
-    def __init__(self, names: Sequence[str], now_s: float, run_folder: Path) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        now_s: float,
+        threads_of: Callable[[str], ProcessThreads] = lambda _: ProcessThreads(),
+    ) -> None:
         self._names = tuple(names)
-        self._run_folder = run_folder
-        self._first_of_process: dict[str, str] = {}  # by node
+        self._threads_of = threads_of
+        self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
+        self._plugins: dict[str, str] = {}
+        self._read: dict[str, ProcessThreads] = {}  # by node that does not report
         self._silent = set(names)
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
@@ -54,16 +60,18 @@ class StallDetector:
         self._starving: dict[str, tuple[str, float]] = {}  # by node, what it lacks, since when
         self._named_as_starving: set[tuple[str, str]] = set()
 
-    def greet(self, names: Sequence[str]) -> None:
-        """These nodes' process is there."""
+    def greet(self, names: Sequence[str], plugins: Mapping[str, str]) -> None:
+        """These nodes' process is there, with these files of plugins."""
         self._silent.difference_update(names)
-        self._first_of_process.update(dict.fromkeys(names, names[0]))
+        self._processes.update(dict.fromkeys(names, tuple(names)))
+        self._plugins.update(plugins)
 
     def report(self, report: Report, now_s: float) -> None:
         """Take a report."""
         name, metrics = report.node, report.metrics
         self._reports[name] = report
         self._heard_s[name] = now_s
+        self._read.pop(name, None)
         self._named_as_mute.discard(name)
         if name in self._named_as_held:
             self._named_as_held.remove(name)
@@ -117,9 +125,8 @@ class StallDetector:
     def is_held_up(self, name: str, now_s: float) -> bool:
         """Whether a node cannot take in packets, which is said otherwise: a hook executes in its
         process, or it does not report."""
-        folder = self._folder(name)
-        executing = (self._folder(other) for other in self._reports if self._executing(other))
-        return folder in executing or self.silent_s(name, now_s) >= SILENT_S
+        others = [other for other in self._together(name) if other in self._reports]
+        return any(map(self._executing, others)) or self.silent_s(name, now_s) >= SILENT_S
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
@@ -179,30 +186,33 @@ class StallDetector:
             if now_s - heard_s < LONG_S or name in self._named_as_mute or name in without:
                 continue
             self._named_as_mute.add(name)
-            held = held_stack(self._folder(name))
-            if held is None:
-                yield (
-                    "WARN",
-                    f"{name} has not reported for {LONG_S:g} s{self.last_seen(name)}: its process"
-                    " is stopped, or a library holds Python's global lock",
-                )
-            elif held.node == name and not self._is_named(name):
+            read = self._read.get(name) or self.read_threads(self._together(name))
+            holder, stack = read.lock_holder, read.stack(self._plugins)
+            silence = f"{name} has not reported for {LONG_S:g} s"
+            if holder is None or read.is_stopped:
+                yield "WARN", f"{silence}{self.last_seen(name)}: its process {_why_silent(read)}"
+            elif stack is None or not holder.is_main:
+                yield "WARN", f"{silence}{self.last_seen(name)}: {holder}"
+            elif stack.node == name and not self._is_named(name):
                 self._named_as_held.add(name)
                 text = (
-                    f"{name} has been executing '{held.hook}' for {LONG_S:g} s, and cannot report:"
+                    f"{name} has been executing '{stack.hook}' for {LONG_S:g} s, and cannot report:"
                     " a library holds Python's global lock"
                 )
-                yield "WARN", with_stack(text, held)
+                yield "WARN", with_stack(text, stack)
+
+    def read_threads(self, names: Sequence[str]) -> ProcessThreads:
+        """Where the threads of the process with these nodes stand, which do not report."""
+        read = self._threads_of(names[0])
+        self._read.update(dict.fromkeys(names, read))
+        return read
 
     def stack_of(self, name: str) -> Stack | None:
         """The stack of a node in its plugin, as far as is known."""
-        if held := self._held(name):
-            return held
-        return self._reports[name].stack if name in self._reports else None
-
-    def threads_of(self, name: str) -> str:
-        """The threads of a node's process if that has not reported for seconds."""
-        return held_threads(self._folder(name))
+        read = self._read.get(name)
+        if read is None or not read.threads:
+            return self._reports[name].stack if name in self._reports else None
+        return _of(name, read.stack(self._plugins))
 
     def silent_s(self, name: str, now_s: float) -> float:
         """For how long a node has not reported."""
@@ -213,22 +223,18 @@ class StallDetector:
         hook = self._executing(name) if name in self._reports else None
         if hook is not None:
             return hook["name"]
-        held = self._held(name)
-        return held.hook if held else ""
+        read = self._read.get(name)
+        stack = _of(name, read.hook_stack(self._plugins)) if read else None
+        return stack.hook if stack else ""
 
     def last_seen(self, name: str) -> str:
         """The hook of a node at its last report: ``", last seen executing 'step'"``."""
         hook = self.executing(name)
         return f", last seen executing '{hook}'" if hook else ""
 
-    def _folder(self, name: str) -> Path:
-        """The folder with the stack file of a node's process."""
-        return self._run_folder / self._first_of_process.get(name, name)
-
-    def _held(self, name: str) -> Stack | None:
-        """The stack of a node that holds Python's global lock."""
-        held = held_stack(self._folder(name))
-        return held if held is not None and held.node == name else None
+    def _together(self, name: str) -> tuple[str, ...]:
+        """The nodes of its process."""
+        return self._processes.get(name, (name,))
 
     def _is_named(self, name: str) -> bool:
         """Whether the hook that a node was executing when it reported last has been named."""
@@ -262,6 +268,19 @@ def _lacks(report: Report) -> str:
     ways = [key.removesuffix(end) for key in received]
     sources = [f"topic {way}" if way[0] == "/" else way.partition(".")[0] for way in ways]
     return f"`{port}` from {' or '.join(dict.fromkeys(sources))}"
+
+
+def _of(name: str, stack: Stack | None) -> Stack | None:
+    """A stack if it is one of this node."""
+    return stack if stack is not None and stack.node == name else None
+
+
+def _why_silent(read: ProcessThreads) -> str:
+    if read.is_stopped:
+        return "is stopped"
+    if read.threads:
+        return "gets no processor time"
+    return "is stopped, or a library holds Python's global lock"
 
 
 def with_stack(text: str, stack: Stack | None) -> str:

@@ -31,7 +31,6 @@ from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
-from neuros.stacks import remove_stack_files
 
 # How often there is a look at clocks and logs: everything else wakes the supervisor by itself.
 _TICK_S = 0.02
@@ -90,7 +89,6 @@ class Supervisor:
         on_stop: Callable[[], object] = lambda: None,
     ) -> None:
         self._files = files
-        self._run_folder = run_folder
         self._launcher = launcher
         self._environment = {**environment, control.CONTROL_VARIABLE: listener.address}
         self._output = output = Overheard(output, lambda message: self.observers.tell(message))
@@ -103,7 +101,9 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
-        self._detector = StallDetector(names, time.monotonic(), run_folder)
+        self._detector = StallDetector(
+            names, time.monotonic(), lambda name: self._processes.threads_of(name)
+        )
         self._processes = Processes(self._detector, self.outcome)
         self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
@@ -161,7 +161,6 @@ class Supervisor:
             self._hear()
             self.observers.part(self.outcome)
             self._channels.close()
-            remove_stack_files([self._run_folder / file.node.name for file in self._files])
             self.outcome.elsewhere = self._peers.counters()
             self.outcome.ended_s = time.monotonic()
         return self.outcome
@@ -196,8 +195,8 @@ class Supervisor:
         match message:
             case Report():
                 self._on_report(message)
-            case control.Hello(nodes):
-                self._on_hello(link, nodes)
+            case control.Hello():
+                self._on_hello(link, message)
             case control.Hooks():
                 self._declarations.take(message)
             case control.Finalising(node, hook):
@@ -228,8 +227,8 @@ class Supervisor:
             case _:
                 self.observers.take(link, message)
 
-    def _on_hello(self, link: ControlLink, nodes: Sequence[str]) -> None:
-        self._detector.greet(nodes)
+    def _on_hello(self, link: ControlLink, hello: control.Hello) -> None:
+        self._detector.greet(hello.nodes, hello.plugins)
         if self._peers.exist:
             self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:

@@ -30,7 +30,7 @@ from neuros.node.reports import declared
 from neuros.node.stepping import SessionSteps
 from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder, Voice
 from neuros.project.model import Connection, NodeFile
-from neuros.stacks import StackFile
+from neuros.stacks import allow_reading
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
@@ -87,7 +87,6 @@ class NodeProcess:
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
-        self._stack_file: StackFile | None = None
         self._peers = PeerLink(
             [file.node.name for file in files], os.environ.get(ELSEWHERE_VARIABLE, ""), self._tell
         )
@@ -97,10 +96,9 @@ class NodeProcess:
         run_folder = self._files[0].folders.run
         os.chdir(run_folder)
         self._link = ControlLink(self._connect(), TO_NODES, "the supervisor")
-        own_folder = run_folder / self._files[0].node.name
-        plugins = {file.node.name: file.node.plugin for file in self._files}
-        self._stack_file = StackFile(own_folder, plugins)
-        self._tell(control.Hello(tuple(plugins)))
+        allow_reading()
+        plugins = {file.node.name: str(file.node.plugin) for file in self._files}
+        self._tell(control.Hello(tuple(plugins), plugins))
         with signals_as_socket() as signalled:
             thread = ControlThread(self._link, signalled, self, self._steps)
             thread.start()
@@ -112,7 +110,6 @@ class NodeProcess:
             if self._middleware is not None:
                 self._guard(self._middleware.close)
             thread.end()
-            self._stack_file.leave()
         return 1 if self._has_failed else 0
 
     # ------------------------------------------------------------------ called by the supervisor
@@ -184,8 +181,6 @@ class NodeProcess:
 
     def report(self, *, is_final: bool = False) -> None:
         """Report state and counters of all nodes. Any thread."""
-        if self._stack_file is not None:
-            self._stack_file.renew()
         for node in tuple(self._nodes):
             node.reports.write_logs()
             self._tell(node.reports.report(is_final=is_final))

@@ -322,6 +322,17 @@ class BackEndChecks:
         assert launched.exit_code == code, launched.output
         assert all(node["report"] == "final" for node in launched.record["nodes"].values())
 
+    def test_of_a_node_that_is_killed_it_is_said_where_it_stood(self, tmp_path: Path) -> None:
+        process = self.start("stuck", tmp_path / "run")
+        self._await_packets(tmp_path / "run", process)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        assert any("a second one kills at once" in line for line in process.stdout)
+        process.send_signal(signal.SIGINT)
+        launched = finish(process, tmp_path / "run")
+        assert launched.exit_code == 130, launched.output
+        assert "in compute" in launched.record["nodes"]["reader"]["stack"], launched.output
+
     def test_nothing_is_left_of_a_run_whose_launcher_was_killed(self, tmp_path: Path) -> None:
         folder = tmp_path / "run"
         process = self.start("time", folder)

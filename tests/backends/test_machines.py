@@ -22,7 +22,6 @@ from neuros.control.link import encode
 from neuros.control.machines import FROM_AGENT, TO_AGENT, Chunk, NodeEnded, Pong, Tree
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
-from neuros.stacks import FILE_NAME as STACK
 
 _SOON_S = 30.0
 
@@ -216,11 +215,11 @@ class TestMirror:
 
     def test_a_file_that_is_cut_off_is_cut_off_here(self, there: Path, tmp_path: Path) -> None:
         here, follower = tmp_path / "here", Follower(there, ["eye"], "robot", ())
-        stack = there / "eye" / STACK
-        for text in ("head\nTimeout!\n", "head\n", "head\nTimeout again!\n"):
-            stack.write_text(text)
+        log = there / "eye/node.log"
+        for text in ("one\ntwo\n", "one\n", "one\nand two\n"):
+            log.write_text(text)
             self.write(follower.grown("eye"), here)
-            assert (here / "eye" / STACK).read_text() == text
+            assert (here / "eye/node.log").read_text() == text
 
     def test_in_the_end_everything_else_comes_and_what_was_given_does_not(
         self, there: Path, tmp_path: Path

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from launching import Finished, Running, launch, start
+from launching import Finished, Running, killed_in_a_hook, launch, start
 
 from neuros.backends.machines.files import scan
 from neuros.backends.machines.machine import Machine, agent_command
@@ -22,6 +22,7 @@ from neuros.control.link import encode
 from neuros.control.machines import Lacking
 from neuros.errors import EnvironmentFault
 from neuros.project.deployment import Host
+from neuros.testing.back_ends import PROJECTS
 
 STREAM = Path(__file__).parent / "network" / "stream"
 NEUROS = Path(sys.executable).with_name("neuros")
@@ -82,6 +83,15 @@ def test_one_command_starts_nodes_elsewhere_and_brings_home_all_they_leave(
     assert finished.connection(CONNECTION)["latency_ms"]["p50"] > 0
     assert left_there(tmp_path) == []
     assert len(trees_there(tmp_path)) == 1
+
+
+def test_it_is_said_where_a_node_elsewhere_stood_that_is_killed(tmp_path: Path) -> None:
+    file = str(deployment(tmp_path, nodes={"reader": "other"}))
+    with start(PROJECTS / "stuck", "--deployment", file, cwd=tmp_path) as running:
+        finished = killed_in_a_hook(running, ENDED_S)
+    assert "in compute" in finished.record["nodes"]["reader"]["stack"], finished.output
+    assert f'File "{PROJECTS}/stuck/reader.py"' in finished.output
+    assert left_there(tmp_path) == []
 
 
 def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(

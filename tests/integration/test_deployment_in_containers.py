@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 from docker import DockerClient
-from launching import Running, launch, start
+from launching import Running, killed_in_a_hook, launch, start
 
 from containers import connected, require_containers, wait_until
 from neuros.backends.docker.remote import AGENT_LABEL
+from neuros.testing.back_ends import PROJECTS
 
 HERE = Path(__file__).parent
 STREAM = HERE / "network" / "stream"
@@ -90,6 +91,14 @@ def test_nodes_run_in_containers_of_their_own(engine: DockerClient, tmp_path: Pa
     }
     assert machines["box-sink"]["container"]["image"].startswith("neuros_python:")
     wait_until(lambda: not containers_of(engine, "source") + containers_of(engine, "sink"))
+
+
+def test_it_is_said_where_a_node_stood_that_is_killed(engine: DockerClient, tmp_path: Path) -> None:
+    file = deployment(tmp_path, {"reader": "box"})
+    with start(PROJECTS / "stuck", "--deployment", file, cwd=tmp_path) as running:
+        finished = killed_in_a_hook(running, UP_S)
+    assert "in compute" in finished.record["nodes"]["reader"]["stack"], finished.output
+    wait_until(lambda: not containers_of(engine, "reader"))
 
 
 def test_messages_of_the_project_come_along(engine: DockerClient, tmp_path: Path) -> None:

@@ -35,6 +35,17 @@ def hold(node):
 def deep():
     {KEEP_THE_GIL}
 """
+HOLDS_ASIDE = f"""
+import threading
+@neuros_tick(seconds=0.05)
+def beat(node):
+    if not node.get_user_data():
+        node.set_user_data(True)
+        threading.Thread(target=work, daemon=True).start()
+def work():
+    time.sleep(0.3)
+    {KEEP_THE_GIL}
+"""
 HANGS = """
 @neuros_finalise()
 def close(node):
@@ -46,7 +57,10 @@ def close(node):
 def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood(
     bench: Bench,
 ) -> None:
-    file = bench.project("gil.o -> good.x", gil=HOLDS, hangs=RUNS + HANGS, good=SINK)
+    plugins = {"gil": HOLDS, "hangs": RUNS + HANGS, "good": SINK}
+    if bench.back_end == "process":
+        plugins["aside"] = HOLDS_ASIDE
+    file = bench.project("gil.o -> good.x", **plugins)
     budgets = {"lost_packets": {"gil.o -> good.x": 0}}
     file.write_text(json.dumps({**json.loads(file.read_text()), "budgets": budgets}))
     finished = bench.launch()
@@ -67,7 +81,7 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
         assert "hangs was at this point when it was killed:\n" in finished.output
         assert "in close\n" in finished.record["nodes"]["hangs"]["stack"]
         assert bench.saved("good", "hangs")
-    assert not list(bench.folder.rglob(".stack"))
+        assert "in work\n" in finished.record["nodes"]["aside"]["stack"]
 
 
 def test_so_is_one_whose_finalise_hook_hangs_though_all_else_went_well(tmp_path: Path) -> None:

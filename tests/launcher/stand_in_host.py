@@ -38,9 +38,9 @@ class Host:
             name, _, port = self.place.partition(":")
             end.connect((name, int(port)))
 
-    def hello(self) -> None:
+    def hello(self, **fields: Any) -> None:
         self.connect(self.socket)
-        self.send("hello", nodes=NAMES)
+        self.send("hello", nodes=NAMES, **fields)
 
     def send(self, kind: str, **fields: Any) -> None:
         self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
@@ -63,9 +63,9 @@ class Host:
             metrics = {"hooks": {}, "executing": None, "state": {"state": "idle", "cause": ""}}
             self.send(kind, **{"node": name, "metrics": metrics | self.connections, **fields})
 
-    def up(self) -> None:
+    def up(self, **fields: Any) -> None:
         """Hello, loaded, and the first hook has begun."""
-        self.hello()
+        self.hello(**fields)
         self.report()
         self.tell("first_hook")
         for name in NAMES:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from neuros.control import Report
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.project.model import Connection
+from neuros.stacks import ProcessThreads, Stack, Thread
 
 
 def report(
@@ -42,8 +44,8 @@ def executing(for_s: float, executions: int = 7) -> dict[str, Any]:
 
 def detector_of(*names: str) -> StallDetector:
     """A detector from second 0 on, whose nodes have all been loaded."""
-    detector = StallDetector(names, 0.0, Path("nowhere"))
-    detector.greet(names)
+    detector = StallDetector(names, 0.0)
+    detector.greet(names, {})
     for name in names:
         detector.report(report(name), 0.0)
     return detector
@@ -130,11 +132,11 @@ def test_nothing_rests_while_a_hook_executes() -> None:
 
 
 def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> None:
-    detector = StallDetector(["a", "b"], 0.0, Path("nowhere"))
-    detector.greet(["a"])
+    detector = StallDetector(["a", "b"], 0.0)
+    detector.greet(["a"], {})
     detector.report(report("a"), 0.0)
     assert not detector.has_just_stalled(9.0), "b has not come yet"
-    detector.greet(["b"])
+    detector.greet(["b"], {})
     detector.report(LOADING, 9.0)
     assert not detector.has_just_stalled(15.0), "b is importing its plugin"
     detector.report(report("b", waiting_for=("c.o -> b.x",)), 15.0)
@@ -177,8 +179,8 @@ def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
 
 
 def test_nodes_that_start_slowly_are_named() -> None:
-    detector = StallDetector(["a", "b", "c"], 0.0, Path("nowhere"))
-    detector.greet(["b", "c"])
+    detector = StallDetector(["a", "b", "c"], 0.0)
+    detector.greet(["b", "c"], {})
     detector.report(LOADING, 4.0)
     detector.report(
         report(
@@ -218,6 +220,69 @@ def test_a_node_that_does_not_report_is_named_once() -> None:
     detector.report(report("a"), 8.0)
     (text,) = remarks(detector, 13.0)
     assert text.startswith("a has not reported for 5 s: ")
+
+
+IN_HOOK = (("/lib/engine.py", 7, "run"), ("/a.py", 3, "step"), ("/lib/solver.py", 9, "solve"))
+MAIN = Thread("MainThread", is_main=True, has_lock=False, frames=IN_HOOK)
+WORKER = Thread("worker", is_main=False, has_lock=True, frames=(("/a.py", 20, "work"),))
+HELD = ProcessThreads((replace(MAIN, has_lock=True),))
+STACK = '  File "/a.py", line 3, in step\n  File "/lib/solver.py", line 9, in solve'
+
+
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [
+        (
+            HELD,
+            "a has been executing 'step' for 5 s, and cannot report:"
+            f" a library holds Python's global lock:\n{STACK}",
+        ),
+        (
+            ProcessThreads((MAIN, WORKER)),
+            "a has not reported for 5 s, last seen executing 'step':"
+            ' worker holds Python\'s global lock:\n  File "/a.py", line 20, in work',
+        ),
+        (
+            replace(HELD, is_stopped=True),
+            "a has not reported for 5 s, last seen executing 'step': its process is stopped",
+        ),
+        (ProcessThreads((MAIN,)), "last seen executing 'step': its process gets no processor time"),
+        (
+            ProcessThreads(),
+            "a has not reported for 5 s:"
+            " its process is stopped, or a library holds Python's global lock",
+        ),
+    ],
+    ids=["in a hook", "in a thread", "stopped", "late", "not to be read"],
+)
+def test_of_a_node_that_does_not_report_it_is_read_why(read: ProcessThreads, said: str) -> None:
+    asked: list[str] = []
+
+    def threads_of(name: str) -> ProcessThreads:
+        asked.append(name)
+        return read
+
+    detector = StallDetector(["b", "a"], 0.0, threads_of)
+    detector.greet(["b", "a"], {"b": "/b.py", "a": "/a.py"})
+    detector.report(report("b"), 0.0)
+    detector.report(report("a"), 0.0)
+    assert any(text.endswith(said) for text in remarks(detector, 5.0))
+    assert asked == ["b"], "both are in one process, which is read once"
+    detector.report(report("a"), 6.0)
+    assert detector.executing("a") == "", "what was read has passed"
+
+
+def test_what_was_read_goes_before_what_was_told_last() -> None:
+    read = [HELD]
+    detector = StallDetector(["a"], 0.0, lambda _: read[0])
+    detector.greet(["a"], {"a": "/a.py"})
+    detector.report(replace(report("a"), stack=Stack("a", "before", "told")), 0.0)
+    assert detector.stack_of("a") == Stack("a", "before", "told")
+    detector.read_threads(["a"])
+    assert detector.stack_of("a") == Stack("a", "step", STACK)
+    read[0] = ProcessThreads()
+    detector.read_threads(["a"])
+    assert detector.stack_of("a") == Stack("a", "before", "told"), "it could not be read"
 
 
 # ------------------------------------------------------------------ packets that wait
@@ -283,8 +348,8 @@ def test_packets_that_are_not_taken_in_are_said_too() -> None:
 
 
 def test_a_node_that_can_take_in_nothing_has_not_fallen_behind() -> None:
-    detector = StallDetector(["camera", "brain"], 0.0, Path("nowhere"))
-    detector.greet(["camera", "brain"])
+    detector = StallDetector(["camera", "brain"], 0.0)
+    detector.greet(["camera", "brain"], {})
     backlog = Backlog([CONNECTION], detector.is_held_up)
     for second in range(7):
         backlog.report(counted(sent=3), float(second))

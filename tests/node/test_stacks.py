@@ -1,11 +1,12 @@
-"""Where a node stands in its plugin, told by itself, and by a thread in C while it cannot."""
+"""Where a node stands in its plugin: told by itself, and read from outside while it cannot."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import signal
 import subprocess
 import sys
-import textwrap
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from containers import wait_until
-from neuros.stacks import FILE_NAME, held_stack, remove_stack_files, stack_in
+from neuros.stacks import ProcessThreads, stack_in, threads_of
 
 PLUGIN = """\
 import ctypes, threading
@@ -26,53 +27,91 @@ def deep(wait):
     wait()
 def hold():
     ctypes.PyDLL(None).sleep(60)
+def hold_elsewhere():
+    thread = threading.Thread(target=hold, name="worker")
+    thread.start()
+    thread.join()
 """
-HOLDS = """
-import importlib.util, pathlib, sys
-from neuros import stacks
-stacks.HELD_S = 0.2
-plugin = pathlib.Path(sys.argv[1])
-spec = importlib.util.spec_from_file_location("plugin", plugin)
+CALLS = """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("plugin", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-stacks.StackFile(plugin.parent, {"other": plugin.parent / "other.py", "a": plugin}).renew()
-module.hook(module.hold)
+module.hook(getattr(module, sys.argv[2]))
 """
 
 
 @pytest.fixture
 def plugin(tmp_path: Path) -> Path:
-    """Its name has a letter that faulthandler spells out."""
     (tmp_path / "plugin_\u00fc.py").write_text(PLUGIN)
     return tmp_path / "plugin_\u00fc.py"
 
 
 @contextmanager
-def held(plugin: Path) -> Iterator[None]:
-    """A process whose plugin holds the global lock."""
-    process = subprocess.Popen([sys.executable, "-c", HOLDS, plugin], stdout=subprocess.PIPE)
+def in_hook(plugin: Path, function: str) -> Iterator[int]:
+    """The id of a process whose hook calls one of the functions."""
+    command = [sys.executable, "-c", CALLS, plugin, function]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert process.stdout is not None
     try:
         assert process.stdout.readline() == b"running\n"
-        yield
+        yield process.pid
     finally:
         process.kill()
         process.wait()
         process.stdout.close()
 
 
-def test_it_is_known_while_the_plugin_holds_the_global_lock(plugin: Path) -> None:
-    with held(plugin):
-        wait_until(lambda: held_stack(plugin.parent), 20.0)
-        stack = held_stack(plugin.parent)
+def lines_of(text: str) -> list[str]:
+    """Line and function of each call."""
+    frames = [line for line in text.splitlines() if line.startswith("  File")]
+    return [frame.partition(", ")[2] for frame in frames]
+
+
+def test_it_is_read_while_the_plugin_holds_the_global_lock(plugin: Path) -> None:
+    plugins = {"other": str(plugin.parent / "other.py"), "a": str(plugin)}
+    with in_hook(plugin, "hold") as pid:
+        wait_until(lambda: "in hold" in str(threads_of(pid)), 20.0)
+        read = threads_of(pid)
+    assert not read.is_stopped
+    assert read.lock_holder is not None
+    assert read.lock_holder.is_main
+    stack = read.stack(plugins)
     assert stack is not None
+    assert stack == read.hook_stack(plugins)
     assert (stack.node, stack.hook) == ("a", "hook")
-    lines = [line for line in stack.text.splitlines() if line.startswith("  File")]
-    assert [line.split(", ")[1:] for line in lines] == [
-        ["line 4", "in hook"],
-        ["line 6", "in deep"],
-        ["line 8", "in hold"],
-    ]
+    assert lines_of(stack.text) == ["line 4, in hook", "line 6, in deep", "line 8, in hold"]
+
+
+def test_so_is_that_of_a_thread_of_the_plugin_that_holds_it(plugin: Path) -> None:
+    plugins = {"a": str(plugin)}
+    with in_hook(plugin, "hold_elsewhere") as pid:
+        wait_until(lambda: "in hold\n" in str(threads_of(pid)), 20.0)
+        read = threads_of(pid)
+    holder, stack, hook = read.lock_holder, read.stack(plugins), read.hook_stack(plugins)
+    assert holder is not None
+    assert holder.name.startswith("worker")
+    assert stack is not None
+    assert hook is not None
+    assert lines_of(stack.text) == ["line 8, in hold"]
+    assert lines_of(hook.text)[:2] == ["line 4, in hook", "line 6, in deep"]
+    first, *_ = str(read).splitlines()
+    assert first == "MainThread:"
+    assert "worker holds Python's global lock:\n" in str(read)
+
+
+def test_a_process_that_was_stopped_is_read_too(plugin: Path) -> None:
+    with in_hook(plugin, "hold") as pid:
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: threads_of(pid).is_stopped, 20.0)
+        assert "in deep" in str(threads_of(pid))
+
+
+def test_of_what_is_no_python_program_or_not_there_nothing_is_read() -> None:
+    with subprocess.Popen(["sleep", "60"]) as process:
+        assert threads_of(process.pid) == ProcessThreads()
+        process.kill()
+    assert threads_of(process.pid) == ProcessThreads()
 
 
 def test_a_node_that_reports_tells_it_of_its_main_thread(plugin: Path) -> None:
@@ -97,49 +136,23 @@ def test_a_node_that_reports_tells_it_of_its_main_thread(plugin: Path) -> None:
     assert found[1] is None, "it is in no plugin now"
 
 
-def test_a_file_of_one_that_reports_says_nothing(tmp_path: Path) -> None:
-    found = run(
-        """
-        file = stacks.StackFile(folder, {"a": folder / "a.py"})
-        with open(folder / stacks.FILE_NAME, "a") as more:
-            more.write("Stack (most recent call first):\\n")
-            more.write(f'  File "{folder}/a.py", line 3 in f\\n')
-        print(stacks.held_stack(folder).hook)
-        file.renew()
-        print(stacks.held_stack(folder))
-        """,
-        tmp_path,
-    )
-    assert (found.returncode, found.stdout) == (0, "f\nNone\n")
-    remove_stack_files([tmp_path, tmp_path / "nowhere"])
-    assert held_stack(tmp_path) is None
-    assert not (tmp_path / FILE_NAME).exists()
-
-
-def test_a_process_that_was_only_late_goes_on_unharmed(tmp_path: Path) -> None:
-    """As after a standstill of the machine: the stack is written while other threads go on."""
-    found = run(
-        """
-        stacks.HELD_S = 0.005
-        def late():
-            until_s = time.monotonic() + 2.0
-            while time.monotonic() < until_s:
-                exec("def deep(n):\\n return n and [deep(n - 1)]\\ndeep(20)", {})
-        stacks.StackFile(folder, {}).renew()
-        thread = threading.Thread(target=late)
-        thread.start()
-        thread.join()
-        print((folder / stacks.FILE_NAME).read_text().count("in join"))
-        """,
-        tmp_path,
-    )
-    assert found.returncode == 0, "it was killed by a signal"
-    assert int(found.stdout) > 20
-
-
-def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """A program in a process of its own."""
-    head = "import sys, threading, time\nfrom pathlib import Path\nfrom neuros import stacks\n"
-    head += "folder = Path(sys.argv[1])\n"
-    command = [sys.executable, "-c", head + textwrap.dedent(program), folder]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+def test_a_busy_process_is_read_many_times_and_goes_on_unharmed() -> None:
+    """As after a standstill of the machine: it goes on while its threads are read."""
+    busy = """
+import threading
+def go_on():
+    while True:
+        exec("def deep(n):\\n return n and [deep(n - 1)]\\ndeep(20)", {})
+print("running", flush=True)
+threading.Thread(target=go_on).start()
+go_on()
+"""
+    with subprocess.Popen([sys.executable, "-c", busy], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == b"running\n"
+            texts = [str(threads_of(process.pid)) for _ in range(100)]
+            assert process.poll() is None
+        finally:
+            process.kill()
+    assert sum("in go_on" in text for text in texts) > 50

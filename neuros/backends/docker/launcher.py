@@ -48,13 +48,14 @@ from neuros.backends.node_command import (
     script_failure,
     signal_in_words,
 )
-from neuros.backends.run_processes import RUN_ID, RunProcesses
+from neuros.backends.run_processes import RUN_ID, RunProcesses, started_at
 from neuros.backends.shared_memory import hold
 from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault, results_of
 from neuros.ports import Deployment, NodeProgram, Notice, Reaper
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, memory_text
+from neuros.stacks import ProcessThreads, threads_of
 
 TOOL_IMAGE = "neuros_tools"
 _STOP_S = 2
@@ -270,7 +271,7 @@ class RunningContainer:
             words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
             is_stopped = self._events.is_signalled(self.id) and not self._is_told
             return f"{words}: {_STOPPED}" if is_stopped else words
-        if self._events.lost and not self._events.has_processes(self._file.node.name):
+        if self._events.lost and not self._events.pids(self._file.node.name):
             return f"the Docker engine went away ({self._events.lost}): start it again"
         return None
 
@@ -283,6 +284,11 @@ class RunningContainer:
 
     def kill(self) -> None:
         self._signal(signal.SIGKILL)
+
+    def threads(self) -> ProcessThreads:
+        """Where its threads stand in Python; the first of its processes may be an init program."""
+        read = map(threads_of, self._events.pids(self._file.node.name))
+        return next(filter(lambda each: each.threads, read), ProcessThreads())
 
     def _signal(self, number: signal.Signals) -> None:
         self._is_told = True
@@ -394,16 +400,16 @@ class ContainerEvents(threading.Thread):
         fate = self._fates.get(container_id)
         return fate is not None and fate.is_signalled
 
-    def has_processes(self, node: str) -> bool:
-        """Whether processes of a node are there, as this machine sees it."""
-        return node in RunProcesses(self._run_id).nodes().values()
+    def pids(self, node: str | None = None) -> Sequence[int]:
+        """Of the processes of a node, or of all, as this machine sees them; the oldest first."""
+        found = RunProcesses(self._run_id).nodes()
+        return sorted((pid for pid in found if node in (None, found[pid])), key=_age)
 
     def signal_all(self, number: int, node: str | None = None) -> None:
         """Send a signal to the processes of the run, or of one node, without the engine."""
-        for pid, name in RunProcesses(self._run_id).nodes().items():
-            if node in (None, name):
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.kill(pid, number)
+        for pid in self.pids(node):
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, number)
 
     def _take(self, event: dict[str, Any]) -> None:
         actor = event["Actor"]
@@ -417,6 +423,10 @@ class ContainerEvents(threading.Thread):
             fate.exit_code = int(actor["Attributes"]["exitCode"])
         elif event["Action"] in ("destroy", "remove"):  # podman says remove
             fate.is_gone = True
+
+
+def _age(pid: int) -> int:
+    return started_at(pid) or 0
 
 
 def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:

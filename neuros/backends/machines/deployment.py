@@ -27,6 +27,7 @@ from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
 from neuros.project.deployment import DeploymentFile, Host
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_to_json, split, translated
+from neuros.stacks import ProcessThreads
 
 if TYPE_CHECKING:
     from neuros.backends.docker.remote import AgentContainer, RemoteEngine
@@ -325,6 +326,10 @@ class NodeElsewhere:
 
     def kill(self) -> None:
         self.side.machine.signal(self.name, "KILL")
+
+    def threads(self) -> ProcessThreads:
+        """Where its threads stand in Python."""
+        return self.side.machine.threads_of(self.name)
 
 
 def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:

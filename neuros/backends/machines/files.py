@@ -14,9 +14,9 @@ It gets *trees*: folders with files, known by their content.
 Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
 has been changed in a tree there is put right before it is used, and what has come to it is removed.
 
-What nodes write there appears in the run folder of the launcher. Logs, stack files and recorded
-packets do while they are written, so that the console, the stall detector and the recorder find
-them as ever; everything else once the nodes have ended.
+What nodes write there appears in the run folder of the launcher. Logs and recorded packets do while
+they are written, so that the console and the recorder find them as ever; everything else once the
+nodes have ended.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from pathlib import Path
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.control.machines import Chunk, Tree, TreeFile
 from neuros.errors import EnvironmentFault
-from neuros.stacks import FILE_NAME as STACK
 
 RECEIVED, RUNS = "received", "runs"
 """Folders of agents beside the trees, whose names end with a key."""
@@ -44,7 +43,7 @@ MACHINES = "machines"
 """The folder in a run folder with what belongs to no node: a folder for each machine."""
 
 _CHUNK_BYTES = 1 << 16
-_FOLLOWED = ("node.log", STACK)
+_LOG = "node.log"
 _SPOOL = "spool"
 _LEFT_OUT = frozenset({"__pycache__", "runs", "node_modules"})
 _RUN_FILE = "run.json"
@@ -228,8 +227,7 @@ class Follower:
     def grown(self, node: str) -> Iterator[Chunk]:
         """What has come to the logs and to the recorded packets of a node."""
         folder = self._run / node
-        for name in _FOLLOWED:
-            yield from self._news(folder / name)
+        yield from self._news(folder / _LOG)
         # One that has a successor does not grow any more, and is read to its end before that.
         with contextlib.suppress(OSError):
             for name in sorted(os.listdir(folder / _SPOOL)):
@@ -241,7 +239,6 @@ class Follower:
             for name in names:
                 path = Path(parent, name)
                 is_new = path.relative_to(self._run).as_posix() not in self._known
-                is_new = is_new and name != STACK
                 if is_new and path.is_file() and not path.is_symlink():
                     yield from self._news(path)
 

@@ -30,6 +30,7 @@ from neuros.errors import ControlError, EnvironmentFault
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 from neuros.project.model import Folders
+from neuros.stacks import ProcessThreads
 
 _SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 _CONNECT_S = 60.0
@@ -40,6 +41,7 @@ _COMMAND_NOT_FOUND = 127
 _ENDS_S = 5.0
 _PACKET_LOG = "packets"  # of a node, in its folder
 _EXITS_S = 0.5
+_READ_S = 0.5
 _SAID_LAST_BYTES = 2000
 
 Log = Callable[[str, str], None]
@@ -72,6 +74,7 @@ class Machine:
         self._control: Callable[[], ControlStream] | None = None
         self._run: Path | None = None
         self._ends: dict[str, str] = {}
+        self._threads: dict[str, ProcessThreads] = {}
         self.fault = ""
         self._is_closed = False
         self._answers: list[Message] = []
@@ -177,6 +180,16 @@ class Machine:
         """Send a signal to the process of a node."""
         self._pump.send(agent.SignalNode(node, name))
 
+    def threads_of(self, node: str) -> ProcessThreads:
+        """Where the threads of a node's process stand; empty if the machine is slow to say."""
+        with self._arrived:
+            self._threads.pop(node, None)
+        if not self.lost:
+            self._pump.send(agent.ReadThreads(node))
+        with self._arrived:
+            self._arrived.wait_for(lambda: node in self._threads or self.lost, _READ_S)
+            return self._threads.get(node, ProcessThreads())
+
     def end_of(self, node: str) -> str | None:
         """How the process of a node has ended, ``None`` while it runs."""
         if node in self._ends:
@@ -234,6 +247,10 @@ class Machine:
                 self._log(severity, f"{self.host.name}: {text}")
             case agent.NodeEnded(node, how):
                 self._ends[node] = how
+            case agent.ThreadsRead(node, read):
+                with self._arrived:
+                    self._threads[node] = read
+                    self._arrived.notify_all()
             case _:
                 if isinstance(message, agent.Finished):
                     self._pump.end()  # that it hangs up now is no fault

@@ -14,6 +14,7 @@ from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, RunningNode
 from neuros.project.model import Node, NodeFile, Project
+from neuros.stacks import ProcessThreads, threads_of
 
 
 class Nice(BackEnd):
@@ -102,6 +103,9 @@ class NiceNode:
 
     def terminate(self) -> None:
         self._child.terminate()
+
+    def threads(self) -> ProcessThreads:
+        return threads_of(self._child.pid)
 
     def kill(self) -> None:
         if self._child.poll() is None:
