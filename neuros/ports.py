@@ -230,11 +230,7 @@ class Middleware(Protocol):
 
 
 class TransportKind(ABC):
-    """A way to carry packets. Registered as an entry point of the group ``neuros.transports``.
-
-    Attributes:
-        name: that of the entry point, which a back end names.
-    """
+    """A way to carry packets: an entry point ``name`` of the group ``neuros.transports``."""
 
     name: str
 
