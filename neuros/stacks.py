@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -24,9 +25,14 @@ from typing import Any
 LONG_S = 5.0
 """A hook that runs for this long is named."""
 
+IMPORT = "<module>"
+"""What Python calls the function of a module that is imported, in stacks."""
+
 _READ_S = 2.0
+_MOST_FRAMES = 100  # shown, as by faulthandler
 _MAIN_THREAD = "MainThread"
 _PR_SET_PTRACER, _ANY = 0x59616D61, -1  # prctl(2), ptrace(2)
+_INIT = 1
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class Thread:
     Attributes:
         name: in Python.
         is_main: whether it is the one in which hooks run.
-        has_lock: whether it holds Python's global lock.
+        has_lock: whether it held Python's global lock when it was read.
         frames: file, line and function of each call, the most recent last.
     """
 
@@ -61,36 +67,36 @@ class Thread:
 
 @dataclass(frozen=True)
 class ProcessThreads:
-    """Where the threads of a process stand in Python; empty if that could not be read.
+    """Where the threads of a process stand in Python.
 
     Attributes:
         is_stopped: whether the process was stopped (SIGSTOP), so that none of them goes on.
+        problem: why they could not be read; empty if they could.
     """
 
     threads: tuple[Thread, ...] = ()
     is_stopped: bool = False
+    problem: str = ""
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.threads))
 
     @property
     def lock_holder(self) -> Thread | None:
-        """The thread that keeps the others from going on."""
+        """The thread that held Python's global lock."""
         return next((each for each in self.threads if each.has_lock), None)
 
-    def hook_stack(self, plugins: Mapping[str, str]) -> Stack | None:
-        """The stack of the main thread in one of these plugins (their files, by node)."""
-        main = next((each for each in self.threads if each.is_main), None)
-        return _from_plugin(plugins, main.frames) if main else None
-
-    def stack(self, plugins: Mapping[str, str]) -> Stack | None:
-        """The stack in a plugin of the thread that holds the lock, or else of the main thread."""
-        holder = self.lock_holder
-        return _from_plugin(plugins, holder.frames) if holder else self.hook_stack(plugins)
+    def hook_stack(self, node: str, plugin: str) -> Stack | None:
+        """The stack of the main thread in the plugin of a node, whose file this is."""
+        frames = next((each.frames for each in self.threads if each.is_main), ())
+        for place, (path, _, name) in enumerate(frames):
+            if path == plugin:
+                return Stack(node, name, _text(frames[place:]))
+        return None
 
 
 def threads_of(pid: int) -> ProcessThreads:
-    """Read where the threads of a process on this machine stand."""
+    """Read where the threads of a process on this machine stand; takes up to 2 s."""
     command = [_py_spy(), "dump", "--nonblocking", "--json", "--pid", str(pid)]
     try:
         done = subprocess.run(
@@ -98,36 +104,51 @@ def threads_of(pid: int) -> ProcessThreads:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_READ_S,
-            check=True,
+            check=False,
             start_new_session=True,  # Ctrl+C is not for it
         )
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").partition("\n")[0]
+            return ProcessThreads(problem=f"py-spy: {said.removeprefix('Error: ')}")
         threads = [_thread(each, pid) for each in json.loads(done.stdout)]
         with open(f"/proc/{pid}/stat", "rb") as file:
             state = file.read().rpartition(b") ")[2][:1]
-    except (OSError, subprocess.SubprocessError, ValueError):  # it may have ended meanwhile
-        return ProcessThreads()
+    except FileNotFoundError:
+        return ProcessThreads(problem="py-spy is not installed, or the process has ended")
+    except subprocess.TimeoutExpired:
+        return ProcessThreads(problem=f"py-spy did not answer within {_READ_S:g} s")
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        return ProcessThreads(problem=f"py-spy: {error}")
     threads.sort(key=lambda each: not each.is_main)
     return ProcessThreads(tuple(threads), state in (b"T", b"t"))
 
 
 def allow_reading() -> None:
-    """Let :func:`threads_of` read this process, where only its parents might (Yama)."""
+    """Let :func:`threads_of` read this process where Yama would allow it to ancestors only.
+
+    Then the process that has started this one may, and its children; in a container, where that is
+    not to be seen, any process of the same user.
+    """
+    parent = os.getppid()
+    reader = parent if parent > _INIT else _ANY
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PTRACER, ctypes.c_ulong(_ANY), 0, 0, 0)
+        ctypes.CDLL(None).prctl(_PR_SET_PTRACER, ctypes.c_ulong(reader), 0, 0, 0)
 
 
 def stack_in(node: str, plugin: Path) -> Stack | None:
     """The stack of the main thread in a plugin, ``None`` outside of it. Any other thread."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
-    if frame is None:
-        return None
-    frames = [(f.filename, f.lineno or 0, f.name) for f in traceback.extract_stack(frame)]
-    return _from_plugin({node: str(plugin)}, frames)
+    frames = traceback.extract_stack(frame) if frame else []
+    for place, each in enumerate(frames):
+        if each.filename == str(plugin):
+            text = "".join(traceback.format_list(frames[place:])).rstrip("\n")
+            return Stack(node, each.name, text)
+    return None
 
 
 @cache
 def _py_spy() -> str:
-    """The program, which the distribution of that name has installed somewhere."""
+    """The path of the program."""
     from importlib.metadata import PackageNotFoundError, files
 
     with contextlib.suppress(PackageNotFoundError):
@@ -145,16 +166,9 @@ def _thread(told: Mapping[str, Any], pid: int) -> Thread:
     return Thread(name or "a thread", is_main, told["owns_gil"], (*reversed(frames),))
 
 
-def _from_plugin(
-    plugins: Mapping[str, str], frames: Sequence[tuple[str, int, str]]
-) -> Stack | None:
-    """The stack from the first call in one of the plugins on."""
-    nodes = {path: node for node, path in reversed([*plugins.items()])}
-    for place, (path, _, name) in enumerate(frames):
-        if path in nodes:
-            return Stack(nodes[path], name, _text(frames[place:]))
-    return None
-
-
 def _text(frames: Sequence[tuple[str, int, str]]) -> str:
-    return "".join(traceback.format_list([traceback.FrameSummary(*f) for f in frames])).rstrip("\n")
+    """As Python shows calls, but without their source: a node says which files these are."""
+    lines = [f'  File "{path}", line {line}, in {name}' for path, line, name in frames]
+    if len(lines) > _MOST_FRAMES:
+        lines[1 : 1 - _MOST_FRAMES] = [f"  [{len(lines) - _MOST_FRAMES} calls are left out]"]
+    return "\n".join(lines)

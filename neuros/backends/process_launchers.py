@@ -189,7 +189,8 @@ class RunningProcess:
 
     def threads(self) -> ProcessThreads:
         """Where its threads stand in Python."""
-        return threads_of(self.pid)
+        read = threads_of(self.pid)
+        return read if self.poll() is None else ProcessThreads()
 
 
 def end_now(processes: Sequence[RunningProcess]) -> None:

@@ -16,6 +16,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 from base64 import b64decode
 from collections.abc import Iterable, Mapping
@@ -305,9 +306,14 @@ class Agent:
             (process.kill if name == "KILL" else process.terminate)()
 
     def _read_threads(self, node: str) -> None:
+        """Beside all else: it may take seconds."""
         process = self._processes.get(node)
-        read = ProcessThreads() if process is None else process.threads()
-        self._pump.send(ThreadsRead(node, read))
+
+        def read() -> None:
+            threads = ProcessThreads() if process is None else process.threads()
+            self._pump.send(ThreadsRead(node, threads))
+
+        threading.Thread(target=read, name="neuros-stacks", daemon=True).start()
 
     def _look(self) -> bool:
         """Send what has come since; returns whether that was anything."""

@@ -12,7 +12,6 @@ from typing import Any, Protocol
 from neuros.control import Report
 from neuros.launcher.stall_detector import StallDetector
 from neuros.ports import RunningNode
-from neuros.stacks import ProcessThreads
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}
 SIGNAL_NAMES = {
@@ -208,10 +207,9 @@ class Processes:
         self.killed.update(process.names)
         process.kill()
 
-    def threads_of(self, name: str) -> ProcessThreads:
-        """Where the threads of the process with this node stand."""
-        running = (each for each in self._running if name in each.names)
-        return next((each.threads() for each in running), ProcessThreads())
+    def with_node(self, name: str) -> RunningNode | None:
+        """The process with a node, if it runs."""
+        return next((each for each in self._running if name in each.names), None)
 
     def not_loaded(self) -> list[RunningNode]:
         """Processes in which no node has come as far as its first hook."""

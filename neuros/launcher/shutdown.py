@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from neuros.control import Drain, Leave, Stop
@@ -24,12 +24,15 @@ from neuros.launcher.outcome import (
 )
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict
-from neuros.launcher.stall_detector import SILENT_S, StallDetector, with_stack
+from neuros.launcher.stall_detector import SILENT_S, StallDetector
+from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import RunningNode
 
 STOP_S = 5.0
 """What nodes have for their finalise hooks and for flushing, in all."""
 
+# Reading where nodes stand begins so long before they are killed, and may hold that up for so long.
+_READ_EARLY_S, _READ_S = 1.0, 0.5
 # What closing a node that peers have heard may take, before it would be killed.
 _CLOSING_S = 1.0
 
@@ -46,6 +49,7 @@ class Shutdown:
     _channels: Channels
     _processes: Processes
     _detector: StallDetector
+    _reader: ThreadReader
     _declarations: Declarations
     _probing: Probing
     _peers: Peers
@@ -140,14 +144,18 @@ class Shutdown:
                 self._stop()
 
     def _look_at_stopping(self, now_s: float) -> None:
-        if now_s >= self._deadline_s:
+        left_s = self._deadline_s - now_s
+        if left_s <= 0.0:
+            self._read([*self._processes])
             for process in self._processes:
-                self._detector.read_threads(process.names)
                 self._fail_to_end(process, now_s)
             self._kill_all()
-        elif self._peers.exist and self._processes.have_reported():
+            return
+        if left_s < _READ_EARLY_S:
+            self._begin_to_read([*self._processes])
+        if self._peers.exist and self._processes.have_reported():
             may_go = self._peers.finish(self._outcome.reports, now_s)
-            if may_go or self._deadline_s - now_s < _CLOSING_S:
+            if may_go or left_s < _CLOSING_S:
                 self._channels.send(Leave())
 
     def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
@@ -190,16 +198,33 @@ class Shutdown:
 
     def _kill_all(self) -> None:
         self.phase = Phase.KILLED
+        self.kill([*self._processes])
         self._deadline_s = time.monotonic() + STOP_S
-        for process in self._processes:
-            read, stacks = self._detector.read_threads(process.names), self._outcome.stacks
-            for name in process.names:
-                if stack := self._detector.stack_of(name):
-                    stacks[name] = stack.text
-                    text = f"{name} was at this point when it was killed"
-                    self._output.log("ERROR", with_stack(text, stack))
-            if stacks.keys().isdisjoint(process.names) and read.threads:
-                stacks[process.names[0]] = str(read)
+
+    def kill(self, processes: Sequence[RunningNode]) -> None:
+        """Kill processes, and tell where their nodes stood."""
+        self._read(processes)
+        now_s = time.monotonic()
+        stood = [(process, *self._detector.where(process.names, now_s)) for process in processes]
+        for process in processes:
+            self._processes.kill(process)
+        for process, texts, read in stood:
+            for name, text in texts.items():
+                self._output.log("ERROR", f"{name} was at this point when it was killed:\n{text}")
+            if not texts and read.threads:
+                texts[process.names[0]] = str(read)
                 text = f"where the threads of {names_of(process)} stood when killed:\n{read}"
                 self._output.log("ERROR", text)
-            self._processes.kill(process)
+            elif not texts and read.problem:
+                text = f"where {names_of(process)} stood when killed is not known: {read.problem}"
+                self._output.log("WARN", text)
+            self._outcome.stacks.update(texts)
+
+    def _begin_to_read(self, processes: Sequence[RunningNode]) -> None:
+        for process in processes:
+            self._reader.begin(process.names[0])
+
+    def _read(self, processes: Sequence[RunningNode]) -> None:
+        """Read where the threads of processes stand, as far as there is time for that."""
+        self._begin_to_read(processes)
+        self._reader.wait(_READ_S)

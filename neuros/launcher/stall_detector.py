@@ -10,8 +10,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from neuros.control import ExecutingHook, Report
+from neuros.launcher.thread_reader import ThreadReader
 from neuros.project.model import Connection
-from neuros.stacks import LONG_S, ProcessThreads, Stack
+from neuros.stacks import IMPORT, LONG_S, ProcessThreads, Stack
 
 STALL_S = 5.0
 """After this long, nodes are asked why nothing moves."""
@@ -21,8 +22,11 @@ SILENT_S = 2.0
 
 _FIRST_REMARK_S = 5.0
 _NEXT_REMARK_S = 10.0
+_READ_WITHIN_S = 3.0
 BEHIND_S = 5.0
 """A packet that has waited for so long is old."""
+
+_NOT_IN_TIME = ProcessThreads(problem="it could not be read in time")
 
 _Samples = deque[tuple[float, int]]
 
@@ -33,20 +37,14 @@ class StallDetector:
     Args:
         names: the nodes.
         now_s: the time now; all times are seconds on one monotonic clock.
-        threads_of: reads where the threads of a node's process stand.
+        reader: reads where the threads of processes stand.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        now_s: float,
-        threads_of: Callable[[str], ProcessThreads] = lambda _: ProcessThreads(),
-    ) -> None:
+    def __init__(self, names: Sequence[str], now_s: float, reader: ThreadReader) -> None:
         self._names = tuple(names)
-        self._threads_of = threads_of
+        self._reader = reader
         self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
         self._plugins: dict[str, str] = {}
-        self._read: dict[str, ProcessThreads] = {}  # by node that does not report
         self._silent = set(names)
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
@@ -60,18 +58,21 @@ class StallDetector:
         self._starving: dict[str, tuple[str, float]] = {}  # by node, what it lacks, since when
         self._named_as_starving: set[tuple[str, str]] = set()
 
-    def greet(self, names: Sequence[str], plugins: Mapping[str, str]) -> None:
+    def greet(self, names: Sequence[str], plugins: Mapping[str, str], now_s: float) -> None:
         """These nodes' process is there, with these files of plugins."""
         self._silent.difference_update(names)
-        self._processes.update(dict.fromkeys(names, tuple(names)))
-        self._plugins.update(plugins)
+        for name in names:
+            self._processes[name] = tuple(names)
+            self._heard_s.setdefault(name, now_s)
+            if name in plugins:
+                self._plugins[name] = plugins[name]
 
     def report(self, report: Report, now_s: float) -> None:
         """Take a report."""
         name, metrics = report.node, report.metrics
         self._reports[name] = report
         self._heard_s[name] = now_s
-        self._read.pop(name, None)
+        self._reader.forget(self._together(name)[0])
         self._named_as_mute.discard(name)
         if name in self._named_as_held:
             self._named_as_held.remove(name)
@@ -125,8 +126,8 @@ class StallDetector:
     def is_held_up(self, name: str, now_s: float) -> bool:
         """Whether a node cannot take in packets, which is said otherwise: a hook executes in its
         process, or it does not report."""
-        others = [other for other in self._together(name) if other in self._reports]
-        return any(map(self._executing, others)) or self.silent_s(name, now_s) >= SILENT_S
+        is_executing = any(map(self._executing, self._together(name)))
+        return is_executing or self.silent_s(name, now_s) >= SILENT_S
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
@@ -176,43 +177,77 @@ class StallDetector:
                 if key not in self._named_hooks:
                     self._named_hooks.add(key)
                     text = f"{name} has been executing '{hook['name']}' for {LONG_S:g} s"
-                    yield "WARN", with_stack(text, self.stack_of(name))
+                    yield "WARN", with_stack(text, self._reports[name].stack)
 
     def remarks_on_silence(
         self, now_s: float, without: Collection[str] = ()
     ) -> Iterator[tuple[str, str]]:
-        """Nodes that do not report, each once, and where they stand; not those that were killed."""
+        """Processes that do not report, each once, and where they stand; not if they were killed.
+
+        A process is read beside; the remark comes when that is there.
+        """
         for name, heard_s in self._heard_s.items():
             if now_s - heard_s < LONG_S or name in self._named_as_mute or name in without:
                 continue
-            self._named_as_mute.add(name)
-            read = self._read.get(name) or self.read_threads(self._together(name))
-            holder, stack = read.lock_holder, read.stack(self._plugins)
-            silence = f"{name} has not reported for {LONG_S:g} s"
-            if holder is None or read.is_stopped:
-                yield "WARN", f"{silence}{self.last_seen(name)}: its process {_why_silent(read)}"
-            elif stack is None or not holder.is_main:
-                yield "WARN", f"{silence}{self.last_seen(name)}: {holder}"
-            elif stack.node == name and not self._is_named(name):
-                self._named_as_held.add(name)
-                text = (
-                    f"{name} has been executing '{stack.hook}' for {LONG_S:g} s, and cannot report:"
-                    " a library holds Python's global lock"
-                )
-                yield "WARN", with_stack(text, stack)
+            names = self._together(name)
+            self._reader.begin(names[0])
+            read = self._reader.read(names[0])
+            if read is None and now_s - heard_s < LONG_S + _READ_WITHIN_S:
+                continue
+            self._named_as_mute.update(names)
+            if remark := self._remark_on(names, read or _NOT_IN_TIME):
+                yield "WARN", remark
 
-    def read_threads(self, names: Sequence[str]) -> ProcessThreads:
-        """Where the threads of the process with these nodes stand, which do not report."""
-        read = self._threads_of(names[0])
-        self._read.update(dict.fromkeys(names, read))
-        return read
+    def _remark_on(self, names: Sequence[str], read: ProcessThreads) -> str:
+        """Why a process with these nodes does not report; empty if that has been said."""
+        holder = read.lock_holder
+        if holder and holder.is_main and not read.is_stopped:
+            for stack in filter(None, map(self._read_stack, names)):
+                if self._is_named(stack.node):
+                    return ""
+                self._named_as_held.add(stack.node)
+                does = f"executing '{stack.hook}'"
+                if stack.hook == IMPORT:
+                    does = "importing its plugin"
+                said = f"{stack.node} has been {does} for {LONG_S:g} s, and cannot report"
+                return with_stack(f"{said}: a library holds Python's global lock", stack)
+        have = "has" if len(names) == 1 else "have"
+        last_seen = "".join(map(self.last_seen, names))
+        silence = f"{', '.join(names)} {have} not reported for {LONG_S:g} s{last_seen}: "
+        if read.is_stopped:
+            return f"{silence}the process is stopped"
+        if holder:
+            return f"{silence}{holder}"
+        if read.threads:
+            return f"{silence}the process gets no processor time"
+        why_not = f" (where it stands is not known: {read.problem})" if read.problem else ""
+        return f"{silence}the process is stopped, or a library holds Python's global lock{why_not}"
 
-    def stack_of(self, name: str) -> Stack | None:
-        """The stack of a node in its plugin, as far as is known."""
-        read = self._read.get(name)
-        if read is None or not read.threads:
-            return self._reports[name].stack if name in self._reports else None
-        return _of(name, read.stack(self._plugins))
+    def where(self, names: Sequence[str], now_s: float) -> tuple[dict[str, str], ProcessThreads]:
+        """Where nodes of one process stand in their plugins, by name; and what was read of it."""
+        read = self._reader.read(names[0]) or _NOT_IN_TIME
+        told = {name: self._reports[name].stack for name in names if name in self._reports}
+        stacks = {name: self._read_stack(name) or told.get(name) for name in names}
+        holder, is_silent = read.lock_holder, self.silent_s(names[0], now_s) >= SILENT_S
+        if not is_silent:  # what it tells has the source lines
+            stacks |= {name: stack for name, stack in told.items() if stack}
+        found = {name: stack.text for name, stack in stacks.items() if stack}
+        if is_silent and holder and not holder.is_main:
+            found = {name: f"{text}\n{holder}" for name, text in found.items()}
+        return found, read
+
+    def _read_stack(self, name: str) -> Stack | None:
+        """The stack of a node in its plugin that has been read since it reported last.
+
+        Of several nodes with one plugin in one process, it is of the one that was executing.
+        """
+        names = self._together(name)
+        read, plugin = self._reader.read(names[0]), self._plugins.get(name)
+        if read is None or plugin is None:
+            return None
+        alike = [each for each in names if self._plugins.get(each) == plugin]
+        last = next(filter(self._executing, alike), alike[0])
+        return read.hook_stack(name, plugin) if name == last else None
 
     def silent_s(self, name: str, now_s: float) -> float:
         """For how long a node has not reported."""
@@ -220,12 +255,11 @@ class StallDetector:
 
     def executing(self, name: str) -> str:
         """The hook that a node executes, as far as is known; empty if there is none."""
-        hook = self._executing(name) if name in self._reports else None
+        hook = self._executing(name)
         if hook is not None:
             return hook["name"]
-        read = self._read.get(name)
-        stack = _of(name, read.hook_stack(self._plugins)) if read else None
-        return stack.hook if stack else ""
+        stack = self._read_stack(name)
+        return stack.hook if stack and stack.hook != IMPORT else ""
 
     def last_seen(self, name: str) -> str:
         """The hook of a node at its last report: ``", last seen executing 'step'"``."""
@@ -251,8 +285,8 @@ class StallDetector:
         return sorted(waiting)
 
     def _executing(self, name: str) -> ExecutingHook | None:
-        metrics = self._reports[name].metrics
-        return metrics["executing"] if metrics else None
+        report = self._reports.get(name)
+        return report.metrics["executing"] if report and report.metrics else None
 
 
 def _lacks(report: Report) -> str:
@@ -268,19 +302,6 @@ def _lacks(report: Report) -> str:
     ways = [key.removesuffix(end) for key in received]
     sources = [f"topic {way}" if way[0] == "/" else way.partition(".")[0] for way in ways]
     return f"`{port}` from {' or '.join(dict.fromkeys(sources))}"
-
-
-def _of(name: str, stack: Stack | None) -> Stack | None:
-    """A stack if it is one of this node."""
-    return stack if stack is not None and stack.node == name else None
-
-
-def _why_silent(read: ProcessThreads) -> str:
-    if read.is_stopped:
-        return "is stopped"
-    if read.threads:
-        return "gets no processor time"
-    return "is stopped, or a library holds Python's global lock"
 
 
 def with_stack(text: str, stack: Stack | None) -> str:

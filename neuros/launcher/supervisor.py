@@ -29,6 +29,7 @@ from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
 from neuros.launcher.shutdown import STOP_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
+from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 
@@ -101,9 +102,8 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
-        self._detector = StallDetector(
-            names, time.monotonic(), lambda name: self._processes.threads_of(name)
-        )
+        reader = ThreadReader(lambda name: self._processes.with_node(name))
+        self._detector = StallDetector(names, time.monotonic(), reader)
         self._processes = Processes(self._detector, self.outcome)
         self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
@@ -115,6 +115,7 @@ class Supervisor:
             self._channels,
             self._processes,
             self._detector,
+            reader,
             self._declarations,
             self._probing,
             self._peers,
@@ -228,7 +229,7 @@ class Supervisor:
                 self.observers.take(link, message)
 
     def _on_hello(self, link: ControlLink, hello: control.Hello) -> None:
-        self._detector.greet(hello.nodes, hello.plugins)
+        self._detector.greet(hello.nodes, hello.plugins, time.monotonic())
         if self._peers.exist:
             self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
@@ -260,7 +261,7 @@ class Supervisor:
 
         for process in self._processes:
             if self._is_cut_off(process):
-                self._processes.kill(process)
+                self._shutdown.kill([process])
                 self._shutdown.fail(
                     f"{nodes_of(process)} cannot be reached any more: the control connection was"
                     " closed at that end. Does a plugin close file descriptors that it has not"

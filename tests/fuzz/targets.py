@@ -381,7 +381,7 @@ def check_bag(name: str, data: bytes, folder: Path) -> None:
 # ---------------------------------------------------------------------- other programs
 
 SENT: Sequence[control.Message] = (
-    control.Hello(("a",)),
+    control.Hello(("a",), {"a": "/a.py"}),
     control.Report(node="a", waiting_for=("a.x -> b.x",), sim_time=1.0, timeline=((1.0, 2.0),)),
     control.Hooks("a", (), ("end",)),
     control.Shutdown("a", "done", 5.0),

@@ -16,12 +16,14 @@ from typing import Any
 import pytest
 from launching import Finished, Running, killed_in_a_hook, launch, start
 
+from containers import wait_until
 from neuros.backends.machines.files import scan
 from neuros.backends.machines.machine import Machine, agent_command
 from neuros.control.link import encode
-from neuros.control.machines import Lacking
+from neuros.control.machines import Lacking, ThreadsRead
 from neuros.errors import EnvironmentFault
 from neuros.project.deployment import Host
+from neuros.stacks import ProcessThreads
 from neuros.testing.back_ends import PROJECTS
 
 STREAM = Path(__file__).parent / "network" / "stream"
@@ -103,6 +105,21 @@ def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(
     assert "process source: " in finished.output
     assert "process sink on other\n" in finished.output
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_where_a_node_stands_is_asked_of_its_machine_unless_that_is_gone() -> None:
+    read = ProcessThreads(problem="nobody may")
+    answers = 'while read -r line; do case $line in *read_threads*) echo "$0";; esac; done'
+    answer = encode(ThreadsRead("eye", read)).decode().strip()
+    host = Host("robot", through=("sh", "-c", answers, answer))
+    machine = Machine(host, ENDED_S, lambda severity, text: None, agent_command(host))
+    try:
+        assert machine.threads_of("eye") == machine.threads_of("eye") == read
+        os.kill(machine.pid, signal.SIGKILL)
+        wait_until(lambda: machine.lost)
+        assert machine.threads_of("eye") == ProcessThreads(problem=machine.lost)
+    finally:
+        machine.close()
 
 
 def test_ctrl_c_ends_the_sending_of_a_project(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
         assert "hangs was at this point when it was killed:\n" in finished.output
         assert "in close\n" in finished.record["nodes"]["hangs"]["stack"]
         assert bench.saved("good", "hangs")
-        assert "in work\n" in finished.record["nodes"]["aside"]["stack"]
+        assert "in work" in finished.record["nodes"]["aside"]["stack"]
 
 
 def test_so_is_one_whose_finalise_hook_hangs_though_all_else_went_well(tmp_path: Path) -> None:

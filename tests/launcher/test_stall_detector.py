@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -11,6 +13,8 @@ from hypothesis import strategies as st
 
 from neuros.control import Report
 from neuros.launcher.stall_detector import Backlog, StallDetector
+from neuros.launcher.thread_reader import ThreadReader
+from neuros.ports import RunningNode
 from neuros.project.model import Connection
 from neuros.stacks import ProcessThreads, Stack, Thread
 
@@ -42,10 +46,30 @@ def executing(for_s: float, executions: int = 7) -> dict[str, Any]:
     return {"name": "step", "for_s": for_s, "executions": executions}
 
 
+@dataclass
+class Process:
+    threads: Callable[[], ProcessThreads]
+
+
+class AtOnce(ThreadReader):
+    """One whose user need not come again."""
+
+    def begin(self, name: str) -> None:
+        super().begin(name)
+        self.wait(10.0)
+
+
+def reader_of(*reads: ProcessThreads) -> ThreadReader:
+    """A reader of processes that finds this, one after the other."""
+    left = [*reads]
+    process = Process(lambda: left.pop(0) if len(left) > 1 else left[0])
+    return AtOnce(lambda _: cast(RunningNode, process))
+
+
 def detector_of(*names: str) -> StallDetector:
     """A detector from second 0 on, whose nodes have all been loaded."""
-    detector = StallDetector(names, 0.0)
-    detector.greet(names, {})
+    detector = StallDetector(names, 0.0, reader_of(ProcessThreads()))
+    detector.greet(names, {}, 0.0)
     for name in names:
         detector.report(report(name), 0.0)
     return detector
@@ -132,11 +156,11 @@ def test_nothing_rests_while_a_hook_executes() -> None:
 
 
 def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> None:
-    detector = StallDetector(["a", "b"], 0.0)
-    detector.greet(["a"], {})
+    detector = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads()))
+    detector.greet(["a"], {}, 0.0)
     detector.report(report("a"), 0.0)
     assert not detector.has_just_stalled(9.0), "b has not come yet"
-    detector.greet(["b"], {})
+    detector.greet(["b"], {}, 0.0)
     detector.report(LOADING, 9.0)
     assert not detector.has_just_stalled(15.0), "b is importing its plugin"
     detector.report(report("b", waiting_for=("c.o -> b.x",)), 15.0)
@@ -179,8 +203,8 @@ def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
 
 
 def test_nodes_that_start_slowly_are_named() -> None:
-    detector = StallDetector(["a", "b", "c"], 0.0)
-    detector.greet(["b", "c"], {})
+    detector = StallDetector(["a", "b", "c"], 0.0, reader_of(ProcessThreads()))
+    detector.greet(["b", "c"], {}, 0.0)
     detector.report(LOADING, 4.0)
     detector.report(
         report(
@@ -227,6 +251,22 @@ MAIN = Thread("MainThread", is_main=True, has_lock=False, frames=IN_HOOK)
 WORKER = Thread("worker", is_main=False, has_lock=True, frames=(("/a.py", 20, "work"),))
 HELD = ProcessThreads((replace(MAIN, has_lock=True),))
 STACK = '  File "/a.py", line 3, in step\n  File "/lib/solver.py", line 9, in solve'
+AT_WORK = 'worker holds Python\'s global lock:\n  File "/a.py", line 20, in work'
+
+
+def of_plugins(reader: ThreadReader, *processes: dict[str, str]) -> StallDetector:
+    """A detector of processes that have nodes with these plugins, and have reported at second 0."""
+    detector = StallDetector([name for plugins in processes for name in plugins], 0.0, reader)
+    for plugins in processes:
+        detector.greet([*plugins], plugins, 0.0)
+        for name in plugins:
+            detector.report(report(name), 0.0)
+    return detector
+
+
+def silence(detector: StallDetector, now_s: float = 5.0) -> list[str]:
+    """What is said of nodes that do not report."""
+    return [text for _, text in detector.remarks_on_silence(now_s)]
 
 
 @pytest.mark.parametrize(
@@ -239,50 +279,102 @@ STACK = '  File "/a.py", line 3, in step\n  File "/lib/solver.py", line 9, in so
         ),
         (
             ProcessThreads((MAIN, WORKER)),
-            "a has not reported for 5 s, last seen executing 'step':"
-            ' worker holds Python\'s global lock:\n  File "/a.py", line 20, in work',
+            f"b, a have not reported for 5 s, last seen executing 'step': {AT_WORK}",
         ),
         (
             replace(HELD, is_stopped=True),
-            "a has not reported for 5 s, last seen executing 'step': its process is stopped",
+            "b, a have not reported for 5 s, last seen executing 'step': the process is stopped",
         ),
-        (ProcessThreads((MAIN,)), "last seen executing 'step': its process gets no processor time"),
         (
-            ProcessThreads(),
-            "a has not reported for 5 s:"
-            " its process is stopped, or a library holds Python's global lock",
+            ProcessThreads((MAIN,)),
+            "b, a have not reported for 5 s, last seen executing 'step':"
+            " the process gets no processor time",
+        ),
+        (
+            ProcessThreads(problem="nobody may"),
+            "b, a have not reported for 5 s: the process is stopped, or a library holds Python's"
+            " global lock (where it stands is not known: nobody may)",
         ),
     ],
     ids=["in a hook", "in a thread", "stopped", "late", "not to be read"],
 )
-def test_of_a_node_that_does_not_report_it_is_read_why(read: ProcessThreads, said: str) -> None:
-    asked: list[str] = []
-
-    def threads_of(name: str) -> ProcessThreads:
-        asked.append(name)
-        return read
-
-    detector = StallDetector(["b", "a"], 0.0, threads_of)
-    detector.greet(["b", "a"], {"b": "/b.py", "a": "/a.py"})
-    detector.report(report("b"), 0.0)
-    detector.report(report("a"), 0.0)
-    assert any(text.endswith(said) for text in remarks(detector, 5.0))
-    assert asked == ["b"], "both are in one process, which is read once"
-    detector.report(report("a"), 6.0)
+def test_of_a_process_that_does_not_report_it_is_read_and_said_once_why(
+    read: ProcessThreads, said: str
+) -> None:
+    reader = reader_of(read)
+    detector = of_plugins(reader, {"b": "/b.py", "a": "/a.py"})
+    assert silence(detector) == [said]
+    assert list(detector.remarks_on_silence(60.0)) == []
+    detector.report(report("a"), 60.0)
     assert detector.executing("a") == "", "what was read has passed"
 
 
-def test_what_was_read_goes_before_what_was_told_last() -> None:
-    read = [HELD]
-    detector = StallDetector(["a"], 0.0, lambda _: read[0])
-    detector.greet(["a"], {"a": "/a.py"})
+def test_a_process_that_cannot_be_read_for_long_is_named_all_the_same() -> None:
+    goes_on = threading.Event()
+    process = Process(lambda: (goes_on.wait(), HELD)[1])
+    reader = ThreadReader(lambda _: cast(RunningNode, process))
+    detector = of_plugins(reader, {"a": "/a.py"})
+    assert list(detector.remarks_on_silence(5.0)) == list(detector.remarks_on_silence(7.9)) == []
+    ((_, text),) = detector.remarks_on_silence(8.0)
+    assert text.endswith("(where it stands is not known: it could not be read in time)")
+    goes_on.set()
+
+
+def test_a_plugin_whose_import_keeps_the_lock_is_named() -> None:
+    frames = (("/lib/importlib.py", 1, "exec_module"), ("/a.py", 1, "<module>"))
+    held = Thread("MainThread", is_main=True, has_lock=True, frames=frames)
+    reader = reader_of(ProcessThreads((held,)))
+    detector = StallDetector(["a"], 0.0, reader)
+    detector.greet(["a"], {"a": "/a.py"}, 1.0)
+    (text,) = silence(detector, 6.0)
+    assert text.startswith("a has been importing its plugin for 5 s, and cannot report: a library")
+
+
+def test_nodes_of_one_plugin_are_each_named_in_processes_of_their_own() -> None:
+    reader = reader_of(HELD)
+    detector = of_plugins(reader, {"a": "/a.py"}, {"b": "/a.py"})
+    begins = [text.partition(" for 5 s")[0] for text in silence(detector)]
+    assert begins == ["a has been executing 'step'", "b has been executing 'step'"]
+    assert detector.where(["b"], 6.0)[0] == {"b": STACK}
+
+
+def test_of_nodes_of_one_plugin_in_one_process_the_one_is_named_that_executed_last() -> None:
+    reader = reader_of(HELD)
+    detector = of_plugins(reader, {"a": "/a.py", "b": "/a.py"})
+    detector.report(report("b", executing=executing(1.0)), 0.0)
+    (text,) = silence(detector)
+    assert text.startswith("b has been executing 'step' for 5 s")
+    assert detector.where(["a", "b"], 6.0)[0] == {"b": STACK}
+
+
+def test_a_process_tells_only_of_plugins_of_its_own() -> None:
+    reader = reader_of(HELD)
+    detector = of_plugins(reader, {"a": "/a.py"})
+    detector.greet(["b"], {"b": "/b.py", "a": "/elsewhere.py"}, 0.0)
+    (text,) = silence(detector)[:1]
+    assert text.startswith("a has been executing 'step'")
+
+
+def test_where_a_node_stands_is_what_was_read_else_what_it_told() -> None:
+    reader = reader_of(HELD, ProcessThreads(problem="nobody may"))
+    detector = of_plugins(reader, {"a": "/a.py"})
     detector.report(replace(report("a"), stack=Stack("a", "before", "told")), 0.0)
-    assert detector.stack_of("a") == Stack("a", "before", "told")
-    detector.read_threads(["a"])
-    assert detector.stack_of("a") == Stack("a", "step", STACK)
-    read[0] = ProcessThreads()
-    detector.read_threads(["a"])
-    assert detector.stack_of("a") == Stack("a", "before", "told"), "it could not be read"
+    reader.begin("a")
+    assert detector.where(["a"], 3.0) == ({"a": STACK}, HELD)
+    assert detector.where(["a"], 1.0) == ({"a": "told"}, HELD), "that is new, and has source lines"
+    detector.report(replace(report("a"), stack=Stack("a", "after", "told again")), 1.0)
+    reader.begin("a")
+    texts, read = detector.where(["a"], 9.0)
+    assert (texts, read.problem) == ({"a": "told again"}, "nobody may")
+
+
+def test_another_thread_that_keeps_the_lock_is_shown_if_the_node_does_not_report() -> None:
+    """In one that reports, the lock goes from thread to thread."""
+    reader = reader_of(ProcessThreads((MAIN, WORKER)))
+    detector = of_plugins(reader, {"a": "/a.py"})
+    reader.begin("a")
+    assert detector.where(["a"], 1.0)[0] == {"a": STACK}
+    assert detector.where(["a"], 3.0)[0] == {"a": f"{STACK}\n{AT_WORK}"}
 
 
 # ------------------------------------------------------------------ packets that wait
@@ -348,8 +440,8 @@ def test_packets_that_are_not_taken_in_are_said_too() -> None:
 
 
 def test_a_node_that_can_take_in_nothing_has_not_fallen_behind() -> None:
-    detector = StallDetector(["camera", "brain"], 0.0)
-    detector.greet(["camera", "brain"], {})
+    detector = StallDetector(["camera", "brain"], 0.0, reader_of(ProcessThreads()))
+    detector.greet(["camera", "brain"], {}, 0.0)
     backlog = Backlog([CONNECTION], detector.is_held_up)
     for second in range(7):
         backlog.report(counted(sent=3), float(second))

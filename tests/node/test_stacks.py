@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 
 from containers import wait_until
-from neuros.stacks import ProcessThreads, stack_in, threads_of
+from neuros import stacks
+from neuros.stacks import ProcessThreads, Thread, stack_in, threads_of
 
 PLUGIN = """\
 import ctypes, threading
@@ -69,32 +70,29 @@ def lines_of(text: str) -> list[str]:
 
 
 def test_it_is_read_while_the_plugin_holds_the_global_lock(plugin: Path) -> None:
-    plugins = {"other": str(plugin.parent / "other.py"), "a": str(plugin)}
     with in_hook(plugin, "hold") as pid:
         wait_until(lambda: "in hold" in str(threads_of(pid)), 20.0)
         read = threads_of(pid)
     assert not read.is_stopped
     assert read.lock_holder is not None
     assert read.lock_holder.is_main
-    stack = read.stack(plugins)
+    assert read.hook_stack("other", str(plugin.parent / "other.py")) is None
+    stack = read.hook_stack("a", str(plugin))
     assert stack is not None
-    assert stack == read.hook_stack(plugins)
     assert (stack.node, stack.hook) == ("a", "hook")
     assert lines_of(stack.text) == ["line 4, in hook", "line 6, in deep", "line 8, in hold"]
 
 
 def test_so_is_that_of_a_thread_of_the_plugin_that_holds_it(plugin: Path) -> None:
-    plugins = {"a": str(plugin)}
     with in_hook(plugin, "hold_elsewhere") as pid:
-        wait_until(lambda: "in hold\n" in str(threads_of(pid)), 20.0)
+        wait_until(lambda: "in hold" in str(threads_of(pid).lock_holder), 20.0)
         read = threads_of(pid)
-    holder, stack, hook = read.lock_holder, read.stack(plugins), read.hook_stack(plugins)
+    holder, stack = read.lock_holder, read.hook_stack("a", str(plugin))
     assert holder is not None
     assert holder.name.startswith("worker")
+    assert lines_of(str(holder))[-1] == "line 8, in hold"
     assert stack is not None
-    assert hook is not None
-    assert lines_of(stack.text) == ["line 8, in hold"]
-    assert lines_of(hook.text)[:2] == ["line 4, in hook", "line 6, in deep"]
+    assert lines_of(stack.text)[:2] == ["line 4, in hook", "line 6, in deep"]
     first, *_ = str(read).splitlines()
     assert first == "MainThread:"
     assert "worker holds Python's global lock:\n" in str(read)
@@ -107,11 +105,40 @@ def test_a_process_that_was_stopped_is_read_too(plugin: Path) -> None:
         assert "in deep" in str(threads_of(pid))
 
 
-def test_of_what_is_no_python_program_or_not_there_nothing_is_read() -> None:
+def test_why_nothing_could_be_read_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with subprocess.Popen(["sleep", "60"]) as process:
-        assert threads_of(process.pid) == ProcessThreads()
+        assert threads_of(process.pid) == ProcessThreads(
+            problem="py-spy: Failed to find python version from target process"
+        )
         process.kill()
-    assert threads_of(process.pid) == ProcessThreads()
+    assert threads_of(process.pid).problem.startswith("py-spy: Failed to get process executable")
+    monkeypatch.setattr(stacks, "_py_spy", lambda: "nowhere")
+    assert threads_of(os.getpid()).problem.startswith("py-spy is not installed")
+
+
+def test_of_a_deep_recursion_the_first_call_and_the_last_hundred_are_shown() -> None:
+    frames = tuple(("/a.py", line, "deep") for line in range(250))
+    text = str(Thread("MainThread", is_main=True, has_lock=False, frames=frames))
+    _, first, left_out, *others = text.splitlines()
+    assert first == '  File "/a.py", line 0, in deep'
+    assert left_out == "  [150 calls are left out]"
+    assert len(others) == 99
+    assert others[-1] == '  File "/a.py", line 249, in deep'
+
+
+def test_no_file_is_opened_that_a_process_names(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.txt"
+    secret.write_text("first\nsecret\n")
+    compiles = f"""
+print("running", flush=True)
+exec(compile("\\n__import__('time').sleep(60)", {str(secret)!r}, "exec"))
+"""
+    with subprocess.Popen([sys.executable, "-c", compiles], stdout=subprocess.PIPE) as process:
+        try:
+            wait_until(lambda: f'"{secret}", line 2' in str(threads_of(process.pid)), 20.0)
+            assert "secret\n" not in str(threads_of(process.pid))
+        finally:
+            process.kill()
 
 
 def test_a_node_that_reports_tells_it_of_its_main_thread(plugin: Path) -> None:

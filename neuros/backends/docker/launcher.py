@@ -287,8 +287,12 @@ class RunningContainer:
 
     def threads(self) -> ProcessThreads:
         """Where its threads stand in Python; the first of its processes may be an init program."""
-        read = map(threads_of, self._events.pids(self._file.node.name))
-        return next(filter(lambda each: each.threads, read), ProcessThreads())
+        read = ProcessThreads()
+        for pid in self._events.pids(self._file.node.name):
+            read = threads_of(pid)
+            if read.threads:
+                break
+        return read
 
     def _signal(self, number: signal.Signals) -> None:
         self._is_told = True

@@ -41,7 +41,7 @@ _COMMAND_NOT_FOUND = 127
 _ENDS_S = 5.0
 _PACKET_LOG = "packets"  # of a node, in its folder
 _EXITS_S = 0.5
-_READ_S = 0.5
+_READ_S = 3.0
 _SAID_LAST_BYTES = 2000
 
 Log = Callable[[str, str], None]
@@ -181,14 +181,14 @@ class Machine:
         self._pump.send(agent.SignalNode(node, name))
 
     def threads_of(self, node: str) -> ProcessThreads:
-        """Where the threads of a node's process stand; empty if the machine is slow to say."""
+        """Where the threads of a node's process stand; waits for the answer for up to 3 s."""
         with self._arrived:
             self._threads.pop(node, None)
         if not self.lost:
             self._pump.send(agent.ReadThreads(node))
         with self._arrived:
             self._arrived.wait_for(lambda: node in self._threads or self.lost, _READ_S)
-            return self._threads.get(node, ProcessThreads())
+            return self._threads.get(node, ProcessThreads(problem=self.lost or "no answer came"))
 
     def end_of(self, node: str) -> str | None:
         """How the process of a node has ended, ``None`` while it runs."""
