@@ -100,6 +100,7 @@ def test_so_is_that_of_a_thread_of_the_plugin_that_holds_it(plugin: Path) -> Non
 
 def test_a_process_that_was_stopped_is_read_too(plugin: Path) -> None:
     with in_hook(plugin, "hold") as pid:
+        wait_until(lambda: "in hold" in str(threads_of(pid)), 20.0)
         os.kill(pid, signal.SIGSTOP)
         wait_until(lambda: threads_of(pid).is_stopped, 20.0)
         assert "in deep" in str(threads_of(pid))
