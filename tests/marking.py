@@ -62,7 +62,7 @@ BY_NAME = {
         "benchmarks/test_reproduce_command.py",
         "cli/test_command_line.py::test_what_could_not_be_started",
         "cli/test_validate_command.py",
-        "doctor/test_checks.py::test_a_gpu_tool",
+        "doctor/test_checks.py",
         "faults/",
         "fuzz/",
         "simulators/test_mujoco_opengl.py::TestDoctor",

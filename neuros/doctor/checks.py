@@ -31,6 +31,7 @@ from neuros.ports import Finding, SimulatorKind, State
 from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
 from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry, option_values
+from neuros.stacks import allow_reading, threads_of
 
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")
@@ -129,6 +130,7 @@ def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     yield Finding.good("cores", f"{len(usable_cores())} usable")
     yield _shared_memory(SHARED_MEMORY)
     yield _domain(environ)
+    yield _stacks()
     yield _display(environ)
     yield _gpu()
 
@@ -163,6 +165,15 @@ def _domain(environ: Mapping[str, str]) -> Finding:
             return Finding.good("domain", f"{domain.reason} would be used")
     except (EnvironmentFault, UsageError) as error:
         return Finding.bad("domain", str(error))
+
+
+def _stacks() -> Finding:
+    """Whether a run can show where a node hangs; nodes are children as this process is one."""
+    allow_reading()
+    read = threads_of(os.getpid())
+    if read.threads:
+        return Finding.good("stacks", "those of nodes that hang can be shown")
+    return Finding.absent("stacks", f"those of nodes that hang cannot be shown: {read.problem}")
 
 
 def _display(environ: Mapping[str, str]) -> Finding:

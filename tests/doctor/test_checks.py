@@ -14,6 +14,7 @@ from neuros.backends.docker.back_end import look_at_containers
 from neuros.doctor import checks
 from neuros.ports import Finding, State
 from neuros.registry import BACK_ENDS, SIMULATORS
+from neuros.stacks import ProcessThreads
 
 
 def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:
@@ -59,6 +60,16 @@ def test_shared_memory_too_small_for_images_is_a_problem(
 
 def test_a_domain_id_that_is_none_is_a_problem() -> None:
     assert findings({"ROS_DOMAIN_ID": "many"})["domain"].state is State.BAD
+
+
+def test_whether_a_run_can_show_where_a_node_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert findings()["stacks"].state is State.GOOD
+    monkeypatch.setattr(checks, "threads_of", lambda _: ProcessThreads(problem="nobody may"))
+    found = findings()["stacks"]
+    assert (found.state, found.text) == (
+        State.ABSENT,
+        "those of nodes that hang cannot be shown: nobody may",
+    )
 
 
 def test_the_display_is_the_one_that_the_environment_names() -> None:
