@@ -12,7 +12,7 @@ from importlib import import_module
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
-from marking import Watch, in_turns, mark
+from marking import Watch, longest_first, mark
 from needs import require, summary
 
 with pytest.MonkeyPatch.context() as patch:
@@ -67,8 +67,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Func
     """Give each test its markers, before ``-m`` chooses by them."""
     for item in items:
         mark(item)
-    if hasattr(config, "workerinput"):  # else they stay as they are
-        in_turns(items)
+    if hasattr(config, "workerinput"):  # no worker has much to do when the others are done
+        longest_first(items)
 
 
 def pytest_collection_finish() -> None:

@@ -116,25 +116,14 @@ def uses(item: pytest.Function) -> set[str]:
     return found | {kind for kind, names in BY_NAME.items() if name.startswith(names)}
 
 
-def in_turns(items: list[pytest.Function]) -> None:
-    """Put the files first whose tests wait for containers, then those with runs.
-
-    Files with unit tests, which only compute, come between them: so no core is without work while
-    others wait, and no worker has much to do when the others are done.
-    """
+def longest_first(items: list[pytest.Function]) -> None:
+    """Put the files first whose tests wait for containers, then those with runs."""
     ranks: dict[Path, int] = {}
     for item in items:
         marked = {each.name for each in item.iter_markers()}
         rank = next((rank for rank, kind in enumerate(_LONGEST) if kind in marked), len(_LONGEST))
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
-    waiting = sorted((path for path in ranks if ranks[path] < len(_LONGEST)), key=ranks.get)
-    computing = [path for path in ranks if ranks[path] == len(_LONGEST)]
-    places = {
-        path: (number + 0.5) / len(files)
-        for files in (waiting, computing)
-        for number, path in enumerate(files)
-    }
-    items.sort(key=lambda item: places[item.path])
+    items.sort(key=lambda item: ranks[item.path])
 
 
 @cache
