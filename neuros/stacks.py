@@ -12,7 +12,6 @@ import contextlib
 import ctypes
 import json
 import os
-import subprocess
 import sys
 import threading
 import traceback
@@ -97,6 +96,8 @@ class ProcessThreads:
 
 def threads_of(pid: int) -> ProcessThreads:
     """Read where the threads of a process on this machine stand; takes up to 2 s."""
+    import subprocess  # no node needs it, and each would take 5 ms to import it
+
     command = [_py_spy(), "dump", "--nonblocking", "--json", "--pid", str(pid)]
     try:
         done = subprocess.run(
