@@ -11,6 +11,7 @@ import json
 import os
 import socket
 import sys
+import threading  # noqa: F401 - as in every node: it gives threads their names
 import time
 from pathlib import Path
 from typing import Any
