@@ -29,7 +29,7 @@ LISTENER = ".listener"
 """Folder of the packets that no node sees; it is named like none can be."""
 
 _VERSION = 1
-_NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]*")
+_NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]{,250}")  # it has a folder
 
 
 @dataclass(frozen=True)
