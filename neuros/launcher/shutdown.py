@@ -146,7 +146,6 @@ class Shutdown:
     def _look_at_stopping(self, now_s: float) -> None:
         left_s = self._deadline_s - now_s
         if left_s <= 0.0:
-            self._read([*self._processes])
             for process in self._processes:
                 self._fail_to_end(process, now_s)
             self._kill_all()
@@ -203,7 +202,8 @@ class Shutdown:
 
     def kill(self, processes: Sequence[RunningNode]) -> None:
         """Kill processes, and tell where their nodes stood."""
-        self._read(processes)
+        self._begin_to_read(processes)
+        self._reader.wait(_READ_S)
         now_s = time.monotonic()
         stood = [(process, *self._detector.where(process.names, now_s)) for process in processes]
         for process in processes:
@@ -223,8 +223,3 @@ class Shutdown:
     def _begin_to_read(self, processes: Sequence[RunningNode]) -> None:
         for process in processes:
             self._reader.begin(process.names[0])
-
-    def _read(self, processes: Sequence[RunningNode]) -> None:
-        """Read where the threads of processes stand, as far as there is time for that."""
-        self._begin_to_read(processes)
-        self._reader.wait(_READ_S)

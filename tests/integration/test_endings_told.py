@@ -43,7 +43,6 @@ def beat(node):
         node.set_user_data(True)
         threading.Thread(target=work, daemon=True).start()
 def work():
-    time.sleep(0.3)
     {KEEP_THE_GIL}
 """
 HANGS = """
