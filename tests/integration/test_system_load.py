@@ -32,7 +32,8 @@ def test_every_node_has_figures_of_its_own(tmp_path: Path) -> None:
 def test_nodes_that_share_a_process_share_its_figures(tmp_path: Path) -> None:
     finished, rows = watched(tmp_path, "in-process")
     shown = [row["host.memory_bytes"] for row in rows]
-    assert int(shown[0]) > 20_000_000
+    # The first reading may be of a process that is only starting, the last of one that has ended.
+    assert any(int(memory or 0) > 20_000_000 for memory in shown), rows
     assert "0" not in shown, "a process that ends has no figures"
     assert not {f"{node}.threads" for node in finished.record["nodes"]} & rows[0].keys()
 
