@@ -30,6 +30,7 @@ IMPORT = "<module>"
 _READ_S = 2.0
 _MOST_FRAMES = 100  # shown, as by faulthandler
 _MAIN_THREAD = "MainThread"
+_STOPPED = "the process is stopped"  # by SIGSTOP, or a debugger
 _PR_SET_PTRACER, _ANY = 0x59616D61, -1  # prctl(2), ptrace(2)
 _INIT = 1
 
@@ -69,12 +70,12 @@ class ProcessThreads:
     """Where the threads of a process stand in Python.
 
     Attributes:
-        is_stopped: whether the process was stopped (SIGSTOP), so that none of them goes on.
+        stopped: why none of them goes on ("the process is stopped"); empty if they may.
         problem: why they could not be read; empty if they could.
     """
 
     threads: tuple[Thread, ...] = ()
-    is_stopped: bool = False
+    stopped: str = ""
     problem: str = ""
 
     def __str__(self) -> str:
@@ -121,7 +122,7 @@ def threads_of(pid: int) -> ProcessThreads:
     except (OSError, ValueError, LookupError, TypeError) as error:
         return ProcessThreads(problem=f"py-spy: {error}")
     threads.sort(key=lambda each: not each.is_main)
-    return ProcessThreads(tuple(threads), state in (b"T", b"t"))
+    return ProcessThreads(tuple(threads), _STOPPED if state in (b"T", b"t") else "")
 
 
 def allow_reading() -> None:

@@ -201,7 +201,7 @@ class StallDetector:
     def _remark_on(self, names: Sequence[str], read: ProcessThreads) -> str:
         """Why a process with these nodes does not report; empty if that has been said."""
         holder = read.lock_holder
-        if holder and holder.is_main and not read.is_stopped:
+        if holder and holder.is_main and not read.stopped:
             for stack in filter(None, map(self._read_stack, names)):
                 if self._is_named(stack.node):
                     return ""
@@ -214,8 +214,8 @@ class StallDetector:
         have = "has" if len(names) == 1 else "have"
         last_seen = "".join(map(self.last_seen, names))
         silence = f"{', '.join(names)} {have} not reported for {LONG_S:g} s{last_seen}: "
-        if read.is_stopped:
-            return f"{silence}the process is stopped"
+        if read.stopped:
+            return f"{silence}{read.stopped}"
         if holder:
             return f"{silence}{holder}"
         if read.threads:

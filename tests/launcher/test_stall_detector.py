@@ -282,7 +282,7 @@ def silence(detector: StallDetector, now_s: float = 5.0) -> list[str]:
             f"b, a have not reported for 5 s, last seen executing 'step': {AT_WORK}",
         ),
         (
-            replace(HELD, is_stopped=True),
+            replace(HELD, stopped="the process is stopped"),
             "b, a have not reported for 5 s, last seen executing 'step': the process is stopped",
         ),
         (

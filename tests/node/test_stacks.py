@@ -73,7 +73,7 @@ def test_it_is_read_while_the_plugin_holds_the_global_lock(plugin: Path) -> None
     with in_hook(plugin, "hold") as pid:
         wait_until(lambda: "in hold" in str(threads_of(pid)), 20.0)
         read = threads_of(pid)
-    assert not read.is_stopped
+    assert not read.stopped
     assert read.lock_holder is not None
     assert read.lock_holder.is_main
     assert read.hook_stack("other", str(plugin.parent / "other.py")) is None
@@ -102,7 +102,7 @@ def test_a_process_that_was_stopped_is_read_too(plugin: Path) -> None:
     with in_hook(plugin, "hold") as pid:
         wait_until(lambda: "in hold" in str(threads_of(pid)), 20.0)
         os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: threads_of(pid).is_stopped, 20.0)
+        wait_until(lambda: threads_of(pid).stopped, 20.0)
         assert "in deep" in str(threads_of(pid))
 
 

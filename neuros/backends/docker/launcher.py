@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,7 @@ _STOP_S = 2
 _MOST_AT_ONCE = 16
 _OUT_OF_MEMORY = 128 + signal.SIGKILL
 _NOT_EXECUTED = (125, 126, 127)
+_PAUSED = "the container is paused"
 _STOPPED = "the Docker engine stopped it: by `docker stop`, or because the engine itself ended"
 # The engine removes a container as soon as it has ended. If it cannot, its node has ended anyway.
 _REMOVAL_S = 2.0
@@ -292,7 +293,7 @@ class RunningContainer:
             read = threads_of(pid)
             if read.threads:
                 break
-        return read
+        return replace(read, stopped=_PAUSED) if self._events.is_paused(self.id) else read
 
     def _signal(self, number: signal.Signals) -> None:
         self._is_told = True
@@ -335,6 +336,7 @@ class _Fate:
     died_s: float = 0.0
     is_out_of_memory: bool = False
     is_signalled: bool = False
+    is_paused: bool = False
     is_gone: bool = False
 
 
@@ -404,6 +406,11 @@ class ContainerEvents(threading.Thread):
         fate = self._fates.get(container_id)
         return fate is not None and fate.is_signalled
 
+    def is_paused(self, container_id: str) -> bool:
+        """Whether the engine has frozen it (`docker pause`)."""
+        fate = self._fates.get(container_id)
+        return fate is not None and fate.is_paused
+
     def pids(self, node: str | None = None) -> Sequence[int]:
         """Of the processes of a node, or of all, as this machine sees them; the oldest first."""
         found = RunProcesses(self._run_id).nodes()
@@ -422,6 +429,8 @@ class ContainerEvents(threading.Thread):
             fate.is_out_of_memory = True
         elif event["Action"] == "kill":
             fate.is_signalled = True
+        elif event["Action"] in ("pause", "unpause"):
+            fate.is_paused = event["Action"] == "pause"
         elif event["Action"] == "die":
             fate.died_s = time.monotonic()
             fate.exit_code = int(actor["Attributes"]["exitCode"])

@@ -1,7 +1,8 @@
-"""Ends that say what happened, and a loop in lockstep that ends at once: in containers, too."""
+"""In containers, too: what hangs is said, ends say what happened, and a loop in lockstep ends."""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from ending_bench import RELAY, Bench, assert_ended, made_bench
 from endings import KEEP_THE_GIL, RUNS
 
-from containers import nothing_left, require_containers
+from containers import connected, nothing_left, require_containers
 
 HOLDS = f"""
 @neuros_tick(seconds=1.0)
@@ -31,6 +32,13 @@ def begin(node):
     for number in range(1000):
         print(number, file=KEPT)
     atexit.register(note, node, "at exit")
+"""
+COMPUTES = """
+@neuros_tick(seconds=0.1)
+def compute(node):
+    node.get_logger().info("computing")
+    while True:
+        pass
 """
 BEGINS = """
 @neuros_initialise(outputs="o")
@@ -59,6 +67,28 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
         assert f"'{node}' had to be killed 5 s after the end began: {what}" in finished.output
         assert f"{node} was at this point when it was killed:\n" in finished.output
         assert f'File "{bench.folder}/{node}.py", line ' in finished.record["nodes"][node]["stack"]
+
+
+def test_a_container_that_was_paused_while_it_computed_is_said_to_be_paused(bench: Bench) -> None:
+    bench.project(busy=COMPUTES)
+    running = bench.start()
+    running.wait_for("computing", 20.0)
+    with connected() as engine:
+        (container,) = (
+            each
+            for each in engine.containers.list()
+            if each.labels.get("neuros.run_folder", "").startswith(f"{bench.folder}/")
+        )
+        container.pause()
+        running.wait_for(": the container is paused\n")
+        container.unpause()
+    running.signal(signal.SIGINT)
+    running.wait_for("a second one kills at once")
+    running.signal(signal.SIGINT)
+    finished = running.finish()
+    assert finished.exit_code == 130
+    assert "busy has not reported for 5 s" in finished.output
+    assert ", and cannot report" not in finished.output
 
 
 def test_a_loop_in_lockstep_ends_after_one_more_round_and_leaves_whole_files(bench: Bench) -> None:
