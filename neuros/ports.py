@@ -391,8 +391,8 @@ class RunningNode(Protocol):
     def is_abandoned(self) -> bool:
         """Whether what it ran in has gone (its engine), so that its node is not to blame."""
 
-    def terminate(self) -> None:
-        """Ask it to end (SIGTERM)."""
+    def is_heard(self) -> bool:
+        """Whether all has arrived that its nodes had said when this was first asked."""
 
     def kill(self) -> None: ...
 

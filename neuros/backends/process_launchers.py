@@ -178,7 +178,12 @@ class RunningProcess:
         return self.poll()
 
     def terminate(self) -> None:
+        """Ask it to end (SIGTERM)."""
         self._process.terminate()
+
+    def is_heard(self) -> bool:
+        """Whether what its nodes have said is here: they say it on this machine."""
+        return True
 
     def kill(self) -> None:
         """Kill it and its whole process group."""

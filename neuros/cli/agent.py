@@ -42,6 +42,7 @@ from neuros.control.machines import (
     Examined,
     Finish,
     Finished,
+    KillNode,
     Lacking,
     NodeEnded,
     Place,
@@ -52,7 +53,6 @@ from neuros.control.machines import (
     Ready,
     Refused,
     Remark,
-    SignalNode,
     Start,
     Started,
     ThreadsRead,
@@ -168,8 +168,9 @@ class Agent:
                     self._prepare(nodes)
                 case Start():
                     self._start(message)
-                case SignalNode(node, name):
-                    self._signal(node, name)
+                case KillNode(node):
+                    if node in self._processes:
+                        self._processes[node].kill()
                 case ReadThreads(node):
                     self._read_threads(node)
                 case Took(size):
@@ -299,11 +300,6 @@ class Agent:
         check_observation(monitors_load=True)
         self._monitor = load_monitor(run_id, self._run, names, is_one_process=False)
         self._monitor.start()
-
-    def _signal(self, node: str, name: str) -> None:
-        process = self._processes.get(node)
-        if process is not None:
-            (process.kill if name == "KILL" else process.terminate)()
 
     def _read_threads(self, node: str) -> None:
         """Beside all else: it may take seconds."""

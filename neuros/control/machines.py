@@ -128,11 +128,10 @@ class Start(Message):
 
 
 @dataclass(frozen=True)
-class SignalNode(Message):
-    """Send a signal (``TERM``, ``KILL``) to the process of a node."""
+class KillNode(Message):
+    """Kill the process of a node."""
 
     node: str
-    signal: str
 
 
 @dataclass(frozen=True)
@@ -140,6 +139,13 @@ class ReadThreads(Message):
     """Read where the threads of a node's process stand."""
 
     node: str
+
+
+@dataclass(frozen=True)
+class Flush(Message):
+    """Send all that nodes have said by now, and then :class:`Flushed` with this number."""
+
+    number: int
 
 
 @dataclass(frozen=True)
@@ -239,6 +245,13 @@ class ThreadsRead(Message):
 
 
 @dataclass(frozen=True)
+class Flushed(Message):
+    """All that nodes had said when :class:`Flush` came has been sent."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class Chunk(Message):
     """Bytes of a file of the run folder, in base64, at the offset at which it is to end before."""
 
@@ -265,10 +278,10 @@ class Finished(Message):
 BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)
 TO_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
-    *(Place, Content, Prepare, Start, SignalNode, ReadThreads, Took, Examine, Finish),
+    *(Place, Content, Prepare, Start, KillNode, ReadThreads, Flush, Took, Examine, Finish),
 )
 FROM_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
     *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Chunk, Examined),
-    *(ThreadsRead, Finished),
+    *(ThreadsRead, Flushed, Finished),
 )

@@ -59,6 +59,8 @@ class Shutdown:
     _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
+    _postponed: Callable[[], None] | None = None
+    _are_heard: bool = False
 
     @property
     def is_hopeless(self) -> bool:
@@ -83,12 +85,29 @@ class Shutdown:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
+        self._when_heard(lambda: self._begin_to_drain(stopped))
+
+    def _begin_to_drain(self, stopped: str) -> None:
         # A node that is still loading has sent nothing, and nobody could send to it yet.
         for process in self._processes.not_loaded():
             self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
             self._processes.kill(process)
         self._channels.send(Drain(self._declarations.last_round(stopped)))
-        self._probing.drain(self._processes.killed, now_s)
+        self._probing.drain(self._processes.killed, time.monotonic())
+
+    def _when_heard(self, act: Callable[[], None]) -> None:
+        """Do something when it is known for sure which nodes have not been loaded.
+
+        Elsewhere one may have been loaded, and have worked: then what it said is on its way.
+        """
+        self._postponed, self._are_heard = None, not self._unheard()
+        if self._are_heard:  # none is elsewhere
+            act()
+        else:
+            self._postponed = act
+
+    def _unheard(self) -> list[RunningNode]:
+        return [each for each in self._processes.not_loaded() if not each.is_heard()]
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """End as failed, at once."""
@@ -130,18 +149,29 @@ class Shutdown:
 
     def look(self, now_s: float) -> None:
         """Go on to the next phase where it is time."""
+        if self._postponed is not None:
+            if self._are_heard:  # and what has come has been read since
+                act, self._postponed = self._postponed, None
+                act()
+            else:
+                self._are_heard = not self._unheard()
         if self.phase is Phase.STOPPING:
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
-            if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+            is_asked = self._postponed is None
+            if is_asked and self._probing.look(now_s, 0.0) is Verdict.DRAINED:
                 self._outcome.has_drained = True
                 self._stop()
             elif now_s >= self._deadline_s:
-                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
+                left = self._probing.what_is_left(now_s) if is_asked else self._not_known()
+                why = "; ".join(left) or "packets keep coming"
                 self._output.log("WARN", f"not drained in time: {why}")
                 self._outcome.late_drain = why
                 self._outcome.has_drained = True
                 self._stop()
+
+    def _not_known(self) -> list[str]:
+        return [f"whether {names_of(each)} has started is not known" for each in self._unheard()]
 
     def _look_at_stopping(self, now_s: float) -> None:
         left_s = self._deadline_s - now_s
@@ -191,9 +221,12 @@ class Shutdown:
         self._deadline_s = now_s + STOP_S
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send(Stop())
+        self._when_heard(self._kill_not_loaded)
+        self._on_stop()
+
+    def _kill_not_loaded(self) -> None:
         for process in self._processes.not_loaded():
             self._processes.kill(process)  # it has not come as far as anything worth finalising
-        self._on_stop()
 
     def _kill_all(self) -> None:
         self.phase = Phase.KILLED

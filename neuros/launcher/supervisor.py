@@ -238,7 +238,7 @@ class Supervisor:
             self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
             self._channels.send_to(link, control.Pause())
-        if self._shutdown.phase is not Phase.RUNNING:
+        if self._shutdown.phase not in (Phase.RUNNING, Phase.DRAINING):
             self._channels.send_to(link, control.Stop())
 
     def _on_report(self, report: Report) -> None:

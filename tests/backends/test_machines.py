@@ -19,7 +19,16 @@ from neuros.backends.machines.pump import Pump
 from neuros.cli.agent import Agent, remove_old_runs
 from neuros.control import LiveCounters, Message, NodeStatus, Report
 from neuros.control.link import encode
-from neuros.control.machines import FROM_AGENT, TO_AGENT, Chunk, NodeEnded, Pong, Tree
+from neuros.control.machines import (
+    FROM_AGENT,
+    TO_AGENT,
+    Chunk,
+    Flush,
+    Flushed,
+    NodeEnded,
+    Pong,
+    Tree,
+)
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 
@@ -338,6 +347,22 @@ class TestPump:
         wait_for(lambda: end in ends.to_launcher)
         supervisor.setblocking(False)  # what it has said before is there when its end is known
         assert b"".join(iter(lambda: supervisor.recv(1 << 16), b"")) == words
+        supervisor.close()
+
+    def test_all_that_was_said_by_then_comes_before_it_is_told_to_be_there(
+        self, ends: Ends
+    ) -> None:
+        words = b"words\n" * 10_000
+        node = connect(ends.listener.address)  # and nobody has accepted it yet
+        node.sendall(words)
+        ends.launcher.send(Flush(3))
+        wait_for(lambda: Flushed(3) in ends.to_launcher)
+        supervisor = ends.accepted()
+        supervisor.setblocking(False)
+        arrived = b""
+        while len(arrived) < len(words):
+            arrived += supervisor.recv(1 << 16)  # raises where nothing is there yet
+        node.close()
         supervisor.close()
 
     def test_who_hangs_up_is_missed_at_once(self, ends: Ends) -> None:

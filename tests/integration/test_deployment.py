@@ -9,11 +9,13 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from ending_bench import Bench, assert_ended
 from launching import Finished, Running, killed_in_a_hook, launch, start
 
 from containers import wait_until
@@ -29,6 +31,37 @@ from neuros.testing.back_ends import PROJECTS
 STREAM = Path(__file__).parent / "network" / "stream"
 NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
+SLOW_NETWORK = """
+import os, subprocess, sys, time
+slow, ends, *command = sys.argv[1:]
+agent = subprocess.Popen(command, stdout=subprocess.PIPE)
+while data := os.read(agent.stdout.fileno(), 1 << 16):
+    while os.path.exists(slow) and not os.path.exists(ends):
+        time.sleep(0.01)
+    if os.path.exists(ends):
+        time.sleep(0.2)
+    os.write(1, data)
+sys.exit(agent.wait())
+"""
+LOOKS_AND_SAVES = """
+from pathlib import Path
+from neuros.hooks import neuros_finalise, neuros_tick
+Path("{slow}").touch()
+@neuros_tick(seconds=0.05, outputs="o")
+def look(node):
+    return node.make_packet("o")
+@neuros_finalise()
+def save(node):
+    (node.run_dir / "saved").touch()
+"""
+SEES_AND_ENDS = """
+from pathlib import Path
+from neuros.hooks import neuros_function
+@neuros_function(inputs="x")
+def see(node, x):
+    node.shutdown("seen")
+    Path("{ends}").touch()
+"""
 ENDED_S = 120.0  # on a machine that does many other things
 
 
@@ -37,12 +70,12 @@ def project(tmp_path: Path) -> Path:
     return Path(shutil.copytree(STREAM, tmp_path / "stream"))
 
 
-def deployment(folder: Path, **more: Any) -> Path:
+def deployment(folder: Path, *, through: Sequence[str] = (), **more: Any) -> Path:
     """The sink is with an agent, which has a cache and a current folder of its own."""
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir(exist_ok=True)
-    through = ["env", f"--chdir={elsewhere}", f"XDG_CACHE_HOME={elsewhere}"]
-    host = {"through": through, "neuros": str(NEUROS), "address": "127.0.0.1"}
+    apart = ["env", f"--chdir={elsewhere}", f"XDG_CACHE_HOME={elsewhere}"]
+    host = {"through": [*through, *apart], "neuros": str(NEUROS), "address": "127.0.0.1"}
     content = {"hosts": {"other": host}, "nodes": {"sink": "other"}, "timeout_s": 60, **more}
     file = folder / "deployment.json"
     file.write_text(json.dumps(content))
@@ -94,6 +127,26 @@ def test_it_is_said_where_a_node_elsewhere_stood_that_is_killed(tmp_path: Path) 
     assert "in compute" in finished.record["nodes"]["reader"]["stack"], finished.output
     assert f'File "{PROJECTS}/stuck/reader.py"' in finished.output
     assert left_there(tmp_path) == []
+
+
+def test_a_node_elsewhere_whose_packet_overtook_its_report_ends_as_one_that_has_worked(
+    tmp_path: Path,
+) -> None:
+    slow, ends = tmp_path / "slow", tmp_path / "ends"
+    bench = Bench(tmp_path, "process")
+    bench.project(
+        ("eye.o -> brain.x", None),
+        eye=LOOKS_AND_SAVES.format(slow=slow),
+        brain=SEES_AND_ENDS.format(ends=ends),
+    )
+    (tmp_path / "slow_network.py").write_text(SLOW_NETWORK)
+    late = [sys.executable, str(tmp_path / "slow_network.py"), str(slow), str(ends)]
+    file = deployment(tmp_path, nodes={"eye": "other"}, through=late)
+    finished = bench.launch("--deployment", str(file), timeout_s=ENDED_S)
+    assert_ended(finished, 0, "brain ended the project: seen")
+    assert "had not started yet" not in finished.output
+    assert finished.run_folder is not None
+    assert (finished.run_folder / "eye" / "saved").exists(), finished.output
 
 
 def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(

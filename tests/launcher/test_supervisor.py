@@ -12,9 +12,10 @@ import pytest
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
 from containers import wait_until
+from neuros.backends.process_launchers import RunningProcess
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import stall_detector
+from neuros.launcher import shutdown, stall_detector
 from neuros.launcher.channels import Channels
 
 
@@ -83,6 +84,39 @@ host.serve()
     outcome = run(a=ends, b=reports)
     assert (outcome.exit_code, outcome.failures) == (0, [])
     assert outcome.has_final_report("b"), run.output.said
+
+
+IMPORTS = "host.hello(); Path('b.up').touch(); time.sleep(60)"
+
+
+def test_a_node_elsewhere_that_has_not_started_is_killed_once_all_is_heard(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = [False, False, True]
+    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: answers.pop(0) if answers else True)
+    outcome = run(a=SHUTS_DOWN, b=IMPORTS)
+    assert (outcome.exit_code, outcome.failures, answers) == (0, [], [])
+    assert outcome.has_drained
+    assert "'b' had not started yet: killed" in run.output.said
+
+
+@pytest.mark.parametrize(
+    "ends", [SHUTS_DOWN, "host.up_last(); host.ask('interrupt'); host.serve()"]
+)
+def test_one_of_which_nothing_is_heard_holds_up_no_end(
+    run: Run, ends: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: False)
+    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
+    outcome = run(a=ends.replace("drain_s=5", "drain_s=0.2"), b=IMPORTS)
+    is_drained = ends == SHUTS_DOWN
+    why = "not drained in time: whether 'b' has started is not known"
+    assert (why in run.output.said) == is_drained
+    assert outcome.exit_code == (1 if is_drained else 130)
+    assert outcome.failures == [
+        "node 'b' had to be killed 0.5 s after the end began: 'b' did not begin to finalise"
+    ]
+    assert run.lasted_s < 5.0
 
 
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:

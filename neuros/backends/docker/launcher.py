@@ -280,11 +280,16 @@ class RunningContainer:
     def is_abandoned(self) -> bool:
         return bool(self._events.lost) and self._events.end_of(self.id) is None
 
-    def terminate(self) -> None:
-        self._signal(signal.SIGTERM)
+    def is_heard(self) -> bool:
+        """Whether what its node has said is here: it says so on this machine."""
+        return True
 
     def kill(self) -> None:
-        self._signal(signal.SIGKILL)
+        self._is_told = True
+        if self._events.lost:
+            self._events.signal_all(signal.SIGKILL, self._file.node.name)
+        else:
+            threading.Thread(target=self._tell_engine, daemon=True).start()
 
     def threads(self) -> ProcessThreads:
         """Where its threads stand in Python; the first of its processes may be an init program."""
@@ -295,17 +300,10 @@ class RunningContainer:
                 break
         return replace(read, stopped=_PAUSED) if self._events.is_paused(self.id) else read
 
-    def _signal(self, number: signal.Signals) -> None:
-        self._is_told = True
-        if self._events.lost:
-            self._events.signal_all(number, self._file.node.name)
-        else:
-            threading.Thread(target=self._tell_engine, args=(number,), daemon=True).start()
-
-    def _tell_engine(self, number: signal.Signals) -> None:
+    def _tell_engine(self) -> None:
         # It may have ended meanwhile; the events say what became of it.
         with contextlib.suppress(DockerException, requests.RequestException):
-            self._engine.api.kill(self.id, int(number))
+            self._engine.api.kill(self.id)
 
 
 def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: int | None) -> str:

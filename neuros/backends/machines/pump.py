@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 
 from neuros.control import Message
 from neuros.control.link import ControlLink, decode, encode, kind_of
-from neuros.control.machines import Closed, Opened, Ping, Pong, Said
+from neuros.control.machines import Closed, Flush, Flushed, Opened, Ping, Pong, Said
 from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
 
@@ -147,7 +147,7 @@ class Pump(threading.Thread):
                     pass
         if self._read_from in ready and (reason := self._read()):
             return reason
-        if self._listener is not None and self._listener.fileno() in ready:
+        if self._last or (self._listener is not None and self._listener.fileno() in ready):
             self._accept()
         for number, link in tuple(self._links.items()):
             if link.fileno() in ready:
@@ -197,6 +197,8 @@ class Pump(threading.Thread):
         match message:
             case Ping(sent_s):
                 self.send(Pong(sent_s, time.monotonic(), time.time()))
+            case Flush(number):
+                self.send_last(Flushed(number))
             case Opened(number):
                 if self._connect is not None:
                     self._open(number)
@@ -237,8 +239,7 @@ class Pump(threading.Thread):
             self.send(self._last.popleft())
 
     def _accept(self) -> None:
-        assert self._listener is not None
-        while (stream := self._listener.accept()) is not None:
+        while self._listener is not None and (stream := self._listener.accept()) is not None:
             self._count += 1
             self._add(self._count, stream)
             self.send(Opened(self._count))

@@ -101,8 +101,8 @@ class NiceNode:
         code = self._child.poll()
         return None if code is None else f"exit code {code}"
 
-    def terminate(self) -> None:
-        self._child.terminate()
+    def is_heard(self) -> bool:
+        return True
 
     def threads(self) -> ProcessThreads:
         return threads_of(self._child.pid)
