@@ -27,7 +27,8 @@ def simulate(node):
     robot.sim.step_to_next()
     robot.steer()
     if robot.sim.sim_time > duration_s() - robot.sim.timestep / 2:
-        node.shutdown(f"{duration_s():g} s simulated")
+        # A network that has begun to learn is waited for.
+        node.shutdown(f"{duration_s():g} s simulated", drain_s=60.0)
     readings = {name: robot.sim.read(name) for name in SENSES}
     if readings["imu"] is not None and os.environ.get("EMPTY_BETWEEN_FRAMES", "0") != "0":
         for eye in EYES:
