@@ -275,9 +275,23 @@ class NodeProcess:
     # ------------------------------------------------------------------ inside
 
     def _live(self) -> None:
-        self._open_middleware()
+        # Modules stay: rounds of the garbage collector would go through them for nothing.
+        gc.disable()
+        try:
+            self._load()
+        finally:
+            gc.freeze()
+            gc.enable()
+        if self.is_ending:
+            return
         assert self._middleware is not None
-        self._peers.open(self._middleware)
+        for node in self._nodes:
+            self._middleware.loop.post(node.start)
+        self._middleware.loop.run()
+        self._middleware.take_in()
+
+    def _load(self) -> None:
+        self._peers.open(self._open_middleware())
         for file in self._files:
             self._add(file)
         for node in self._nodes:
@@ -288,27 +302,16 @@ class NodeProcess:
                 self._tell(declared(node.name, node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
-        if self.is_ending:
-            return
-        self.report()
-        for node in self._nodes:
-            self._middleware.loop.post(node.start)
-        gc.freeze()
-        self._middleware.loop.run()
-        self._middleware.take_in()
+        if not self.is_ending:
+            self.report()
 
-    def _open_middleware(self) -> None:
-        # Its modules stay: rounds of the garbage collector would go through them for nothing.
-        gc.disable()
-        try:
-            middleware = self._make_middleware(self._files, self._fail_outside_hooks)
-        finally:
-            gc.freeze()
-            gc.enable()
+    def _open_middleware(self) -> Middleware:
+        middleware = self._make_middleware(self._files, self._fail_outside_hooks)
         with self._early_lock:
             self._middleware = middleware
             for event in self._early_events:
                 middleware.loop.post_from_thread(event)
+        return middleware
 
     @property
     def is_ending(self) -> bool:
