@@ -11,6 +11,7 @@ from site_parts import code, command_line, contents, diagrams, links, pages, wra
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Called by Sphinx."""
+    app.add_domain(links.Python, override=True)
     app.connect("builder-inited", pages.write)
     app.connect("source-read", contents.add_toctrees)
     app.connect("source-read", command_line.add_option_tables)

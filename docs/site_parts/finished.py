@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from html.parser import HTMLParser
+from os.path import normpath
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -44,7 +45,7 @@ def dead_links(site: Path) -> Iterator[str]:
 
 def _leads_somewhere(pages: dict[Path, _Page], file: Path, link: str) -> bool:
     path, _, anchor = link.partition("#")
-    target = (file.parent / unquote(path.partition("?")[0])).resolve() if path else file
+    target = Path(normpath(file.parent / unquote(path.partition("?")[0]))) if path else file
     if target in pages:
         return unquote(anchor) in pages[target].anchors
     return target.exists()
