@@ -82,6 +82,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "transport": {
         "numpy",
         "rclpy",
+        "rosidl_generator_py",
         "rosidl_parser",
         "rpyutils",
         "xxhash",

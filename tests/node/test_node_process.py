@@ -11,7 +11,7 @@ from neuros.errors import EnvironmentFault
 from neuros.node.process import NodeProcess
 
 
-def test_no_garbage_is_looked_for_while_the_middleware_is_imported() -> None:
+def test_no_garbage_is_looked_for_until_the_loop_begins() -> None:
     seen: list[bool] = []
 
     def make_middleware(*_: Any) -> Any:
@@ -20,5 +20,5 @@ def test_no_garbage_is_looked_for_while_the_middleware_is_imported() -> None:
 
     process = NodeProcess([], make_middleware, connect=lambda: pytest.fail("nobody listens"))
     with pytest.raises(EnvironmentFault):
-        process._open_middleware()
+        process._live()
     assert (seen, gc.isenabled()) == ([False], True)
