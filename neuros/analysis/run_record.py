@@ -354,6 +354,8 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
                 "index": index,
                 "discard_limit": each.get("discard_limit"),
                 "queue_size": each.get("queue_size", 1),
+                "sent": None,
+                "received": None,
             }
             for index, each in enumerate(project.get("connections", ()))
         ]

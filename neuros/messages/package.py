@@ -118,6 +118,9 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
     file = folder / MANIFEST
     try:
         manifest = parse_package_string(file.read_text("utf-8"), str(file), warnings=[])
+    except RecursionError as error:
+        text = "its elements are nested too deeply"
+        raise ManifestError(problem_at(file, text, 1)) from error
     except (InvalidPackage, OSError, UnicodeError, AssertionError, ValueError) as error:
         lines = str(error).splitlines() or [""]
         text = " ".join(

@@ -52,6 +52,7 @@ def run(
                 "discard_limit": discard_limit,
                 "queue_size": 1,
                 "sent": len(digests),
+                "received": len(digests),
             }
         )
     (folder / "run.json").write_text(json.dumps({"format": 2, "connections": connections}))
