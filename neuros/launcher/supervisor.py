@@ -103,8 +103,8 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self.outcome = Outcome()
-        reader = ThreadReader(lambda name: self._processes.with_node(name))
-        self._detector = StallDetector(names, time.monotonic(), reader)
+        self._reader = ThreadReader(lambda name: self._processes.with_node(name))
+        self._detector = StallDetector(names, time.monotonic(), self._reader)
         self._processes = Processes(self._detector, self.outcome)
         self._peers.speak_through(lambda text: self._channels.send(control.Say(text)))
         connections = connections_among(files)
@@ -116,7 +116,7 @@ class Supervisor:
             self._channels,
             self._processes,
             self._detector,
-            reader,
+            self._reader,
             self._declarations,
             self._probing,
             self._peers,
@@ -160,6 +160,7 @@ class Supervisor:
         finally:
             for process in self._processes:
                 process.kill()
+            self._reader.close()
             self._hear()
             self.observers.part(self.outcome)
             self._channels.close()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 
 from neuros.ports import RunningNode
 from neuros.stacks import ProcessThreads
+
+_CLOSE_S = 3.0
 
 
 class ThreadReader:
@@ -20,17 +23,20 @@ class ThreadReader:
     def __init__(self, process_of: Callable[[str], RunningNode | None]) -> None:
         self._process_of = process_of
         self._readings: dict[str, Future[ProcessThreads]] = {}  # by first node
+        self._begun: list[threading.Thread] = []
 
     def begin(self, name: str) -> None:
         """Read the process whose first node this is, unless that has begun."""
         if name not in self._readings:
             reading = self._readings[name] = Future[ProcessThreads]()
-            threading.Thread(
+            thread = threading.Thread(
                 target=_read,
                 args=(self._process_of(name), reading),
                 name="neuros-stacks",
                 daemon=True,
-            ).start()
+            )
+            thread.start()
+            self._begun = [*filter(threading.Thread.is_alive, self._begun), thread]
 
     def forget(self, name: str) -> None:
         """The process goes on: what was read of it is past."""
@@ -44,6 +50,12 @@ class ThreadReader:
     def wait(self, limit_s: float) -> None:
         """Until all that has begun is there, or the time is over."""
         wait(self._readings.values(), limit_s)
+
+    def close(self) -> None:
+        """Wait for what still reads, so that no program is left that does; for 3 s at most."""
+        end_s = time.monotonic() + _CLOSE_S
+        for thread in self._begun:
+            thread.join(max(0.0, end_s - time.monotonic()))
 
 
 def _read(process: RunningNode | None, reading: Future[ProcessThreads]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
@@ -54,6 +55,20 @@ def test_a_process_is_read_once_until_it_goes_on() -> None:
     reader.begin("a")
     reader.wait(10.0)
     assert reader.read("a") == AGAIN
+
+
+def test_in_the_end_nothing_reads_any_more() -> None:
+    done: list[str] = []
+
+    def slow(name: str) -> Callable[[], ProcessThreads]:
+        return lambda: (time.sleep(0.2), done.append(name), READ)[2]
+
+    reader = reader_of(a=slow("a"), b=slow("b"))
+    reader.begin("a")
+    reader.forget("a")
+    reader.begin("b")
+    reader.close()
+    assert sorted(done) == ["a", "b"]
 
 
 def test_what_fails_is_told() -> None:
