@@ -152,7 +152,11 @@ class StepLink(Generic[_Received]):
 
     def _message(self, head: bytearray, body: bytes) -> _Received:
         try:
-            found: _Received = self._received.from_frame(_from_json(head.decode())[0], body)
+            text = head.decode()
+            values, end = _from_json(text)
+            if end != len(text):
+                raise ValueError("more than its values is in its head")
+            found: _Received = self._received.from_frame(values, body)
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise ControlError(f"{self._peer} sent a frame that is no step: {error}") from None
         return found
