@@ -21,9 +21,10 @@ _PUBLIC = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*")
 
 
 class Python(PythonDomain):
-    """Python's names, without a look at all objects for each type of another project.
+    """Python's names; one whose last part no object here has is not searched for.
 
-    Such a look took a quarter of the time of a build. Whatever a name leads to has its last part.
+    Sphinx goes through all objects for each such name, of which other projects have most: a quarter
+    of the time of a build.
     """
 
     _last_parts: frozenset[str] = frozenset()

@@ -356,6 +356,7 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
                 "queue_size": each.get("queue_size", 1),
                 "sent": None,
                 "received": None,
+                "consumed": None,
             }
             for index, each in enumerate(project.get("connections", ()))
         ]

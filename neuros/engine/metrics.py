@@ -242,6 +242,6 @@ def _without_initialising(
     executing: Mapping[str, float], hooks: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
     """Seconds by hook without those of ``neuros_initialise``; a function may have other marks."""
-    initialising = {name: (hook or {}).get("initialise_s") or 0.0 for name, hook in hooks.items()}
+    initialising = {name: hook.get("initialise_s") or 0.0 for name, hook in hooks.items()}
     rest = {name: (s or 0.0) - initialising.get(name, 0.0) for name, s in executing.items()}
     return {name: s for name, s in rest.items() if s > 0}

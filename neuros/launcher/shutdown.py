@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from neuros.control import Drain, Leave, Stop
 from neuros.launcher.channels import Channels
@@ -59,8 +59,9 @@ class Shutdown:
     _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
-    _postponed: Callable[[], None] | None = None
-    _are_heard: bool = False
+    _ended_by: str = ""
+    _is_told_to_drain: bool = False
+    _heard: dict[tuple[str, ...], bool] = field(default_factory=dict)
 
     @property
     def is_hopeless(self) -> bool:
@@ -85,29 +86,44 @@ class Shutdown:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._when_heard(lambda: self._begin_to_drain(stopped))
+        self._ended_by = stopped
+        self._begin_to_drain(is_look=False)
 
-    def _begin_to_drain(self, stopped: str) -> None:
+    def _begin_to_drain(self, *, is_look: bool) -> None:
         # A node that is still loading has sent nothing, and nobody could send to it yet.
-        for process in self._processes.not_loaded():
-            self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
-            self._processes.kill(process)
-        self._channels.send(Drain(self._declarations.last_round(stopped)))
-        self._probing.drain(self._processes.killed, time.monotonic())
+        self._kill_not_started(is_look=is_look)
+        if not self._starting():
+            self._is_told_to_drain = True
+            self._channels.send(Drain(self._declarations.last_round(self._ended_by)))
+            self._probing.drain(self._processes.killed, time.monotonic())
 
-    def _when_heard(self, act: Callable[[], None]) -> None:
-        """Do something when it is known for sure which nodes have not been loaded.
+    def _starting(self) -> list[RunningNode]:
+        """Processes in which no node has been loaded, as far as is known."""
+        killed = self._processes.killed
+        return [each for each in self._processes.not_loaded() if not killed.issuperset(each.names)]
 
-        Elsewhere one may have been loaded, and have worked: then what it said is on its way.
+    def _kill_not_started(self, *, is_look: bool) -> None:
+        """Kill what has not come as far as anything worth finalising.
+
+        Elsewhere a node may have been loaded, and have worked: then what it said is on its way.
+        What has arrived by one look has been read by the next.
         """
-        self._postponed, self._are_heard = None, not self._unheard()
-        if self._are_heard:  # none is elsewhere
-            act()
-        else:
-            self._postponed = act
+        for process in self._starting():
+            if process.names not in self._heard:
+                is_sure = self._heard[process.names] = process.is_heard()  # here nothing is late
+            else:
+                is_sure = is_look and self._heard[process.names]
+                self._heard[process.names] |= is_look and process.is_heard()
+            if is_sure:
+                if self.phase is Phase.DRAINING:
+                    self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
+                self._processes.kill(process)
 
-    def _unheard(self) -> list[RunningNode]:
-        return [each for each in self._processes.not_loaded() if not each.is_heard()]
+    def is_too_late_for(self, names: Sequence[str]) -> bool:
+        """Whether nodes that are only starting have no part in the run any more."""
+        is_draining = self.phase is Phase.DRAINING and not self._is_told_to_drain
+        may_start = self.phase is Phase.RUNNING or is_draining
+        return not may_start or self._processes.killed.issuperset(names)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """End as failed, at once."""
@@ -149,21 +165,18 @@ class Shutdown:
 
     def look(self, now_s: float) -> None:
         """Go on to the next phase where it is time."""
-        if self._postponed is not None:
-            if self._are_heard:  # and what has come has been read since
-                act, self._postponed = self._postponed, None
-                act()
-            else:
-                self._are_heard = not self._unheard()
         if self.phase is Phase.STOPPING:
+            self._kill_not_started(is_look=True)
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
-            is_asked = self._postponed is None
-            if is_asked and self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+            if not self._is_told_to_drain:
+                self._begin_to_drain(is_look=True)
+            is_told = self._is_told_to_drain
+            if is_told and self._probing.look(now_s, 0.0) is Verdict.DRAINED:
                 self._outcome.has_drained = True
                 self._stop()
             elif now_s >= self._deadline_s:
-                left = self._probing.what_is_left(now_s) if is_asked else self._not_known()
+                left = self._probing.what_is_left(now_s) if is_told else self._not_known()
                 why = "; ".join(left) or "packets keep coming"
                 self._output.log("WARN", f"not drained in time: {why}")
                 self._outcome.late_drain = why
@@ -171,7 +184,7 @@ class Shutdown:
                 self._stop()
 
     def _not_known(self) -> list[str]:
-        return [f"whether {names_of(each)} has started is not known" for each in self._unheard()]
+        return [f"whether {names_of(each)} has started is not known" for each in self._starting()]
 
     def _look_at_stopping(self, now_s: float) -> None:
         left_s = self._deadline_s - now_s
@@ -221,12 +234,8 @@ class Shutdown:
         self._deadline_s = now_s + STOP_S
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send(Stop())
-        self._when_heard(self._kill_not_loaded)
+        self._kill_not_started(is_look=False)
         self._on_stop()
-
-    def _kill_not_loaded(self) -> None:
-        for process in self._processes.not_loaded():
-            self._processes.kill(process)  # it has not come as far as anything worth finalising
 
     def _kill_all(self) -> None:
         self.phase = Phase.KILLED

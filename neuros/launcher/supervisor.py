@@ -239,7 +239,7 @@ class Supervisor:
             self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
             self._channels.send_to(link, control.Pause())
-        if self._shutdown.phase not in (Phase.RUNNING, Phase.DRAINING):
+        if self._shutdown.is_too_late_for(hello.nodes):
             self._channels.send_to(link, control.Stop())
 
     def _on_report(self, report: Report) -> None:

@@ -52,7 +52,7 @@ class ThreadReader:
         wait(self._readings.values(), limit_s)
 
     def close(self) -> None:
-        """Wait for what still reads, so that no program is left that does; for 3 s at most."""
+        """Wait, for 3 s at most, until no program reads a process any more."""
         end_s = time.monotonic() + _CLOSE_S
         for thread in self._begun:
             thread.join(max(0.0, end_s - time.monotonic()))

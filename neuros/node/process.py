@@ -275,25 +275,16 @@ class NodeProcess:
     # ------------------------------------------------------------------ inside
 
     def _live(self) -> None:
-        # Modules stay: rounds of the garbage collector would go through them for nothing.
+        # Modules of ROS stay: rounds of the garbage collector would go through them for nothing.
         gc.disable()
         try:
-            self._load()
+            middleware = self._open_middleware()
+            self._peers.open(middleware)
+            for file in self._files:
+                self._add(file)
         finally:
             gc.freeze()
             gc.enable()
-        if self.is_ending:
-            return
-        assert self._middleware is not None
-        for node in self._nodes:
-            self._middleware.loop.post(node.start)
-        self._middleware.loop.run()
-        self._middleware.take_in()
-
-    def _load(self) -> None:
-        self._peers.open(self._open_middleware())
-        for file in self._files:
-            self._add(file)
         for node in self._nodes:
             if self.is_ending:
                 return
@@ -302,8 +293,14 @@ class NodeProcess:
                 self._tell(declared(node.name, node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
-        if not self.is_ending:
-            self.report()
+        if self.is_ending:
+            return
+        self.report()
+        for node in self._nodes:
+            middleware.loop.post(node.start)
+        gc.freeze()
+        middleware.loop.run()
+        middleware.take_in()
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)

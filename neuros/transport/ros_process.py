@@ -311,15 +311,18 @@ class _Rclpy(TransportKind):
 
 
 def _do_without_code_generator() -> None:
-    """Import ``rosidl_generator_py``, which messages need, without the generator in it.
+    """Import ``rosidl_generator_py``, which messages need, without ``generate_py`` in it.
 
-    It goes without where that cannot be imported. What its parser needs would take a node a fifth
-    of the time of all its imports.
+    It goes without where that cannot be imported. A node does not need it, and what it imports in
+    turn (a parser) would take a node a fifth of the time of all imports.
     """
     generator = "rosidl_generator_py.generate_py_impl"
-    if generator not in sys.modules:
-        sys.modules[generator] = None  # type: ignore[assignment]
+    if generator in sys.modules:
+        return
+    sys.modules[generator] = None  # type: ignore[assignment]
+    try:
         importlib.import_module("rosidl_generator_py")
+    finally:
         del sys.modules[generator]
 
 

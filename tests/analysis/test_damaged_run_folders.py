@@ -51,12 +51,19 @@ def change(folder: Path, *keys: str | int, to: Any) -> None:
         (("connections", 0, "latency_ms"), [], "$.connections[0].latency_ms: must be an object"),
         (("nodes", "../b"), {}, "$.nodes: '../b' is not allowed as name of a node"),
         (("nodes", "a", "accounting"), 5, "$.nodes.a.accounting: must be an object or null"),
+        (("nodes", "a"), None, "$.nodes.a: must be an object, but is null"),
+        (("nodes", "a", "hooks", "f"), {}, "$.nodes.a.hooks.f: the key 'executions' is missing"),
         (
             ("nodes", "a", "hooks", "f"),
-            {"ticks": {"period_ms": 1, "within": {}}},
+            {"executions": 1, "ticks": {"period_ms": 1, "within": {}}},
             "$.nodes.a.hooks.f.ticks: the key 'std_ms' is missing",
         ),
         (("timeline",), {"a": [[1, 2, 3]]}, "$.timeline.a[0]: has more than 2 items"),
+        (
+            ("system_load",),
+            {"machine": {"cpu_percent_mean": 1, "cpu_percent_max": 1, "cores": 0}},
+            "$.system_load.machine.cores: must be at least 1, but is 0",
+        ),
         (("machine",), {"cores": "many"}, "$.machine.cores: must be a whole number or null"),
     ],
 )

@@ -53,6 +53,7 @@ def run(
                 "queue_size": 1,
                 "sent": len(digests),
                 "received": len(digests),
+                "consumed": len(digests),
             }
         )
     (folder / "run.json").write_text(json.dumps({"format": 2, "connections": connections}))

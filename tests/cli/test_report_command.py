@@ -61,10 +61,11 @@ def test_load_timeline_and_ticks_are_drawn_where_they_were_kept(tmp_path: Path) 
         "within": {"1 ms": 1.0},
         "histogram": [[9.9, 3], [10.0, 5]],
     }
+    hooks = {"f": {"executions": 8, "ticks": ticks}}
     run = run_folder(
         tmp_path / "run", {}, {"a": accounting(executing={"f": 1.0}, idle=9.0)},
         timeline={"a": [[0.0, 0.0], [1.0, 0.5], [2.0, 0.9]]},
-        nodes={"a": {"accounting": accounting(idle=9.0), "hooks": {"f": {"ticks": ticks}}}},
+        nodes={"a": {"accounting": accounting(idle=9.0), "hooks": hooks}},
     )  # fmt: skip
     (run / "system_load.csv").write_text(LOAD)
     assert main(["report", str(run), "-o", str(tmp_path / "out")]) == 0

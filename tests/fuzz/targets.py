@@ -419,7 +419,7 @@ def step_frames(data: bytes, _: Path) -> None:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             ours.sendall(data[:50_000])  # what fits into the buffer of a socket
-            ours.shutdown(socket.SHUT_WR)  # else nothing at all would be waited for
+            ours.shutdown(socket.SHUT_WR)  # else `receive` waits for ever where there is none
             link: StepLink[Any] = StepLink(theirs, kind, "a")
             with allowed(ControlError):
                 for message in link.receive() or ():

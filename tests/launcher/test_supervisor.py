@@ -100,6 +100,41 @@ def test_a_node_elsewhere_that_has_not_started_is_killed_once_all_is_heard(
     assert "'b' had not started yet: killed" in run.output.said
 
 
+def test_one_whose_report_was_on_its_way_drains_as_all_others(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, reported = tmp_path / "asked", tmp_path / "b.reported"
+    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: (asked.touch(), reported.exists())[1])
+    reports = """
+host.hello()
+Path('b.up').touch()
+while not os.path.exists('asked'):
+    time.sleep(0.005)
+host.report()
+Path('b.reported').touch()
+host.wait_for('drain')
+Path('b.drained').touch()
+host.serve()
+"""
+    outcome = run(a=SHUTS_DOWN, b=reports)
+    assert (outcome.exit_code, outcome.failures) == (0, [])
+    assert outcome.has_final_report("b"), run.output.said
+    assert (tmp_path / "b.drained").exists()
+
+
+def test_a_machine_that_is_not_heard_holds_up_the_end_of_its_own_nodes_only(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RunningProcess, "is_heard", lambda process: process.names != ("c",))
+    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
+    interrupts = "host.up_last(); host.ask('interrupt'); host.serve()"
+    outcome = run(a=interrupts, b=IMPORTS, c=IMPORTS.replace("b.up", "c.up"))
+    assert outcome.exit_code == 130
+    assert outcome.failures == [
+        "node 'c' had to be killed 0.5 s after the end began: 'c' did not begin to finalise"
+    ]
+
+
 @pytest.mark.parametrize(
     "ends", [SHUTS_DOWN, "host.up_last(); host.ask('interrupt'); host.serve()"]
 )

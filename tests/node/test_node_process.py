@@ -11,7 +11,7 @@ from neuros.errors import EnvironmentFault
 from neuros.node.process import NodeProcess
 
 
-def test_no_garbage_is_looked_for_until_the_loop_begins() -> None:
+def test_no_garbage_is_looked_for_while_the_middleware_is_imported() -> None:
     seen: list[bool] = []
 
     def make_middleware(*_: Any) -> Any:

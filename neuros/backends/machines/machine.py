@@ -62,7 +62,7 @@ class Machine:
         clock: how far its clocks are off.
         folders: those of the project there, once it is placed.
         fault: what of it could not be kept here, empty if all could.
-        flushed: up to which :meth:`flush` all has arrived.
+        flushed: the number of the last :meth:`flush` of which all has arrived.
     """
 
     def __init__(self, host: Host, timeout_s: float, log: Log, command: Sequence[str]) -> None:
@@ -183,7 +183,10 @@ class Machine:
         self._pump.send(agent.KillNode(node))
 
     def flush(self) -> int:
-        """Ask for all that nodes there have said; ``flushed`` has reached this when it is here."""
+        """Ask for all that nodes there have said by now.
+
+        Once ``flushed`` is at least the number that is returned, all of it has arrived.
+        """
         self._asked += 1
         self._pump.send(agent.Flush(self._asked))
         return self._asked

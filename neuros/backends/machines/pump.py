@@ -147,7 +147,7 @@ class Pump(threading.Thread):
                     pass
         if self._read_from in ready and (reason := self._read()):
             return reason
-        if self._last or (self._listener is not None and self._listener.fileno() in ready):
+        if self._listener is not None and self._listener.fileno() in ready:
             self._accept()
         for number, link in tuple(self._links.items()):
             if link.fileno() in ready:
@@ -232,6 +232,7 @@ class Pump(threading.Thread):
         count = len(self._last)
         if not count:
             return
+        self._accept()  # who waits has said something, too
         for number, link in tuple(self._links.items()):
             while number in self._links and self._relay(number, link):
                 pass
