@@ -160,6 +160,7 @@ def connection(index: int, name: str) -> dict[str, Any]:
         "discard_limit": None,
         "queue_size": 1,
         "sent": sent,
+        "received": sent,
         "consumed": consumed,
         "digests": {"sent": "0123456789abcdef"},
     }
@@ -168,6 +169,7 @@ def connection(index: int, name: str) -> dict[str, Any]:
 def whiskeye_run(folder: Path) -> Path:
     """100 packets of the IMU: the first ten wait for a second each, the others come every 10 ms."""
     ticks = intervals_of([0, 20 * MS, 40 * MS], 0.02)
+    hooks = {"start": {"executions": 1}, "simulate": {"executions": 100, "ticks": ticks}}
     record = {
         "format": FORMAT,
         "backend": "process",
@@ -175,7 +177,7 @@ def whiskeye_run(folder: Path) -> Path:
         "wall_s": 12.5,
         "timeline": {"robot": [[0.0, 1.0], [1.0, 11.5], [2.0, 12.0]]},
         "connections": [connection(i, name) for i, name in enumerate(CONNECTIONS)],
-        "nodes": {"robot": {"hooks": {"start": {}, "simulate": {"ticks": ticks}}}},
+        "nodes": {"robot": {"hooks": hooks}},
     }
     (folder / "visualiser").mkdir(parents=True)
     (folder / "run.json").write_text(json.dumps(record))
