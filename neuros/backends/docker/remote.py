@@ -54,6 +54,7 @@ _FORWARDING = ("-o", "ExitOnForwardFailure=yes")
 _CONNECT_S = 30.0
 _LOOK_S = 0.02
 _NEVER_STARTED_S = 60.0
+_REMOVAL_S, _GONE_S = 2.0, 0.1
 
 Log = Callable[[str, str], None]
 
@@ -245,9 +246,18 @@ class AgentContainer:
         return tuple(folder / "python" for folder in found)
 
     def close(self) -> None:
-        """Remove it, if it is still there."""
-        with contextlib.suppress(DockerException, requests.RequestException):
+        """Remove it, if it is still there.
+
+        Where its engine does not answer any more, it ends by itself with its agent.
+        """
+        api = self._container.client.api
+        api.timeout = min(api.timeout or _REMOVAL_S, _REMOVAL_S)
+        try:
             self._container.remove(force=True)
+        except DockerException:
+            pass
+        except requests.RequestException:
+            api.timeout = _GONE_S  # the next one of this engine need not wait as long
 
     def _put(self, trees: Mapping[Path, Path], owned: Mapping[Path, int] | None = None) -> None:
         """Copy folders into it; make others, each with its owner."""
