@@ -23,7 +23,7 @@ _PUBLIC = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*")
 class Python(PythonDomain):
     """Python's names; one whose last part no object here has is not searched for.
 
-    Sphinx goes through all objects for each such name, of which other projects have most: a quarter
+    Sphinx goes through all objects for each such name, of which other projects have most: a fifth
     of the time of a build.
     """
 

@@ -314,7 +314,7 @@ def _do_without_code_generator() -> None:
     """Import ``rosidl_generator_py``, which messages need, without ``generate_py`` in it.
 
     It goes without where that cannot be imported. A node does not need it, and what it imports in
-    turn (a parser) would take a node a fifth of the time of all imports.
+    turn (a parser) would take a node a seventh of the time of all imports.
     """
     generator = "rosidl_generator_py.generate_py_impl"
     if generator in sys.modules:
