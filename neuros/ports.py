@@ -391,9 +391,6 @@ class RunningNode(Protocol):
     def is_abandoned(self) -> bool:
         """Whether what it ran in has gone (its engine), so that its node is not to blame."""
 
-    def is_heard(self) -> bool:
-        """Whether all has arrived that its nodes had said when this was first asked."""
-
     def kill(self) -> None: ...
 
     def threads(self) -> ProcessThreads:

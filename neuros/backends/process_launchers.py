@@ -181,10 +181,6 @@ class RunningProcess:
         """Ask it to end (SIGTERM)."""
         self._process.terminate()
 
-    def is_heard(self) -> bool:
-        """Whether what its nodes have said is here: they say it on this machine."""
-        return True
-
     def kill(self) -> None:
         """Kill it and its whole process group."""
         # Once it has been reaped, its number may be another's.

@@ -176,6 +176,11 @@ class Probed(Report):
 
 
 @dataclass(frozen=True)
+class Loaded(Message):
+    """All plugins of a process are loaded; no hook starts before the answer, ``begin``."""
+
+
+@dataclass(frozen=True)
 class Hooks(Message):
     """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
 
@@ -299,6 +304,11 @@ class Drain(Message):
     """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Begin(Message):
+    """Start hooks from now on; not sent once the run is ending."""
 
 
 @dataclass(frozen=True)
@@ -450,11 +460,11 @@ class Ended(Message):
 
 
 FROM_NODES: Sequence[type[Message]] = (
-    *(Hello, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation, Heard),
-    *(NodeStatus, AtRest, WasReset),
+    *(Hello, Loaded, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation),
+    *(Heard, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
-    *(Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+    *(Begin, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
     *(Settle, Deliver, Reset),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (

@@ -142,13 +142,6 @@ class ReadThreads(Message):
 
 
 @dataclass(frozen=True)
-class Flush(Message):
-    """Send all that nodes have said by now, and then :class:`Flushed` with this number."""
-
-    number: int
-
-
-@dataclass(frozen=True)
 class Took(Message):
     """So many bytes of :class:`Chunk` have been written."""
 
@@ -245,13 +238,6 @@ class ThreadsRead(Message):
 
 
 @dataclass(frozen=True)
-class Flushed(Message):
-    """All that nodes had said when :class:`Flush` came has been sent."""
-
-    number: int
-
-
-@dataclass(frozen=True)
 class Chunk(Message):
     """Bytes of a file of the run folder, in base64, at the offset at which it is to end before."""
 
@@ -278,10 +264,10 @@ class Finished(Message):
 BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)
 TO_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
-    *(Place, Content, Prepare, Start, KillNode, ReadThreads, Flush, Took, Examine, Finish),
+    *(Place, Content, Prepare, Start, KillNode, ReadThreads, Took, Examine, Finish),
 )
 FROM_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
     *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Chunk, Examined),
-    *(ThreadsRead, Flushed, Finished),
+    *(ThreadsRead, Finished),
 )

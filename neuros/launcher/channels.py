@@ -15,7 +15,7 @@ import contextlib
 import selectors
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -133,9 +133,9 @@ class Channels:
         link.unsent += encode(message)
         link.flush()
 
-    def is_node(self, link: ControlLink) -> bool:
-        """Whether a node process is, or was, at the other end."""
-        return link in self._nodes
+    def nodes_of(self, link: ControlLink) -> Sequence[str]:
+        """The nodes of the process that is, or was, at the other end; none: another program."""
+        return self._nodes.get(link, ())
 
     def has(self, link: ControlLink) -> bool:
         """Whether that one is still connected."""

@@ -211,14 +211,6 @@ class Processes:
         """The process with a node, if it runs."""
         return next((each for each in self._running if name in each.names), None)
 
-    def not_loaded(self) -> list[RunningNode]:
-        """Processes in which no node has come as far as its first hook."""
-        return [
-            process
-            for process in self._running
-            if not any(self._detector.is_loaded(name) for name in process.names)
-        ]
-
     def have_reported(self) -> bool:
         """Whether every node has made its final report, but for those that were killed."""
         names = {name for process in self._running for name in process.names}

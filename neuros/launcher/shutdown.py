@@ -59,9 +59,7 @@ class Shutdown:
     _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
-    _ended_by: str = ""
-    _is_told_to_drain: bool = False
-    _heard: dict[tuple[str, ...], bool] = field(default_factory=dict)
+    _begun: set[str] = field(default_factory=set)
 
     @property
     def is_hopeless(self) -> bool:
@@ -86,44 +84,23 @@ class Shutdown:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._ended_by = stopped
-        self._begin_to_drain(is_look=False)
+        self._kill_not_started()
+        self._channels.send(Drain(self._declarations.last_round(stopped)))
+        self._probing.drain(self._processes.killed, now_s)
 
-    def _begin_to_drain(self, *, is_look: bool) -> None:
-        # A node that is still loading has sent nothing, and nobody could send to it yet.
-        self._kill_not_started(is_look=is_look)
-        if not self._starting():
-            self._is_told_to_drain = True
-            self._channels.send(Drain(self._declarations.last_round(self._ended_by)))
-            self._probing.drain(self._processes.killed, time.monotonic())
+    def lets_begin(self, names: Sequence[str]) -> bool:
+        """Whether the nodes of a process, which are loaded now, may start hooks."""
+        if self.phase is Phase.RUNNING:
+            self._begun.update(names)
+        return self.phase is Phase.RUNNING
 
-    def _starting(self) -> list[RunningNode]:
-        """Processes in which no node has been loaded, as far as is known."""
-        killed = self._processes.killed
-        return [each for each in self._processes.not_loaded() if not killed.issuperset(each.names)]
-
-    def _kill_not_started(self, *, is_look: bool) -> None:
-        """Kill what has not come as far as anything worth finalising.
-
-        Elsewhere a node may have been loaded, and have worked: then what it said is on its way.
-        What has arrived by one look has been read by the next.
-        """
-        for process in self._starting():
-            if process.names not in self._heard:
-                is_sure = self._heard[process.names] = process.is_heard()  # here nothing is late
-            else:
-                is_sure = is_look and self._heard[process.names]
-                self._heard[process.names] |= is_look and process.is_heard()
-            if is_sure:
+    def _kill_not_started(self) -> None:
+        """Kill what was not told to begin: it has sent nothing, and has nothing to finalise."""
+        for process in self._processes:
+            if not {*process.names} & (self._begun | self._processes.killed):
                 if self.phase is Phase.DRAINING:
                     self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
                 self._processes.kill(process)
-
-    def is_too_late_for(self, names: Sequence[str]) -> bool:
-        """Whether nodes that are only starting have no part in the run any more."""
-        is_draining = self.phase is Phase.DRAINING and not self._is_told_to_drain
-        may_start = self.phase is Phase.RUNNING or is_draining
-        return not may_start or self._processes.killed.issuperset(names)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """End as failed, at once."""
@@ -166,25 +143,17 @@ class Shutdown:
     def look(self, now_s: float) -> None:
         """Go on to the next phase where it is time."""
         if self.phase is Phase.STOPPING:
-            self._kill_not_started(is_look=True)
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
-            if not self._is_told_to_drain:
-                self._begin_to_drain(is_look=True)
-            is_told = self._is_told_to_drain
-            if is_told and self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+            if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
                 self._outcome.has_drained = True
                 self._stop()
             elif now_s >= self._deadline_s:
-                left = self._probing.what_is_left(now_s) if is_told else self._not_known()
-                why = "; ".join(left) or "packets keep coming"
+                why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
                 self._output.log("WARN", f"not drained in time: {why}")
                 self._outcome.late_drain = why
                 self._outcome.has_drained = True
                 self._stop()
-
-    def _not_known(self) -> list[str]:
-        return [f"whether {names_of(each)} has started is not known" for each in self._starting()]
 
     def _look_at_stopping(self, now_s: float) -> None:
         left_s = self._deadline_s - now_s
@@ -234,7 +203,7 @@ class Shutdown:
         self._deadline_s = now_s + STOP_S
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send(Stop())
-        self._kill_not_started(is_look=False)
+        self._kill_not_started()
         self._on_stop()
 
     def _kill_all(self) -> None:

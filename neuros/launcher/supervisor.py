@@ -185,7 +185,7 @@ class Supervisor:
 
     def _refuse(self, link: ControlLink, error: ControlError) -> None:
         """A message was not understood: without it, nothing is known of a node for sure."""
-        if self._channels.is_node(link):
+        if self._channels.nodes_of(link):
             if link not in self._refused:
                 self._refused.add(link)
                 self._shutdown.fail(f"control channel: {error}")
@@ -203,6 +203,9 @@ class Supervisor:
                 self._on_report(message)
             case control.Hello():
                 self._on_hello(link, message)
+            case control.Loaded():
+                if self._shutdown.lets_begin(self._channels.nodes_of(link)):
+                    self._channels.send_to(link, control.Begin())
             case control.Hooks():
                 self._declarations.take(message)
             case control.Finalising(node, hook):
@@ -239,8 +242,6 @@ class Supervisor:
             self._channels.send_to(link, control.Say(self._peers.own_state))
         if self.pause.is_on:
             self._channels.send_to(link, control.Pause())
-        if self._shutdown.is_too_late_for(hello.nodes):
-            self._channels.send_to(link, control.Stop())
 
     def _on_report(self, report: Report) -> None:
         now_s = time.monotonic()

@@ -82,7 +82,7 @@ class NodeProcess:
         self._early_lock = threading.Lock()
         self._has_failed = False
         self._settling: control.Settle | Advance | None = None
-        self._is_draining = False
+        self._has_begun = self._is_draining = False
         self._has_been_reset = False
         self._stop_asked = threading.Event()
         self._tell_lock = threading.Lock()
@@ -132,6 +132,11 @@ class NodeProcess:
                 self.post(lambda: self._obey_in_loop(message))
 
     def _obey_in_loop(self, message: Message) -> None:
+        if isinstance(message, control.Begin):
+            self._has_begun = True
+            for node in self._nodes:
+                node.start()
+            return
         if isinstance(message, control.Probe):
             self._probe(message.number)
             return
@@ -256,6 +261,8 @@ class NodeProcess:
 
     def _why_not_reset(self) -> str:
         """Why the nodes cannot be reset where they are; empty if they can."""
+        if not self._has_begun:
+            return "its nodes have not started yet"
         if not all(node.is_paused for node in self._nodes):
             return "the run is not paused: pause it first"
         connections = (c for file in self._files for c in file.connections)
@@ -296,8 +303,7 @@ class NodeProcess:
         if self.is_ending:
             return
         self.report()
-        for node in self._nodes:
-            middleware.loop.post(node.start)
+        self._tell(control.Loaded())
         gc.freeze()
         middleware.loop.run()
         middleware.take_in()

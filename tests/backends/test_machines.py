@@ -23,8 +23,6 @@ from neuros.control.machines import (
     FROM_AGENT,
     TO_AGENT,
     Chunk,
-    Flush,
-    Flushed,
     NodeEnded,
     Pong,
     Tree,
@@ -356,11 +354,10 @@ class TestPump:
         ends = Ends(tmp_path, is_listening=False)
         node = connect(ends.listener.address)
         node.sendall(b"words\n")
-        ends.agent.send_last(Flushed(2))
-        wait_for(lambda: Flushed(2) in ends.to_launcher)
+        end = NodeEnded("eye", "exit code 0")
         ends.agent._listener = ends.listener
-        ends.launcher.send(Flush(3))
-        wait_for(lambda: Flushed(3) in ends.to_launcher)
+        ends.agent.send_last(end)
+        wait_for(lambda: end in ends.to_launcher)
         supervisor = ends.supervisor.accept()
         assert supervisor is not None
         supervisor.setblocking(False)

@@ -33,34 +33,31 @@ NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
 SLOW_NETWORK = """
 import os, subprocess, sys, time
-slow, ends, *command = sys.argv[1:]
+held, ends, *command = sys.argv[1:]
 agent = subprocess.Popen(command, stdout=subprocess.PIPE)
-while data := os.read(agent.stdout.fileno(), 1 << 16):
-    while os.path.exists(slow) and not os.path.exists(ends):
-        time.sleep(0.01)
-    if os.path.exists(ends):
-        time.sleep(0.2)
-    os.write(1, data)
+for line in iter(agent.stdout.readline, b""):
+    if b'"loaded' in line:
+        open(held, "w").close()
+        while not os.path.exists(ends):
+            time.sleep(0.01)
+    os.write(1, line)
 sys.exit(agent.wait())
 """
-LOOKS_AND_SAVES = """
+BEGINS = """
 from pathlib import Path
-from neuros.hooks import neuros_finalise, neuros_tick
-Path("{slow}").touch()
-@neuros_tick(seconds=0.05, outputs="o")
-def look(node):
-    return node.make_packet("o")
-@neuros_finalise()
-def save(node):
-    (node.run_dir / "saved").touch()
+from neuros.hooks import neuros_initialise
+@neuros_initialise()
+def begin(node):
+    Path("{begun}").touch()
 """
-SEES_AND_ENDS = """
+ENDS = """
 from pathlib import Path
-from neuros.hooks import neuros_function
-@neuros_function(inputs="x")
-def see(node, x):
-    node.shutdown("seen")
-    Path("{ends}").touch()
+from neuros.hooks import neuros_tick
+@neuros_tick(seconds=0.05)
+def look(node):
+    if Path("{held}").exists():
+        node.shutdown("seen")
+        Path("{ends}").touch()
 """
 ENDED_S = 120.0  # on a machine that does many other things
 
@@ -129,24 +126,20 @@ def test_it_is_said_where_a_node_elsewhere_stood_that_is_killed(tmp_path: Path) 
     assert left_there(tmp_path) == []
 
 
-def test_a_node_elsewhere_whose_packet_overtook_its_report_ends_as_one_that_has_worked(
+def test_a_node_elsewhere_starts_no_hook_before_its_launcher_knows_that_it_could(
     tmp_path: Path,
 ) -> None:
-    slow, ends = tmp_path / "slow", tmp_path / "ends"
+    """So that, at an end that comes first, it can be killed with nothing lost."""
+    held, ends, begun = tmp_path / "held", tmp_path / "ends", tmp_path / "begun"
     bench = Bench(tmp_path, "process")
-    bench.project(
-        ("eye.o -> brain.x", None),
-        eye=LOOKS_AND_SAVES.format(slow=slow),
-        brain=SEES_AND_ENDS.format(ends=ends),
-    )
+    bench.project(eye=BEGINS.format(begun=begun), brain=ENDS.format(held=held, ends=ends))
     (tmp_path / "slow_network.py").write_text(SLOW_NETWORK)
-    late = [sys.executable, str(tmp_path / "slow_network.py"), str(slow), str(ends)]
+    late = [sys.executable, str(tmp_path / "slow_network.py"), str(held), str(ends)]
     file = deployment(tmp_path, nodes={"eye": "other"}, through=late)
     finished = bench.launch("--deployment", str(file), timeout_s=ENDED_S)
     assert_ended(finished, 0, "brain ended the project: seen")
-    assert "had not started yet" not in finished.output
-    assert finished.run_folder is not None
-    assert (finished.run_folder / "eye" / "saved").exists(), finished.output
+    assert "'eye' had not started yet: killed" in finished.output
+    assert not begun.exists()
 
 
 def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(

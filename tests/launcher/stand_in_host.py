@@ -58,6 +58,12 @@ class Host:
         """Send a message about the (first) node."""
         self.send(kind, **{"node": NAMES[0], **fields})
 
+    def loaded(self) -> None:
+        """Its plugins are loaded; goes on when hooks may start."""
+        self.report()
+        self.send("loaded")
+        self.wait_for("begin")
+
     def report(self, kind: str = "report", **fields: Any) -> None:
         """A report of a node that has been loaded."""
         for name in NAMES:
@@ -67,7 +73,7 @@ class Host:
     def up(self, **fields: Any) -> None:
         """Hello, loaded, and the first hook has begun."""
         self.hello(**fields)
-        self.report()
+        self.loaded()
         self.tell("first_hook")
         for name in NAMES:
             Path(f"{name}.up").touch()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,10 @@ from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
 from containers import wait_until
 from neuros.backends.process_launchers import RunningProcess
+from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import shutdown, stall_detector
+from neuros.launcher import stall_detector
 from neuros.launcher.channels import Channels
 
 
@@ -61,6 +62,7 @@ Path('b.up').touch()
 while not os.path.exists('others are read'):
     time.sleep(0.005)
 host.report()
+host.send('loaded')
 Path('b.reported').touch()
 host.serve()
 """
@@ -86,72 +88,45 @@ host.serve()
     assert outcome.has_final_report("b"), run.output.said
 
 
-IMPORTS = "host.hello(); Path('b.up').touch(); time.sleep(60)"
-
-
-def test_a_node_elsewhere_that_has_not_started_is_killed_once_all_is_heard(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("ends", "exit_code"),
+    [(SHUTS_DOWN, 0), ("host.up_last(); host.ask('interrupt'); host.serve()", 130)],
+)
+def test_a_node_that_is_loaded_once_the_run_is_ending_is_not_told_to_begin(
+    run: Run, ends: str, exit_code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers = [False, False, True]
-    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: answers.pop(0) if answers else True)
-    outcome = run(a=SHUTS_DOWN, b=IMPORTS)
-    assert (outcome.exit_code, outcome.failures, answers) == (0, [], [])
-    assert outcome.has_drained
-    assert "'b' had not started yet: killed" in run.output.said
+    """It is killed; the kill may be on its way for long."""
+    kill, send_to = RunningProcess.kill, Channels.send_to
+    late: list[RunningProcess] = []
+    told_to_begin: list[Sequence[str]] = []
 
+    def kill_late(process: RunningProcess) -> None:
+        if process.names == ("b",) and not late:
+            late.append(process)
+        else:
+            kill(process)
 
-def test_one_whose_report_was_on_its_way_drains_as_all_others(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, reported = tmp_path / "asked", tmp_path / "b.reported"
-    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: (asked.touch(), reported.exists())[1])
-    reports = """
+    def note(self: Channels, link: ControlLink, message: Message) -> None:
+        if isinstance(message, Begin):
+            told_to_begin.append(self.nodes_of(link))
+        send_to(self, link, message)
+
+    monkeypatch.setattr(RunningProcess, "kill", kill_late)
+    monkeypatch.setattr(Channels, "send_to", note)
+    run.when_file_exists("b.loaded", lambda: late[0].kill())
+    loads_late = """
 host.hello()
 Path('b.up').touch()
-while not os.path.exists('asked'):
-    time.sleep(0.005)
+host.wait_for('stop')
 host.report()
-Path('b.reported').touch()
-host.wait_for('drain')
-Path('b.drained').touch()
-host.serve()
+host.send('loaded')
+Path('b.loaded').touch()
+host.wait_for('never')
 """
-    outcome = run(a=SHUTS_DOWN, b=reports)
-    assert (outcome.exit_code, outcome.failures) == (0, [])
-    assert outcome.has_final_report("b"), run.output.said
-    assert (tmp_path / "b.drained").exists()
-
-
-def test_a_machine_that_is_not_heard_holds_up_the_end_of_its_own_nodes_only(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(RunningProcess, "is_heard", lambda process: process.names != ("c",))
-    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
-    interrupts = "host.up_last(); host.ask('interrupt'); host.serve()"
-    outcome = run(a=interrupts, b=IMPORTS, c=IMPORTS.replace("b.up", "c.up"))
-    assert outcome.exit_code == 130
-    assert outcome.failures == [
-        "node 'c' had to be killed 0.5 s after the end began: 'c' did not begin to finalise"
-    ]
-
-
-@pytest.mark.parametrize(
-    "ends", [SHUTS_DOWN, "host.up_last(); host.ask('interrupt'); host.serve()"]
-)
-def test_one_of_which_nothing_is_heard_holds_up_no_end(
-    run: Run, ends: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(RunningProcess, "is_heard", lambda _: False)
-    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
-    outcome = run(a=ends.replace("drain_s=5", "drain_s=0.2"), b=IMPORTS)
-    is_drained = ends == SHUTS_DOWN
-    why = "not drained in time: whether 'b' has started is not known"
-    assert (why in run.output.said) == is_drained
-    assert outcome.exit_code == (1 if is_drained else 130)
-    assert outcome.failures == [
-        "node 'b' had to be killed 0.5 s after the end began: 'b' did not begin to finalise"
-    ]
-    assert run.lasted_s < 5.0
+    outcome = run(a=ends, b=loads_late)
+    assert (outcome.exit_code, outcome.failures) == (exit_code, [])
+    assert not outcome.has_final_report("b")
+    assert told_to_begin == [("a",)]
 
 
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
@@ -162,7 +137,7 @@ def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
 
 
 def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> None:
-    waits_first = "host.hello(); host.report(); import time; time.sleep(0.4); " + (
+    waits_first = "host.hello(); host.loaded(); import time; time.sleep(0.4); " + (
         "host.tell('first_hook'); host.serve()"
     )
     outcome = run(a=waits_first, duration_s=0.3)
@@ -173,7 +148,7 @@ def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> N
 
 def test_a_pause_before_the_first_hook_leaves_the_duration_as_it_is(run: Run) -> None:
     paused = "host.ask('pause'); time.sleep(1.0); host.ask('resume')"
-    act = f"host.hello(); host.report(); import time; {paused}; host.tell('first_hook')"
+    act = f"host.hello(); host.loaded(); import time; {paused}; host.tell('first_hook')"
     outcome = run(a=f"{act}; host.serve()", duration_s=0.3)
     assert outcome.reason == "0.3 s are over"
     assert 0.3 <= outcome.ending_s - outcome.started_s < 1.0
@@ -383,7 +358,7 @@ def test_a_duration_that_has_not_begun_is_named_when_nothing_moves(
     monkeypatch.setattr(stall_detector, "STALL_S", 0.1)
     run.after("no hook has run yet, and --duration counts from the first one", run.press_ctrl_c)
     outcome = run(
-        a="host.is_idle = False; host.hello(); host.report(); host.serve()", duration_s=0.1
+        a="host.is_idle = False; host.hello(); host.loaded(); host.serve()", duration_s=0.1
     )
     assert outcome.exit_code == 130
 

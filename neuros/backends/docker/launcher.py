@@ -280,10 +280,6 @@ class RunningContainer:
     def is_abandoned(self) -> bool:
         return bool(self._events.lost) and self._events.end_of(self.id) is None
 
-    def is_heard(self) -> bool:
-        """Whether what its node has said is here: it says so on this machine."""
-        return True
-
     def kill(self) -> None:
         self._is_told = True
         if self._events.lost:

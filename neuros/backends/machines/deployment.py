@@ -308,7 +308,6 @@ class NodeElsewhere:
 
     side: Side
     name: str
-    _asked: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -321,11 +320,6 @@ class NodeElsewhere:
     @property
     def is_abandoned(self) -> bool:
         return bool(self.side.machine.lost)
-
-    def is_heard(self) -> bool:
-        """Whether what it had said when this was first asked is here, or its machine is gone."""
-        self._asked = self._asked or self.side.machine.flush()
-        return self.side.machine.flushed >= self._asked or self.is_abandoned
 
     def kill(self) -> None:
         self.side.machine.kill(self.name)

@@ -62,7 +62,6 @@ class Machine:
         clock: how far its clocks are off.
         folders: those of the project there, once it is placed.
         fault: what of it could not be kept here, empty if all could.
-        flushed: the number of the last :meth:`flush` of which all has arrived.
     """
 
     def __init__(self, host: Host, timeout_s: float, log: Log, command: Sequence[str]) -> None:
@@ -77,7 +76,6 @@ class Machine:
         self._ends: dict[str, str] = {}
         self._threads: dict[str, ProcessThreads] = {}
         self.fault = ""
-        self.flushed = self._asked = 0
         self._is_closed = False
         self._answers: list[Message] = []
         self._arrived = threading.Condition()
@@ -182,15 +180,6 @@ class Machine:
         """Kill the process of a node."""
         self._pump.send(agent.KillNode(node))
 
-    def flush(self) -> int:
-        """Ask for all that nodes there have said by now.
-
-        Once ``flushed`` is at least the number that is returned, all of it has arrived.
-        """
-        self._asked += 1
-        self._pump.send(agent.Flush(self._asked))
-        return self._asked
-
     def threads_of(self, node: str) -> ProcessThreads:
         """Where the threads of a node's process stand; waits for the answer for up to 3 s."""
         with self._arrived:
@@ -258,8 +247,6 @@ class Machine:
                 self._log(severity, f"{self.host.name}: {text}")
             case agent.NodeEnded(node, how):
                 self._ends[node] = how
-            case agent.Flushed(number):
-                self.flushed = number
             case agent.ThreadsRead(node, read):
                 with self._arrived:
                     self._threads[node] = read

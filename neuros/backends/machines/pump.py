@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 
 from neuros.control import Message
 from neuros.control.link import ControlLink, decode, encode, kind_of
-from neuros.control.machines import Closed, Flush, Flushed, Opened, Ping, Pong, Said
+from neuros.control.machines import Closed, Opened, Ping, Pong, Said
 from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
 
@@ -197,8 +197,6 @@ class Pump(threading.Thread):
         match message:
             case Ping(sent_s):
                 self.send(Pong(sent_s, time.monotonic(), time.time()))
-            case Flush(number):
-                self.send_last(Flushed(number))
             case Opened(number):
                 if self._connect is not None:
                     self._open(number)

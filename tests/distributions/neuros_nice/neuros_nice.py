@@ -101,9 +101,6 @@ class NiceNode:
         code = self._child.poll()
         return None if code is None else f"exit code {code}"
 
-    def is_heard(self) -> bool:
-        return True
-
     def threads(self) -> ProcessThreads:
         return threads_of(self._child.pid)
 
