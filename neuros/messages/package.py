@@ -14,6 +14,9 @@ MANIFEST = "package.xml"
 KINDS = ("msg", "srv", "action")
 """The folders of interfaces, which are also the suffixes of the files in them."""
 
+_LONGEST_NAME = 200
+"""Names of files, which have at most 255 bytes, contain the name of a package and up to 40 more."""
+
 _IGNORED = ("COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE")
 _NOT_SOURCES = {"build", "install", "log"}
 
@@ -128,6 +131,9 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
         )
         line = getattr(error.__context__, "lineno", 1)  # what is missing is in no line
         raise ManifestError(problem_at(file, text, int(line))) from error
+    if len(manifest.name) > _LONGEST_NAME:
+        text = f"the name of the package has {len(manifest.name)} characters, at most"
+        raise ManifestError(problem_at(file, f"{text} {_LONGEST_NAME} are allowed"))
     depends = (*manifest.build_depends, *manifest.build_export_depends, *manifest.exec_depends)
     return Package(manifest.name, folder, files, frozenset(each.name for each in depends))
 

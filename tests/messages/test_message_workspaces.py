@@ -241,6 +241,15 @@ class TestMistakes:
 
         assert problem.partition("a_msgs/package.xml:")[2].startswith("3:1: ")
 
+    def test_a_name_that_is_too_long_for_files_is_told(self, bench: Bench) -> None:
+        write_package(bench.own, "a" * 200, POINT)
+        write_package(bench.own, "b" * 201, POINT)
+
+        (problem,) = bench.problems()
+
+        text = "the name of the package has 201 characters, at most 200 are allowed"
+        assert problem.endswith(f"{'b' * 201}/package.xml:1:1: {text}")
+
     def test_a_manifest_that_lacks_something_says_what(self, bench: Bench) -> None:
         folder = write_package(bench.own, "a_msgs", POINT)
         text = (folder / "package.xml").read_text()
