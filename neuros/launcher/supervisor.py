@@ -37,7 +37,6 @@ from neuros.project.model import NodeFile
 _TICK_S = 0.02
 _QUIET_TICK_S = 0.2
 _MOST_REFUSED = 10
-_ENDS = (control.Shutdown, control.Failed)
 _PARTED_S = 1.0
 """A process that has hung up ends within this time, or something has closed its descriptors."""
 _KEPT_STILL_S = 1.0
@@ -171,13 +170,7 @@ class Supervisor:
     # ------------------------------------------------------------------ what arrives
 
     def _hear(self) -> None:
-        messages = list(self._channels.receive())
-        # Who ends the project may have been set going by a node whose report comes later here: that
-        # node was read before it reported, or is read after.
-        if any(isinstance(message, _ENDS) for _, message in messages):
-            messages += self._channels.receive()
-            messages.sort(key=lambda pair: isinstance(pair[1], _ENDS))
-        for link, message in messages:
+        for link, message in self._channels.receive():
             if isinstance(message, ControlError):
                 self._refuse(link, message)
             else:

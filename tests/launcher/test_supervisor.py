@@ -6,12 +6,10 @@ import os
 import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
-from containers import wait_until
 from neuros.backends.process_launchers import RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
@@ -50,42 +48,6 @@ host.report(is_final=True)
 """
     outcome = run(a=SHUTS_DOWN, b=ends_after_that, on_stop=begun.touch)
     assert (outcome.exit_code, outcome.failures) == (0, [])
-
-
-def test_a_node_that_reports_while_others_are_read_has_started(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It has reported before its packet made the other one end the project."""
-    reports = """
-host.hello()
-Path('b.up').touch()
-while not os.path.exists('others are read'):
-    time.sleep(0.005)
-host.report()
-host.send('loaded')
-Path('b.reported').touch()
-host.serve()
-"""
-    ends = """
-host.up_last()
-while not os.path.exists('b.reported'):
-    time.sleep(0.005)
-host.tell('shutdown', reason='enough', drain_s=5)
-Path('a.told').touch()
-host.serve()
-"""
-    read = Channels._read
-
-    def read_a_late(self: Channels, link: ControlLink) -> Iterator[Any]:
-        if self._nodes.get(link) == ("a",):
-            (tmp_path / "others are read").touch()
-            wait_until((tmp_path / "a.told").exists)
-        yield from read(self, link)
-
-    monkeypatch.setattr(Channels, "_read", read_a_late)
-    outcome = run(a=ends, b=reports)
-    assert (outcome.exit_code, outcome.failures) == (0, [])
-    assert outcome.has_final_report("b"), run.output.said
 
 
 @pytest.mark.parametrize(
