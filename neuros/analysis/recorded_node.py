@@ -45,7 +45,10 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
         content = read_object(file)
         if wrong := mistake(content, "node", "#/$defs/node_file"):
             raise EnvironmentFault(f"replay: {file} is damaged: {wrong}")
-        return run, node_file_from_json(content)
+        told = node_file_from_json(content)
+        if told.node.name != name:
+            raise EnvironmentFault(f"replay: {file} is damaged: it is of a node '{told.node.name}'")
+        return run, told
     except (OSError, ValueError, TypeError, OverflowError) as error:
         raise EnvironmentFault(f"replay: {file} cannot be read ({error})") from error
 
