@@ -187,7 +187,11 @@ def damage_of(folder: Path, what: str = "") -> Iterator[None]:
 
 def _check_definitions(reader: Reader) -> None:
     """Raise ``ReaderError`` where metadata and files do not agree."""
-    storages = reader.storage.storages if isinstance(reader.storage, DirectoryReader) else ()
+    folder = reader.storage if isinstance(reader.storage, DirectoryReader) else None
+    if folder and not isinstance(folder.files, list):
+        folder.files = []  # else it could not be closed
+        raise ReaderError("in metadata.yaml, files is no list")
+    storages = folder.storages if folder else ()
     stored = [each for storage in storages for each in storage.connections]
     there = {each.topic for each in stored}
     named = {each.topic for each in reader.connections}

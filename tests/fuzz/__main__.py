@@ -1,8 +1,8 @@
 """Fuzzing by command: ``python -m tests.fuzz --hours 1``, ``--target NAME``, ``--keep DIR``.
 
-Each target has a process of its own, so that a crash is a finding, too. Guided by coverage where
-atheris is installed (``pip install atheris``), else by chance. The exit code is 1 if anything was
-found.
+Each target has a process of its own, so that a crash is a finding, too. Of JSON, each value is
+changed in turn. Then inputs are guided by coverage where atheris is installed (``pip install
+atheris``), else made by chance. The exit code is 1 if anything was found.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import itertools
 import json
 import random
 import resource
@@ -129,6 +130,8 @@ def _child(options: argparse.Namespace) -> int:
             from . import running, targets
     else:
         from . import running, targets
+    from .mutation import changed, each_change_of_json
+
     target = targets.TARGETS[name]
     seeds, tally = target.seeds(), Tally()
     for kept in sorted((HERE / "corpus" / name).glob("*")):
@@ -149,8 +152,13 @@ def _child(options: argparse.Namespace) -> int:
             told_s = time.monotonic()
             _tell(tally, folder)
 
+    end_s = begin_s + options.hours * 3600
+    ordinary = target.seeds() if target.is_json else ()
+    changes = itertools.chain.from_iterable(map(each_change_of_json, ordinary))
+    for change in itertools.takewhile(lambda _: time.monotonic() < end_s, changes):
+        one(change)
+    left_s = max(1.0, end_s - time.monotonic())
     if is_guided:
-        from .mutation import changed
 
         def mutate(data: bytes, most: int, seed: int) -> bytes:
             chance = random.Random(seed)
@@ -163,7 +171,7 @@ def _child(options: argparse.Namespace) -> int:
         corpus.mkdir()
         for place, data in enumerate(seeds):
             (corpus / str(place)).write_bytes(data)
-        limits = [f"-max_total_time={max(1, int(options.hours * 3600))}", "-rss_limit_mb=0"]
+        limits = [f"-max_total_time={int(left_s)}", "-rss_limit_mb=0"]
         limits += ["-max_len=262144", "-timeout=0", f"-seed={options.seed}", "-verbosity=0"]
         limits += [f"-artifact_prefix={folder}/"]
         atheris.Setup([sys.argv[0], *limits, str(corpus)], one, custom_mutator=mutate)
@@ -171,9 +179,7 @@ def _child(options: argparse.Namespace) -> int:
             atheris.Fuzz()
     else:
         chance = random.Random(options.seed)
-        from .mutation import changed
-
-        while time.monotonic() - begin_s < options.hours * 3600:
+        while time.monotonic() < end_s:
             one(changed(seeds, target.mutate, chance))
     _tell(tally, folder)
     return 0

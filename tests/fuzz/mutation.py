@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import random
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 Mutate = Callable[[bytes, random.Random], bytes]
@@ -88,12 +88,35 @@ def change_json(data: bytes, chance: random.Random) -> bytes:
     What is none is changed as bytes, and so is what would be nested too deeply to be written.
     """
     try:
-        return _changed_json([json.loads(data)], chance).encode("utf-8", "surrogatepass")
+        return _encoded(_changed_json([json.loads(data)], chance))
     except (ValueError, RecursionError):
         return change_bytes(data, chance)
 
 
-def _changed_json(root: list[Any], chance: random.Random) -> str:
+def each_change_of_json(data: bytes) -> Iterator[bytes]:
+    """Each value of JSON in turn, replaced by each other one, left out and renamed."""
+    root = [json.loads(data)]
+    for holder in _holders(root):
+        for key in [*holder] if isinstance(holder, dict) else range(len(holder)):
+            found = holder[key]
+            for value in _VALUES:
+                holder[key] = value
+                yield _encoded(root)
+            holder[key] = found
+            if isinstance(holder, dict):
+                del holder[key]
+                yield _encoded(root)
+                holder["#"] = found
+                yield _encoded(root)
+                del holder["#"]
+                holder[key] = found
+
+
+def _encoded(root: list[Any]) -> bytes:
+    return _text(root[0]).encode("utf-8", "surrogatepass")
+
+
+def _changed_json(root: list[Any], chance: random.Random) -> list[Any]:
     for _ in range(chance.randint(1, 3)):
         holders = [each for each in _holders(root) if each]
         holder = chance.choice(holders)
@@ -111,7 +134,7 @@ def _changed_json(root: list[Any], chance: random.Random) -> str:
                 holder[key] = json.loads(_text(other[at])) if _is_plain(other[at]) else None
             case _:
                 holder[key] = chance.choice(_VALUES)
-    return _text(root[0])
+    return root
 
 
 def _holders(value: Any) -> list[Any]:

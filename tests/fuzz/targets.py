@@ -68,12 +68,14 @@ class Target:
         feed: lets one input in, in an empty folder; raises for what must not happen.
         seeds: ordinary inputs.
         factor: the most memory that an input may take, as a multiple of it.
+        is_json: whether ordinary inputs are JSON.
     """
 
     feed: Callable[[bytes, Path], object]
     seeds: Callable[[], Sequence[bytes]]
     mutate: Mutate
     factor: int = 10
+    is_json: bool = False
 
 
 TARGETS: dict[str, Target] = {}
@@ -85,7 +87,8 @@ def target(
     """Register a function under its name."""
 
     def register(feed: Callable[[bytes, Path], object]) -> Callable[[bytes, Path], object]:
-        TARGETS[feed.__name__] = Target(feed, seeds, mixed(*ways), factor)
+        is_json = change_json in ways
+        TARGETS[feed.__name__] = Target(feed, seeds, mixed(*ways), factor, is_json)
         return feed
 
     return register

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from .mutation import changed
+from .mutation import changed, each_change_of_json
 from .running import fault_of
 from .targets import TARGETS
 
@@ -34,6 +34,15 @@ def test_any_other_is_answered(name: str) -> None:
         assert not fault_of(target, data, measures_memory=True), data
 
     check()
+
+
+def test_each_value_of_json_is_changed_in_turn_and_only_one_at_a_time() -> None:
+    changes = [*each_change_of_json(b'{"a": [1], "b": "x"}')]
+    assert b'{"a": [null], "b": "x"}' in changes
+    assert b'{"b": "x"}' in changes
+    assert b'{"b": "x", "#": [1]}' in changes
+    assert b'{"b": NaN, "a": [1]}' in changes
+    assert b'{"a": null, "b": null}' not in changes
 
 
 @pytest.mark.parametrize(
