@@ -89,7 +89,7 @@ def change_json(data: bytes, chance: random.Random) -> bytes:
     """
     try:
         return _encoded(_changed_json([json.loads(data)], chance))
-    except (ValueError, RecursionError):
+    except (ValueError, RecursionError, MemoryError):
         return change_bytes(data, chance)
 
 
@@ -126,7 +126,7 @@ def _changed_json(root: list[Any], chance: random.Random) -> list[Any]:
                 del holder[key]
             case 1 if isinstance(holder, dict):
                 holder[chance.choice((*holder, *_WORDS))] = holder.pop(key)
-            case 2 if isinstance(holder, list):
+            case 2 if isinstance(holder, list) and len(holder) < 1000:
                 holder *= chance.choice((2, 50))
             case 3:
                 other = chance.choice(holders)

@@ -186,6 +186,7 @@ class World:
         self.losses, self.ticks = project.losses, project.ticks
         self.is_ending = self.is_drained = False
         self.has_crashed = False
+        self.now_s = 0.0
         self.nodes = {name: ModelNode(self, name, specs) for name, specs in project.plugins.items()}
         self.probing = Probing(self.nodes, list(project.connections), self._to_all)
 
@@ -198,6 +199,8 @@ class World:
         found: list[tuple[Any, ...]] = []
         if self._must_shut_down():
             return [("shut down",)]
+        if late := self._orders_that_are_late():
+            return late
         for name, node in self.nodes.items():
             if node.is_dead:
                 continue
@@ -302,7 +305,8 @@ class World:
         self.probing.drain((), 0.0)
 
     def _probe(self) -> None:
-        self.probing.look(1e9, 0.0)  # long after the last one
+        self.now_s += 1e3  # long after the last one
+        self.probing.look(self.now_s, 0.0)
 
     # the launcher
 
@@ -323,6 +327,14 @@ class World:
             and self._all_run()
             and max(counts, default=0) >= _LONGEST
         )
+
+    def _orders_that_are_late(self) -> list[tuple[Any, ...]]:
+        """To drain: while a node has not heard of it, a loop goes round for ever."""
+        sent = [count for node in self.nodes.values() for count in node.numbers.values()]
+        if not self.is_ending or max(sent, default=0) < 2 * _LONGEST:
+            return []
+        channels = [("to node", name) for name in self.nodes]
+        return [("deliver", channel) for channel in channels if self.channels.get(channel)]
 
     def _all_run(self) -> bool:
         return all(node.engine.is_running for node in self.nodes.values())
