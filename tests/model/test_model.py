@@ -11,7 +11,9 @@ from .world import Project
 
 PROJECTS = {project.name: project for project in projects()}
 SMALL = 1_000
-"""More states take minutes: those projects are searched by ``python -m tests.model``."""
+"""More states take minutes: those of projects that end, or in which a node dies."""
+LARGE = 50_000
+ENDING = [name for name in PROJECTS if "ended" in name or "dies" in name]
 
 
 def held(project: Project, most_states: int) -> bool:
@@ -20,11 +22,15 @@ def held(project: Project, most_states: int) -> bool:
     return found.is_complete
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in PROJECTS if "ended" not in name and "dies" not in name]
-)
+@pytest.mark.parametrize("name", [name for name in PROJECTS if name not in ENDING])
 def test_whatever_comes_first_no_rule_is_broken_and_the_last_packet_arrives(name: str) -> None:
     assert held(PROJECTS[name], SMALL)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("name", ENDING)
+def test_whatever_comes_first_a_project_that_is_ended_comes_to_its_end(name: str) -> None:
+    assert held(PROJECTS[name], LARGE)
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.rule)
