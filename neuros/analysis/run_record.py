@@ -497,7 +497,7 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
 
 
 def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool:
-    """Whether a packet may have been sent: not before the nodes at both ends had been loaded."""
+    """Whether a packet may have been sent: not before the nodes at both ends had begun."""
     ends = (end.partition(".")[0] for end in connection["connection"].split(" -> "))
     here = [record["nodes"][node] for node in ends if node in record["nodes"]]
     if len(here) < 2 and not (connection["sent"] or connection["received"]):

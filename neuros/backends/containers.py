@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -72,7 +73,8 @@ def folder_of(name: str, places: Iterable[Path]) -> Path | None:
     """The first folder of that name in ``places``; ``None`` where it can only be an image."""
     if not _NAME.fullmatch(name):
         return None
-    return next((place / name for place in places if (place / name).is_dir()), None)
+    folders = (place / name for place in places)
+    return next((each for each in folders if os.path.isdir(each)), None)  # a name may be too long
 
 
 def find_container(name: str, project: Path, own: Path = OWN_FOLDER) -> ContainerFolder | None:

@@ -133,7 +133,7 @@ class Report(Message):
         expected_end_s: simulated time at which the plugin expects to end the project.
         timeline: further points of simulated and wall time, in seconds.
         running_since_s: since when the node has been initialised, on the monotonic clock.
-        metrics: ``None`` before the plugin is loaded.
+        metrics: ``None`` before the node has begun.
         stack: where the plugin stands, if its hook runs for long.
         fault: what cannot be recorded.
         foreign: by connection, messages from others than its two nodes.

@@ -84,18 +84,24 @@ class Shutdown:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._kill_not_started()
+        self._kill_not_begun()
         self._channels.send(Drain(self._declarations.last_round(stopped)))
         self._probing.drain(self._processes.killed, now_s)
 
-    def lets_begin(self, names: Sequence[str]) -> bool:
-        """Whether the nodes of a process, which are loaded now, may start hooks."""
+    def let_begin(self, names: Sequence[str]) -> bool:
+        """The nodes of a process are loaded; returns whether they may start hooks."""
         if self.phase is Phase.RUNNING:
             self._begun.update(names)
         return self.phase is Phase.RUNNING
 
-    def _kill_not_started(self) -> None:
-        """Kill what was not told to begin: it has sent nothing, and has nothing to finalise."""
+    def give_up(self) -> None:
+        """Kill what is left, whatever the phase, and let nothing begin any more."""
+        self.phase = Phase.KILLED
+        for process in self._processes:
+            process.kill()
+
+    def _kill_not_begun(self) -> None:
+        """Kill what was not told to begin: nothing was sent by it or to it, no hook has run."""
         for process in self._processes:
             if not {*process.names} & (self._begun | self._processes.killed):
                 if self.phase is Phase.DRAINING:
@@ -171,6 +177,12 @@ class Shutdown:
 
     def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
         """Its nodes have had their time."""
+        if self._begun.isdisjoint(process.names):
+            self._outcome.fail(
+                f"{nodes_of(process)} had not started, and had not ended {STOP_S:g} s after it was"
+                " killed"
+            )
+            return
         late = [name for name in process.names if not self._outcome.has_final_report(name)]
         unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
         why = "; ".join(unfinished) or "its process did not end"
@@ -203,7 +215,7 @@ class Shutdown:
         self._deadline_s = now_s + STOP_S
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send(Stop())
-        self._kill_not_started()
+        self._kill_not_begun()
         self._on_stop()
 
     def _kill_all(self) -> None:

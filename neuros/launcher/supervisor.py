@@ -157,8 +157,7 @@ class Supervisor:
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
-            for process in self._processes:
-                process.kill()
+            self._shutdown.give_up()
             self._reader.close()
             self._hear()
             self.observers.part(self.outcome)
@@ -197,7 +196,7 @@ class Supervisor:
             case control.Hello():
                 self._on_hello(link, message)
             case control.Loaded():
-                if self._shutdown.lets_begin(self._channels.nodes_of(link)):
+                if self._shutdown.let_begin(self._channels.nodes_of(link)):
                     self._channels.send_to(link, control.Begin())
             case control.Hooks():
                 self._declarations.take(message)
@@ -210,7 +209,7 @@ class Supervisor:
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
                 self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
-            case control.Failed(node, text):
+            case control.Failed(node, text) if node not in self._processes.killed:
                 self._processes.note_failure(node)
                 first_line = (text.strip() or "no reason was given").splitlines()[0]
                 self._shutdown.fail(f"node '{node}' failed: {first_line}")

@@ -15,7 +15,7 @@ KINDS = ("msg", "srv", "action")
 """The folders of interfaces, which are also the suffixes of the files in them."""
 
 _LONGEST_NAME = 200
-"""Names of files, which have at most 255 bytes, contain the name of a package and up to 40 more."""
+"""Names of files, which have at most 255 bytes, contain the name of a package and up to 50 more."""
 
 _IGNORED = ("COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE")
 _NOT_SOURCES = {"build", "install", "log"}

@@ -181,6 +181,7 @@ class NodeRuntime:
 
     def start(self) -> None:
         """Let the engine run hooks as soon as every receiver is there."""
+        self.reports.begin()
         if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
             self._has_timer = True
             self._middleware.loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
@@ -260,11 +261,11 @@ class NodeRuntime:
         """Start no further hook. Any thread."""
         self._services.stop()
 
-    def finalise(self) -> None:
+    def finalise(self, *, runs_hooks: bool = True) -> None:
         """Run the finalise hooks and give up what the plugin holds; each fault is reported."""
         self.stop()
         self._enter()
-        if self.engine is not None:
+        if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
         self._tell(Finalising(self.name, ""))
         if self._recorder is not None:

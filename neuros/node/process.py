@@ -85,6 +85,7 @@ class NodeProcess:
         self._has_begun = self._is_draining = False
         self._has_been_reset = False
         self._stop_asked = threading.Event()
+        self._may_begin = threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
         self._peers = PeerLink(
@@ -104,7 +105,7 @@ class NodeProcess:
             thread.start()
             self._guard(self._live)
             for node in self._nodes:
-                self._guard(node.finalise)
+                self._guard(functools.partial(node.finalise, runs_hooks=self._has_begun))
             self._guard(lambda: self.report(is_final=True))
             self._guard(self._peers.close)
             if self._middleware is not None:
@@ -117,6 +118,8 @@ class NodeProcess:
     def obey(self, message: Message) -> None:
         """Do what the supervisor asks for, between two events where hooks are concerned."""
         match message:
+            case control.Begin():
+                self._may_begin.set()
             case control.Stop():
                 self.ask_to_stop()
             case control.Leave():
@@ -132,11 +135,6 @@ class NodeProcess:
                 self.post(lambda: self._obey_in_loop(message))
 
     def _obey_in_loop(self, message: Message) -> None:
-        if isinstance(message, control.Begin):
-            self._has_begun = True
-            for node in self._nodes:
-                node.start()
-            return
         if isinstance(message, control.Probe):
             self._probe(message.number)
             return
@@ -164,6 +162,7 @@ class NodeProcess:
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
         self._stop_asked.set()
+        self._may_begin.set()
         for node in tuple(self._nodes):
             node.stop()
         if self._middleware is not None:
@@ -261,8 +260,6 @@ class NodeProcess:
 
     def _why_not_reset(self) -> str:
         """Why the nodes cannot be reset where they are; empty if they can."""
-        if not self._has_begun:
-            return "its nodes have not started yet"
         if not all(node.is_paused for node in self._nodes):
             return "the run is not paused: pause it first"
         connections = (c for file in self._files for c in file.connections)
@@ -302,9 +299,15 @@ class NodeProcess:
                 self._fail(node.name, error)
         if self.is_ending:
             return
-        self.report()
-        self._tell(control.Loaded())
         gc.freeze()
+        self._tell(control.Loaded())
+        self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
+        if self.is_ending:
+            return
+        self._has_begun = True
+        for node in self._nodes:
+            middleware.loop.post(node.start)
+        middleware.loop.post(self.report)
         middleware.loop.run()
         middleware.take_in()
 

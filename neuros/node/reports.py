@@ -36,6 +36,7 @@ class NodeReports:
     _world_log: WorldLog | None = None
     _engine: Engine | None = None
     _packet_log: PacketLog | None = None
+    _has_begun: bool = False
 
     def open(self, engine: Engine, logger: Logger) -> None:
         """There is an engine to report of; what is special about it is logged."""
@@ -51,6 +52,10 @@ class NodeReports:
                 f"no hook takes input '{subscription.input_name}': packets on"
                 f" {subscription.name} are acknowledged on arrival and dropped"
             )
+
+    def begin(self) -> None:
+        """The node may start hooks: from now on there is something to report."""
+        self._has_begun = True
 
     def begin_anew(self, engine: Engine) -> None:
         """The node was reset, and has this engine now."""
@@ -77,7 +82,7 @@ class NodeReports:
 
     def _state(self) -> dict[str, Any]:
         now_ns, engine = self._clock(), self._engine
-        metrics = None if engine is None else snapshot(engine, now_ns)
+        metrics = snapshot(engine, now_ns) if engine and self._has_begun else None
         return {
             "node": self._file.node.name,
             "waiting_for": tuple(str(each) for each in self._transport.waiting_for()),

@@ -45,17 +45,36 @@ sys.exit(agent.wait())
 """
 BEGINS = """
 from pathlib import Path
-from neuros.hooks import neuros_initialise
-@neuros_initialise()
+from neuros.hooks import neuros_finalise, neuros_function, neuros_initialise
+@neuros_initialise(outputs="o")
 def begin(node):
     Path("{begun}").touch()
+    return node.make_packet("o")
+@neuros_function(inputs="x")
+def take(node, x):
+    Path("{begun}").touch()
+@neuros_finalise()
+def end(node):
+    Path("{begun}").touch()
+"""
+SENDS = """
+from neuros.hooks import neuros_function, neuros_tick
+@neuros_tick(seconds=0.05, outputs="o")
+def look(node):
+    return node.make_packet("o")
+@neuros_function(inputs="x")
+def take(node, x):
+    pass
 """
 ENDS = """
 from pathlib import Path
 from neuros.hooks import neuros_tick
+ticks = 0
 @neuros_tick(seconds=0.05)
 def look(node):
-    if Path("{held}").exists():
+    global ticks
+    ticks += Path("{held}").exists()
+    if ticks == 20:  # by then the others would have found each other
         node.shutdown("seen")
         Path("{ends}").touch()
 """
@@ -126,18 +145,24 @@ def test_it_is_said_where_a_node_elsewhere_stood_that_is_killed(tmp_path: Path) 
     assert left_there(tmp_path) == []
 
 
-def test_a_node_elsewhere_starts_no_hook_before_its_launcher_knows_that_it_could(
+def test_a_node_elsewhere_takes_no_part_before_its_launcher_knows_that_it_could(
     tmp_path: Path,
 ) -> None:
     """So that, at an end that comes first, it can be killed with nothing lost."""
     held, ends, begun = tmp_path / "held", tmp_path / "ends", tmp_path / "begun"
     bench = Bench(tmp_path, "process")
-    bench.project(eye=BEGINS.format(begun=begun), brain=ENDS.format(held=held, ends=ends))
+    bench.project(
+        ("eye.o -> brain.x", 0),
+        ("brain.o -> eye.x", 0),
+        eye=BEGINS.format(begun=begun),
+        brain=SENDS,
+        judge=ENDS.format(held=held, ends=ends),
+    )
     (tmp_path / "slow_network.py").write_text(SLOW_NETWORK)
     late = [sys.executable, str(tmp_path / "slow_network.py"), str(held), str(ends)]
     file = deployment(tmp_path, nodes={"eye": "other"}, through=late)
     finished = bench.launch("--deployment", str(file), timeout_s=ENDED_S)
-    assert_ended(finished, 0, "brain ended the project: seen")
+    assert_ended(finished, 0, "judge ended the project: seen")
     assert "'eye' had not started yet: killed" in finished.output
     assert not begun.exists()
 

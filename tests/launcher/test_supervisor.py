@@ -6,11 +6,13 @@ import os
 import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
-from neuros.backends.process_launchers import RunningProcess
+from containers import wait_until
+from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
@@ -22,6 +24,21 @@ from neuros.launcher.channels import Channels
 def run(tmp_path: Path) -> Iterator[Run]:
     with supervised(tmp_path) as run:
         yield run
+
+
+@pytest.fixture
+def told_to_begin(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[str]]:
+    """The nodes of each process that was told to begin."""
+    told: list[Sequence[str]] = []
+    send_to = Channels.send_to
+
+    def note(self: Channels, link: ControlLink, message: Message) -> None:
+        if isinstance(message, Begin):
+            told.append(self.nodes_of(link))
+        send_to(self, link, message)
+
+    monkeypatch.setattr(Channels, "send_to", note)
+    return told
 
 
 # ------------------------------------------------------------------ drained ends
@@ -51,16 +68,23 @@ host.report(is_final=True)
 
 
 @pytest.mark.parametrize(
-    ("ends", "exit_code"),
-    [(SHUTS_DOWN, 0), ("host.up_last(); host.ask('interrupt'); host.serve()", 130)],
+    ("ends", "told", "exit_code"),
+    [
+        (SHUTS_DOWN, "drain", 0),
+        ("host.up_last(); host.ask('interrupt'); host.serve()", "stop", 130),
+    ],
 )
 def test_a_node_that_is_loaded_once_the_run_is_ending_is_not_told_to_begin(
-    run: Run, ends: str, exit_code: int, monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    told_to_begin: list[Sequence[str]],
+    ends: str,
+    told: str,
+    exit_code: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It is killed; the kill may be on its way for long."""
-    kill, send_to = RunningProcess.kill, Channels.send_to
+    kill = RunningProcess.kill
     late: list[RunningProcess] = []
-    told_to_begin: list[Sequence[str]] = []
 
     def kill_late(process: RunningProcess) -> None:
         if process.names == ("b",) and not late:
@@ -68,20 +92,14 @@ def test_a_node_that_is_loaded_once_the_run_is_ending_is_not_told_to_begin(
         else:
             kill(process)
 
-    def note(self: Channels, link: ControlLink, message: Message) -> None:
-        if isinstance(message, Begin):
-            told_to_begin.append(self.nodes_of(link))
-        send_to(self, link, message)
-
     monkeypatch.setattr(RunningProcess, "kill", kill_late)
-    monkeypatch.setattr(Channels, "send_to", note)
     run.when_file_exists("b.loaded", lambda: late[0].kill())
-    loads_late = """
+    loads_late = f"""
 host.hello()
 Path('b.up').touch()
-host.wait_for('stop')
-host.report()
+host.wait_for('{told}')
 host.send('loaded')
+host.tell('failed', text='it cannot be imported')
 Path('b.loaded').touch()
 host.wait_for('never')
 """
@@ -89,6 +107,27 @@ host.wait_for('never')
     assert (outcome.exit_code, outcome.failures) == (exit_code, [])
     assert not outcome.has_final_report("b")
     assert told_to_begin == [("a",)]
+
+
+def test_nothing_begins_where_not_all_could_be_started(
+    run: Run,
+    told_to_begin: list[Sequence[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = ProcessLauncher.start
+
+    def start_and_fail(*arguments: Any) -> Any:
+        started = start(*arguments)
+        wait_until((tmp_path / "a.loaded").exists)
+        run.hosts += started
+        raise EnvironmentFault("the third one cannot be started")
+
+    monkeypatch.setattr(ProcessLauncher, "start", start_and_fail)
+    loads = "host.hello(); host.send('loaded'); Path('a.loaded').touch(); host.wait_for('begin')"
+    with pytest.raises(EnvironmentFault):
+        run(a=loads)
+    assert told_to_begin == []
 
 
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
