@@ -82,10 +82,8 @@ class NodeProcess:
         self._early_lock = threading.Lock()
         self._has_failed = False
         self._settling: control.Settle | Advance | None = None
-        self._has_begun = self._is_draining = False
-        self._has_been_reset = False
-        self._stop_asked = threading.Event()
-        self._may_begin = threading.Event()
+        self._has_begun = self._is_draining = self._has_been_reset = False
+        self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
         self._peers = PeerLink(
