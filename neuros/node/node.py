@@ -181,7 +181,6 @@ class NodeRuntime:
 
     def start(self) -> None:
         """Let the engine run hooks as soon as every receiver is there."""
-        self.reports.begin()
         if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
             self._has_timer = True
             self._middleware.loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)

@@ -295,8 +295,6 @@ class NodeProcess:
                 self._tell(declared(node.name, node.specs))
             except NeurosError as error:
                 self._fail(node.name, error)
-        if self.is_ending:
-            return
         gc.freeze()
         self._tell(control.Loaded())
         self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
@@ -304,6 +302,7 @@ class NodeProcess:
             return
         self._has_begun = True
         for node in self._nodes:
+            node.reports.begin()
             middleware.loop.post(node.start)
         middleware.loop.post(self.report)
         middleware.loop.run()
