@@ -94,6 +94,10 @@ class Shutdown:
             self._begun.update(names)
         return self.phase is Phase.RUNNING
 
+    def counts_failure_of(self, name: str) -> bool:
+        """Whether it matters that a node fails: not if it was killed as the run ended well."""
+        return bool(self._outcome.failures) or name not in self._processes.killed
+
     def give_up(self) -> None:
         """Kill what is left, whatever the phase, and let nothing begin any more."""
         self.phase = Phase.KILLED

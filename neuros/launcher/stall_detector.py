@@ -46,6 +46,7 @@ class StallDetector:
         self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
         self._plugins: dict[str, str] = {}
         self._silent = set(names)
+        self._loaded: set[str] = set()
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
         self._moved: dict[str, Any] = {}
@@ -96,15 +97,19 @@ class StallDetector:
         """Whether the process of a node has said hello."""
         return name not in self._silent
 
-    def is_loaded(self, name: str) -> bool:
-        """Whether a node has come as far as having an engine that may run hooks."""
+    def note_loaded(self, name: str) -> None:
+        """The plugin of a node has been imported."""
+        self._loaded.add(name)
+
+    def has_begun(self, name: str) -> bool:
+        """Whether a node may run hooks."""
         report = self._reports.get(name)
         return report is not None and report.metrics is not None
 
     @property
     def is_complete(self) -> bool:
-        """Whether all nodes have been loaded."""
-        return not self._silent and all(map(self.is_loaded, self._names))
+        """Whether all nodes have begun."""
+        return not self._silent and all(map(self.has_begun, self._names))
 
     @property
     def is_driven(self) -> bool:
@@ -153,8 +158,8 @@ class StallDetector:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             if self._silent:
                 yield "INFO", f"still starting: {', '.join(sorted(self._silent))}"
-            loading = [name for name in sorted(self._reports) if not self.is_loaded(name)]
-            if loading:
+            early = [name for name in sorted(self._reports) if not self.has_begun(name)]
+            if loading := [name for name in early if name not in self._loaded]:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"

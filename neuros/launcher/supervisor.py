@@ -200,6 +200,7 @@ class Supervisor:
                     self._channels.send_to(link, control.Begin())
             case control.Hooks():
                 self._declarations.take(message)
+                self._detector.note_loaded(message.node)
             case control.Finalising(node, hook):
                 self._declarations.note_finalising(node, hook)
             case control.FirstHook():
@@ -209,7 +210,7 @@ class Supervisor:
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
                 self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
-            case control.Failed(node, text) if node not in self._processes.killed:
+            case control.Failed(node, text) if self._shutdown.counts_failure_of(node):
                 self._processes.note_failure(node)
                 first_line = (text.strip() or "no reason was given").splitlines()[0]
                 self._shutdown.fail(f"node '{node}' failed: {first_line}")

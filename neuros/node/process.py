@@ -26,9 +26,10 @@ from neuros.errors import ControlError, NeurosError
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
+from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.stepping import SessionSteps
-from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder, Voice
+from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder
 from neuros.project.model import Connection, NodeFile
 from neuros.stacks import allow_reading
 
@@ -36,7 +37,6 @@ MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None
 Event = Callable[[], None]
 
 _REPORT_S = 1.0
-_LEAVE_S = 4.0
 
 
 class NodeProcess:
@@ -117,6 +117,7 @@ class NodeProcess:
         """Do what the supervisor asks for, between two events where hooks are concerned."""
         match message:
             case control.Begin():
+                self.post(self._begin)
                 self._may_begin.set()
             case control.Stop():
                 self.ask_to_stop()
@@ -133,6 +134,8 @@ class NodeProcess:
                 self.post(lambda: self._obey_in_loop(message))
 
     def _obey_in_loop(self, message: Message) -> None:
+        if self.is_ending:
+            return
         if isinstance(message, control.Probe):
             self._probe(message.number)
             return
@@ -298,15 +301,17 @@ class NodeProcess:
         gc.freeze()
         self._tell(control.Loaded())
         self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
-        if self.is_ending:
-            return
+        if not self.is_ending:
+            middleware.loop.run()
+            middleware.take_in()
+
+    def _begin(self) -> None:
         self._has_begun = True
         for node in self._nodes:
             node.reports.begin()
-            middleware.loop.post(node.start)
-        middleware.loop.post(self.report)
-        middleware.loop.run()
-        middleware.take_in()
+        for node in self._nodes:
+            node.start()
+        self.report()
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)
@@ -393,63 +398,6 @@ class NodeProcess:
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)
-
-
-class PeerLink:
-    """Link between a launcher and its peers, through the nodes of this process.
-
-    The launcher knows no ROS. So each of its nodes publishes the launcher's state, and tells it
-    what nodes elsewhere publish; only in a project that is started in parts.
-
-    Args:
-        names: the nodes of this process.
-        elsewhere: content of the environment variable.
-        tell: sends to the supervisor.
-    """
-
-    def __init__(
-        self, names: Sequence[str], elsewhere: str, tell: Callable[[Message], None]
-    ) -> None:
-        self._names = names
-        self._elsewhere = [name for name in elsewhere.split(",") if name]
-        self._tell = tell
-        self._lock = threading.Lock()
-        self._voice: Voice | None = None
-        self._last_state = ""
-        self._may_leave = threading.Event()
-
-    def open(self, middleware: Middleware) -> None:
-        """Speak and listen from now on."""
-        if not self._elsewhere:
-            return
-        voice = middleware.join_peers(self._names, self._elsewhere, self._hear)
-        with self._lock:
-            self._voice = voice
-            if self._last_state:
-                voice.say(self._last_state)
-
-    def say(self, text: str) -> None:
-        """Pass on what the launcher says, as soon as that is possible. Any thread."""
-        with self._lock:
-            self._last_state = text
-            if self._voice is not None:
-                self._voice.say(text)
-
-    def leave(self) -> None:
-        """Nothing more will be said or needs to be heard. Any thread."""
-        self._may_leave.set()
-
-    def close(self) -> None:
-        """Stay until the launcher has said and heard all; it is bound by what it waits for."""
-        if self._voice is None:
-            return
-        self._may_leave.wait(_LEAVE_S)
-        with self._lock:
-            voice, self._voice = self._voice, None
-        voice.close()
-
-    def _hear(self, name: str, text: str | None) -> None:
-        self._tell(control.Heard(name, text))
 
 
 class ControlThread(threading.Thread):

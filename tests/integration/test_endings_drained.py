@@ -54,6 +54,18 @@ def test_a_drained_end_loses_nothing_on_its_way(bench: Bench) -> None:
     assert all(node["report"] == "final" for node in finished.record["nodes"].values())
 
 
+def test_a_node_may_end_the_project_before_others_have_started_a_hook(bench: Bench) -> None:
+    ends_at_once = """
+@neuros_initialise()
+def begin(node):
+    node.shutdown("enough")
+    time.sleep(0.5)
+"""
+    bench.project(("a.o -> b.x", None), a=f"{ends_at_once}{SOURCE}", b=COUNTS)
+    finished = bench.launch()
+    assert_ended(finished, 0, "a ended the project: enough")
+
+
 def test_two_nodes_that_end_the_project_end_it_once(bench: Bench) -> None:
     bench.project(a=ENDS, b=ENDS)
     finished = bench.launch()

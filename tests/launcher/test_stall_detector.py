@@ -206,12 +206,8 @@ def test_nodes_that_start_slowly_are_named() -> None:
     detector = StallDetector(["a", "b", "c"], 0.0, reader_of(ProcessThreads()))
     detector.greet(["b", "c"], {}, 0.0)
     detector.report(LOADING, 4.0)
-    detector.report(
-        report(
-            "c",
-        ),
-        4.0,
-    )
+    detector.note_loaded("c")  # and waits for the others in its process
+    detector.report(replace(LOADING, node="c"), 4.0)
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
 
 
