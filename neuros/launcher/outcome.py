@@ -173,7 +173,7 @@ class Processes:
     """Processes that the back end has started, judged by the reports of their nodes.
 
     Attributes:
-        killed: the names of all nodes whose processes were killed.
+        killed: the names of all nodes whose processes were killed, or are to be.
     """
 
     _detector: StallDetector

@@ -5,6 +5,7 @@ Running, then perhaps draining, then stopping, and at worst killed; never back.
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -60,6 +61,7 @@ class Shutdown:
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
     _begun: set[str] = field(default_factory=set)
+    _kill_early_s: float = math.inf
 
     @property
     def is_hopeless(self) -> bool:
@@ -105,12 +107,20 @@ class Shutdown:
             process.kill()
 
     def _kill_not_begun(self) -> None:
-        """Kill what was not told to begin: nothing was sent by it or to it, no hook has run."""
+        """Kill what was not told to begin: nothing was sent by it or to it, no hook has run.
+
+        It may be the only one here that can tell peers of the end, and has a moment for that.
+        """
         for process in self._processes:
             if not {*process.names} & (self._begun | self._processes.killed):
                 if self.phase is Phase.DRAINING:
                     self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
-                self._processes.kill(process)
+                if self._peers.exist:
+                    self._processes.killed.update(process.names)
+                    self._channels.send_to_node(process.names[0], Stop())
+                    self._kill_early_s = time.monotonic() + _CLOSING_S
+                else:
+                    self._processes.kill(process)
 
     def fail(self, reason: str, exit_code: int = 1) -> None:
         """End as failed, at once."""
@@ -152,6 +162,11 @@ class Shutdown:
 
     def look(self, now_s: float) -> None:
         """Go on to the next phase where it is time."""
+        if now_s >= self._kill_early_s:
+            self._kill_early_s = math.inf
+            for process in self._processes:
+                if self._begun.isdisjoint(process.names):
+                    process.kill()
         if self.phase is Phase.STOPPING:
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:

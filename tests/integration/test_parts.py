@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ import psutil
 import pytest
 from launching import Running, start
 
+from containers import wait_until
 from neuros.backends.domain import choose_domain
 
 STREAM = Path(__file__).parent / "network" / "stream"
@@ -25,10 +27,10 @@ class Parts:
         self._folder = folder
         self._domain = str(domain)
 
-    def start(self, node: str, *arguments: str) -> Running:
+    def start(self, node: str, *arguments: str, project: Path = STREAM) -> Running:
         folder = self._folder / node
         folder.mkdir()
-        return start(STREAM, "-n", node, "-d", self._domain, *arguments, cwd=folder)
+        return start(project, "-n", node, "-d", self._domain, *arguments, cwd=folder)
 
 
 @pytest.fixture
@@ -70,6 +72,25 @@ def test_a_node_that_is_killed_ends_all_and_its_own_launcher_says_how(parts: Par
         assert source.finish().exit_code == sink.finish().exit_code == 1
     assert "killed by SIGKILL" in source.output
     assert "node 'source' on " in sink.output
+
+
+def test_a_part_that_still_imports_its_plugin_tells_the_others_that_it_was_ended(
+    parts: Parts, tmp_path: Path
+) -> None:
+    imports = f"import pathlib, time; pathlib.Path({str(tmp_path / 'imports')!r}).touch()"
+    project = tmp_path / "project"
+    shutil.copytree(STREAM, project)
+    with (project / "sink.py").open("a") as plugin:
+        plugin.write(f"\n{imports}; time.sleep(60)\n")
+    with (
+        parts.start("source", *ENDLESS, project=project) as source,
+        parts.start("sink", *ENDLESS, project=project) as sink,
+    ):
+        wait_until((tmp_path / "imports").exists, FOUND_S)
+        source.wait_for("found elsewhere: sink", FOUND_S)
+        sink.signal(signal.SIGINT)
+        ended = sink.finish()
+        assert source.finish().exit_code == ended.exit_code == 130, source.output
 
 
 def test_a_part_that_is_alone_is_ended_by_ctrl_c_as_ever(parts: Parts) -> None:
