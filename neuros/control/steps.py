@@ -87,6 +87,8 @@ class Advanced(NamedTuple):
         _require(str, *(name for name, _, _ in sizes))
         parts = _split(body, [size for *_, size in sizes])
         packets = {name: (n, part) for (name, n, _), part in zip(sizes, parts, strict=True)}
+        if len(packets) < len(sizes):
+            raise ValueError("an output comes twice")
         return cls(number, sim_times, packets)
 
 

@@ -1,4 +1,4 @@
-"""What passes between a launcher and its peers, in a project that is started in parts."""
+"""Link between a launcher and its peers, in a project that is started in parts."""
 
 from __future__ import annotations
 
