@@ -309,9 +309,9 @@ class NodeProcess:
         self._has_begun = True
         for node in self._nodes:
             node.reports.begin()
+        self.report()
         for node in self._nodes:
             node.start()
-        self.report()
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)

@@ -57,7 +57,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood(
     bench: Bench,
 ) -> None:
-    bench.project(gil=HOLDS, hangs=RUNS + HANGS)
+    bench.project(("gil.o -> hangs.x", None), gil=HOLDS, hangs=RUNS + HANGS)  # both have begun
     finished = bench.launch(timeout_s=40.0)
     assert finished.exit_code == 1
     for node, what in {
