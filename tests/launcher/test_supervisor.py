@@ -16,7 +16,7 @@ from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import stall_detector
+from neuros.launcher import shutdown, stall_detector
 from neuros.launcher.channels import Channels
 
 
@@ -128,6 +128,45 @@ def test_nothing_begins_where_not_all_could_be_started(
     with pytest.raises(EnvironmentFault):
         run(a=loads)
     assert told_to_begin == []
+
+
+def test_one_that_has_not_started_and_outlasts_its_kill_is_named_so(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill = RunningProcess.kill
+    ignored: list[RunningProcess] = []
+
+    def kill_at_the_second_time(process: RunningProcess) -> None:
+        if process.names == ("b",) and not ignored:
+            ignored.append(process)
+        else:
+            kill(process)
+
+    monkeypatch.setattr(RunningProcess, "kill", kill_at_the_second_time)
+    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
+    interrupts = "host.up_last(); host.ask('interrupt'); host.serve()"
+    outcome = run(a=interrupts, b="host.hello(); Path('b.up').touch(); host.wait_for('never')")
+    assert outcome.exit_code == 130
+    assert outcome.failures == [
+        "node 'b' had not started, and had not ended 0.5 s after it was killed"
+    ]
+
+
+def test_of_two_plugins_that_cannot_be_imported_both_are_told(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the first one ends the run, and the other one is killed as not started."""
+    wait = Channels.wait
+
+    def wait_for_both(self: Channels, timeout_s: float) -> None:
+        wait_until(lambda: (tmp_path / "a.told").exists() and (tmp_path / "b.told").exists())
+        wait(self, timeout_s)
+
+    monkeypatch.setattr(Channels, "wait", wait_for_both)
+    fails = "host.hello(); host.tell('failed', text='no'); Path(f'{NAMES[0]}.told').touch()"
+    outcome = run(a=fails, b=fails)
+    assert outcome.exit_code == 1
+    assert sorted(outcome.failures) == ["node 'a' failed: no", "node 'b' failed: no"]
 
 
 def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
