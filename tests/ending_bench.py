@@ -105,10 +105,14 @@ class Bench:
         self.outputs.append(finished.output)
         return finished
 
-    def start(self, *arguments: str) -> Running:
-        """Start it; it is ended with the test."""
+    def start(self, *arguments: str, program: Sequence[str] = ()) -> Running:
+        """Start it, by ``program`` in place of ``neuros launch``; it is ended with the test."""
         running = start(
-            self.folder, *self._arguments(arguments), cwd=self.folder, **{MARK: self.mark}
+            self.folder,
+            *self._arguments(arguments),
+            cwd=self.folder,
+            program=program,
+            **{MARK: self.mark},
         )
         self.running.append(running)
         return running

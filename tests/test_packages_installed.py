@@ -265,6 +265,14 @@ class TestFallback:
         assert f"--python {python} neuros_colour [1 {environ['PIP_FIND_LINKS']}]" in log
         assert "pip" not in shown
 
+    @pytest.mark.parametrize(("set_to", "is_told"), [(None, "1"), ("0", "0")])
+    def test_modules_are_compiled_unless_the_user_tells_uv_not_to(
+        self, python: Path, environ: dict[str, str], set_to: str | None, is_told: str
+    ) -> None:
+        uv = program(python.with_name("uv"), 'echo "[$UV_COMPILE_BYTECODE]"')
+        self.run(python, uv, environ | ({"UV_COMPILE_BYTECODE": set_to} if set_to else {}))
+        assert f"[{is_told}]" in (python.parent.parent / "log").read_text("utf-8")
+
     def test_a_setting_that_uv_does_not_know_is_said(
         self, python: Path, environ: dict[str, str]
     ) -> None:

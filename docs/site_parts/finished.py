@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
-from html.parser import HTMLParser
+from html import unescape
 from os.path import normpath
 from pathlib import Path
 from urllib.parse import unquote
 
+# Sphinx writes whole tags, with every value in double quotes.
+_TAG = re.compile(r"<(a|img|script|link)\s[^>]*?\b(href|src)=\"([^\"]+)\"")
+_ANCHOR = re.compile(r"<[^>]*\sid=\"([^\"]+)\"")
 _LINKS = {("a", "href"), ("img", "src"), ("script", "src"), ("link", "href")}
 _LOADED = {"img", "script", "link"}
 _ELSEWHERE = ("http:", "https:", "mailto:")
 
 
-class _Page(HTMLParser):
+class _Page:
     """What a page links to, by tag, and what can be linked to on it."""
 
     def __init__(self, file: Path) -> None:
-        super().__init__()
-        self.links: set[tuple[str, str]] = set()
-        self.anchors = {""}
-        self.feed(file.read_text("utf-8"))
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if value and name == "id":
-                self.anchors.add(value)
-            elif value and (tag, name) in _LINKS:
-                self.links.add((tag, value))
+        text = file.read_text("utf-8")
+        found = set(_TAG.findall(text))
+        self.links = {(tag, unescape(link)) for tag, name, link in found if (tag, name) in _LINKS}
+        self.anchors = {"", *map(unescape, _ANCHOR.findall(text))}
 
 
 def dead_links(site: Path) -> Iterator[str]:

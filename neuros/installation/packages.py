@@ -32,7 +32,8 @@ PIP_INSTALL = (
     *("--progress-bar", "off", "--prefer-binary"),
 )
 # As pip: every index counts, and modules are compiled, so that no start has to.
-_UV_INSTALL = ("pip", "install", "--index-strategy", "unsafe-best-match", "--compile-bytecode")
+_UV_INSTALL = ("pip", "install", "--index-strategy", "unsafe-best-match")
+_AS_PIP = {"UV_COMPILE_BYTECODE": "1"}
 
 # Settings of pip, and the variables by which uv takes them.
 _IN_UV = {
@@ -194,7 +195,7 @@ class Installer:
                     # Lock files name every version, and uv refuses a constraint without a hash.
                     in_uv.pop("UV_CONSTRAINT", None)
                 command = [str(uv), *_UV_INSTALL, "--python", str(self.python)]
-                output = self._run_each(command, calls, {**self.environ, **in_uv})
+                output = self._run_each(command, calls, {**_AS_PIP, **self.environ, **in_uv})
                 if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
                     return output  # pip would not find more
                 self.progress.step(f"uv failed: trying pip (log: {self.log})")

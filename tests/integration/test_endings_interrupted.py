@@ -241,6 +241,31 @@ def test_when_the_launcher_is_killed_everything_ends(bench: Bench, moments: list
         assert bench.saved("a", "b"), "nodes that were up had their time"
 
 
+KEEPS_FROM_BEGINNING = """
+import sys
+from pathlib import Path
+from neuros.cli.main import main
+from neuros.launcher.shutdown import Shutdown
+def let_begin(self, names):
+    Path("loaded").touch()
+    return False
+Shutdown.let_begin = let_begin
+sys.exit(main(["launch", *sys.argv[1:]]))
+"""
+
+
+def test_no_hook_runs_of_a_node_that_had_not_begun(bench: Bench) -> None:
+    """Its finalise hook may rely on what its initialise hook has made."""
+    bench.project(a=RUNS)
+    running = bench.start(program=[sys.executable, "-c", KEEPS_FROM_BEGINNING])
+    wait_until((bench.folder / "loaded").exists)
+    running.signal(signal.SIGKILL)
+    running.process.wait()
+    bench.outputs.append(running.output)
+    wait_until(lambda: not bench.is_anything_left(), GONE_WITHIN_S)
+    assert not bench.saved("a")
+
+
 def test_also_when_a_node_holds_the_gil(tmp_path: Path) -> None:
     with made_bench(tmp_path, "process") as bench:
         bench.project(a=HOLDS.format(KEEP_THE_GIL), b=RUNS)
