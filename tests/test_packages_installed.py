@@ -197,7 +197,11 @@ class TestUv:
 def environ(tmp_path: Path) -> dict[str, str]:
     """An environment in which pip knows one folder of wheels, and nothing else."""
     return {
-        **{k: v for k, v in clean_environment(os.environ).items() if not k.startswith("PIP_")},
+        **{
+            k: v
+            for k, v in clean_environment(os.environ).items()
+            if not k.startswith(("PIP_", "UV_"))
+        },
         "PIP_CONFIG_FILE": os.devnull,
         "PIP_NO_INDEX": "1",
         "PIP_FIND_LINKS": str(tmp_path / "wheels"),

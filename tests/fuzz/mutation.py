@@ -78,7 +78,7 @@ def change_text(data: bytes, chance: random.Random) -> bytes:
             case 2:
                 parts[at] = chance.choice(_WORDS).encode("utf-8", "surrogatepass")
             case _:
-                parts[at] *= chance.choice((2, 100))
+                parts[at] = (parts[at] * chance.choice((2, 100)))[:_MOST_BYTES]
     return b"".join(parts)
 
 
