@@ -117,13 +117,21 @@ def uses(item: pytest.Function) -> set[str]:
 
 
 def longest_first(items: list[pytest.Function]) -> None:
-    """Put the files first whose tests wait for containers, then those with runs."""
+    """Put the files first whose tests wait for containers, then those with runs.
+
+    Those that only compute are spread among them, so that a core has work while others wait; a
+    sixth of them comes last, when no worker should get anything long any more.
+    """
     ranks: dict[Path, int] = {}
     for item in items:
         marked = {each.name for each in item.iter_markers()}
         rank = next((rank for rank, kind in enumerate(_LONGEST) if kind in marked), len(_LONGEST))
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
-    items.sort(key=lambda item: ranks[item.path])
+    waiting = sorted((file for file in ranks if ranks[file] < len(_LONGEST)), key=ranks.__getitem__)
+    computing = [file for file in ranks if ranks[file] == len(_LONGEST)]
+    places = {file: place / len(waiting) for place, file in enumerate(waiting)}
+    places |= {file: 1.2 * place / len(computing) for place, file in enumerate(computing)}
+    items.sort(key=lambda item: (places[item.path], ranks[item.path]))
 
 
 @cache

@@ -6,11 +6,13 @@ import socket
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import rclpy
 from launching import EXAMPLES, launch
-from marking import Watch, reached_from
+from marking import Watch, longest_first, reached_from
 
 from containers import connected
 
@@ -92,3 +94,22 @@ def test_what_was_done_before_does_not_count(watch: Watch) -> None:
     subprocess.run(["true"], check=True)
     with watch.nothing_leaves():
         pass
+
+
+def test_files_that_wait_come_first_and_computing_ones_among_them() -> None:
+    def items(count: int, *kinds: str) -> list[Any]:
+        marks = [SimpleNamespace(name=kind) for kind in kinds]
+        kind = kinds[0] if kinds else "unit"
+        return [
+            SimpleNamespace(path=Path(f"{kind}{n}"), iter_markers=lambda: marks)
+            for n in range(count)
+        ]
+
+    files = [*items(4), *items(2, "process"), *items(2, "ros"), *items(1, "docker")]
+    longest_first(files)
+    names = [file.path.name for file in files]
+    assert [name for name in names if not name.startswith("unit")] == [
+        *("docker0", "ros0", "ros1", "process0", "process1")
+    ]
+    assert names[:4] == ["docker0", "unit0", "ros0", "unit1"]
+    assert names[-1] == "unit3"
