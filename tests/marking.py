@@ -8,6 +8,7 @@ unit test that starts a process, opens a ROS context or connects to a Docker eng
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from typing import Any
 
 import pytest
 
-HERE = Path(__file__).parent
+HERE = f"{Path(__file__).parent}{os.sep}"
 KINDS = ("ros", "docker", "browser", "process", "slow")
 # By module, or by name in a module.
 REACHED = {
@@ -153,7 +154,7 @@ def _reached(value: Any, seen: set[int]) -> set[str]:
         if found := {kind for key, kind in REACHED.items() if name.startswith(f"{key}.")}:
             return found
         names = vars(sys.modules.get(value.__module__, sys))
-        if Path(names.get("__file__") or "/").is_relative_to(HERE):
+        if (names.get("__file__") or "").startswith(HERE):
             if isinstance(value, type):
                 return set().union(*(_reached(each, seen) for each in vars(value).values()))
             return _reached_by(value.__code__, value.__globals__, seen)
