@@ -16,7 +16,7 @@ from marking import Watch, longest_first, mark
 from needs import require, summary
 
 with pytest.MonkeyPatch.context() as patch:
-    # NumPy reads it when it is loaded: threads of four workers spin while they wait for a core.
+    # NumPy reads it when it is loaded: threads of all workers spin while they wait for a core.
     patch.setenv("OPENBLAS_NUM_THREADS", "1")
     import_module("numpy")
 
