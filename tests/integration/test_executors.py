@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import sys
 import threading
@@ -16,12 +17,19 @@ from launching import EXAMPLES, launch
 from rclpy.node import Node as RosNode
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from std_msgs.msg import Int32
 
 from neuros.backends.domain import choose_domain
 from neuros.errors import EnvironmentFault
 from neuros.transport import ros_loop
-from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
+from neuros.transport.executors import (
+    EXECUTOR_VARIABLE,
+    Coroutines,
+    Turn,
+    WaitSetExecutor,
+    make_executor,
+)
 from neuros.transport.lean_node import LeanNode, PluginCallbacks
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
@@ -221,7 +229,7 @@ def test_without_the_events_executor_a_wait_set_takes_its_place(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, EVENTS, None)  # as if it had been removed
-    executor = make_executor(context, print)
+    executor = make_executor(context, print, Coroutines())
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
     assert capfd.readouterr().err.count("falling back to a wait set") == 1
@@ -231,7 +239,7 @@ def test_with_an_events_executor_that_has_changed_too(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"{EVENTS}.EventsExecutor", lambda *, context: object())
-    executor = make_executor(context, print)
+    executor = make_executor(context, print, Coroutines())
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
 
@@ -239,7 +247,7 @@ def test_with_an_events_executor_that_has_changed_too(
 def test_a_turn_stands_in_the_queue_itself_and_no_task_for_it(context: rclpy.Context) -> None:
     """What a loop-back costs depends on that; it goes on working where rclpy changes."""
     turn = Turn(lambda: None)
-    executor = make_executor(context, print)
+    executor = make_executor(context, print, Coroutines())
     assert executor.create_task(turn) is turn
     assert isinstance(executor.create_task(lambda: None), rclpy.task.Task)
     executor.shutdown(0)
@@ -250,7 +258,7 @@ def test_an_unknown_executor_is_refused(
 ) -> None:
     monkeypatch.setenv(EXECUTOR_VARIABLE, "fast")
     with pytest.raises(EnvironmentFault, match="'events' or 'wait_set'"):
-        make_executor(context, print)
+        make_executor(context, print, Coroutines())
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])
@@ -281,6 +289,65 @@ def test_a_task_that_fails_is_an_error_and_does_not_end_the_process(
     loop.loop.post(lambda: loop.loop.post_loop_back(loop.loop.stop))
     with pytest.raises(ValueError, match="in a task"):
         loop.run()
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("by", ["task", "event", "timer", "coroutine"])
+def test_a_coroutine_goes_on_whatever_has_set_its_future(
+    by: str, loop: Loop, context: rclpy.Context
+) -> None:
+    """Nothing of ROS follows; rclpy's executor would look at it again only then."""
+    node = RosNode("node", context=context)
+    loop.loop.add_node(node)
+    future, further, due = Future(), Future(), [time.monotonic_ns() + 50_000_000]
+    answer = functools.partial(future.set_result, None)
+
+    async def stop_then() -> None:
+        await future
+        loop.loop.stop()
+
+    async def answer_then() -> None:
+        await further
+        answer()
+
+    def answer_once() -> None:
+        due.clear()
+        answer()
+
+    node.executor.create_task(stop_then)
+    if by == "task":
+        node.executor.create_task(answer)
+    elif by == "event":
+        loop.loop.post(answer)
+    elif by == "timer":
+        loop.loop.add_timer(lambda: due[0] if due else None, answer_once)
+    else:
+        node.executor.create_task(answer_then)
+        node.executor.create_task(functools.partial(further.set_result, None))
+    loop.run()
+    node.destroy_node()
+
+
+def test_coroutines_that_wait_do_not_keep_each_other_busy(context: rclpy.Context) -> None:
+    loop, looks = Loop(context), []
+
+    class Never:
+        def __await__(self) -> Iterator[None]:
+            while True:
+                looks.append(1)
+                yield
+
+    async def wait() -> None:
+        await Never()
+
+    node = RosNode("node", context=context)
+    loop.loop.add_node(node)
+    for _ in range(3):
+        node.executor.create_task(wait)
+    node.executor.create_task(lambda: None)
+    threading.Timer(0.3, loop.loop.stop).start()
+    loop.run()
+    assert 3 <= len(looks) < 30
     node.destroy_node()
 
 
