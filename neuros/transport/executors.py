@@ -62,16 +62,13 @@ class Turn:
     a task itself, and has always been done. Where rclpy wraps it after all, that works, too.
     """
 
-    __slots__ = ("_callback", "_coroutines")
+    __slots__ = ("_callback",)
 
-    def __init__(self, callback: Callable[[], None], coroutines: Coroutines | None = None) -> None:
+    def __init__(self, callback: Callable[[], None]) -> None:
         self._callback = callback
-        self._coroutines = coroutines
 
     def __call__(self) -> None:
         self._callback()
-        if self._coroutines:
-            self._coroutines.resume()
 
     def done(self) -> bool:
         """The queue may forget it."""
@@ -81,59 +78,40 @@ class Turn:
         """The callback raises none."""
 
 
-class Coroutines:
-    """The coroutines of an ``EventsExecutor`` that wait for a future.
-
-    The executor goes on with them after callbacks of ROS only. One whose future was set by a hook
-    or another coroutine waited for ever if nothing of ROS followed: the result of an action, if
-    it arrived in one go with the feedback.
-    """
-
-    def __init__(self) -> None:
-        self._turns: dict[GuardedTask, Turn] = {}
-        self.post: Callable[[Turn], object] = lambda turn: None
-
-    def __bool__(self) -> bool:
-        return bool(self._turns)
-
-    def note(self, task: GuardedTask, *, is_waiting: bool) -> None:
-        """A task has run, and waits or has ended."""
-        if not is_waiting:
-            self._turns.pop(task, None)
-        elif task not in self._turns:
-            self._turns[task] = Turn(task)
-
-    def resume(self, but: GuardedTask | None = None) -> None:
-        """Something has happened that they may wait for: let them look, all ``but`` one."""
-        for task, turn in self._turns.items():
-            if task is not but:
-                self.post(turn)
-
-
 class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
     """A task of rclpy that fails without the executor, which would end the process by SIGSEGV.
 
-    If it is a coroutine, it goes on as soon as what it waits for is there.
+    If it is a coroutine, it goes on as soon as the future that it waits for is done. The executor
+    looks at coroutines only after callbacks of ROS, so one whose future was set by a hook or by
+    another task waited for ever if nothing of ROS followed: for the result of an action, where that
+    came in one go with the feedback.
     """
 
     on_failure: OnFailure
-    coroutines: Coroutines
     _is_hidden = False
-    _awaited: object = None
+    _awaited: rclpy.task.Future | None = None
 
     def __call__(self) -> None:
-        if not self._pending():  # the executor, too, goes on with what has waited
+        self._go_on()
+        self._is_hidden = self._exception is not None  # whoever calls, the executor, asks next
+
+    def _go_on(self) -> None:
+        if not self._pending():
             return
         super().__call__()
-        is_waiting, awaited = self._pending(), self._awaited
-        self._awaited = _innermost_awaited(self._handler) if is_waiting else None
-        self.coroutines.note(self, is_waiting=is_waiting)
-        if self.coroutines and not (is_waiting and self._awaited is awaited):
-            self.coroutines.resume(but=self)
-        error = self._exception
-        if error is not None:
-            self._is_hidden = True
-            self.on_failure(error)
+        if not self._pending():
+            if self._exception is not None:
+                self.on_failure(self._exception)
+            return
+        awaited = _awaited_by(self._handler)
+        if awaited is not None and awaited is not self._awaited:
+            awaited.add_done_callback(self._post)
+        self._awaited = awaited
+
+    def _post(self, _: object) -> None:
+        executor = self._executor()
+        if executor is not None:
+            executor.create_task(Turn(self._go_on))
 
     def exception(self) -> BaseException | None:
         """The error of the task; ``None`` for the executor, which asks first."""
@@ -144,20 +122,22 @@ class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
         return found
 
 
-def _innermost_awaited(coroutine: object) -> object:
-    """What a coroutine stands at: another object once it has gone on, if only to the next await."""
-    found, inner = coroutine, coroutine
+def _awaited_by(coroutine: Any) -> rclpy.task.Future | None:
+    """The future of ROS that a coroutine waits for, if it can be seen."""
+    found = inner = coroutine
     while inner is not None:
         found, inner = inner, getattr(inner, "cr_await", getattr(inner, "gi_yieldfrom", None))
-    return found
+    if getattr(found, "gi_code", None) is not rclpy.task.Future.__await__.__code__:
+        return None
+    future: rclpy.task.Future = found.gi_frame.f_locals["self"]
+    return future
 
 
-def make_executor(context: Context, on_failure: OnFailure, coroutines: Coroutines) -> Executor:
+def make_executor(context: Context, on_failure: OnFailure) -> Executor:
     """The executor that was asked for, or the best that works; a fallback is logged.
 
     Args:
         on_failure: is given what a task has raised.
-        coroutines: will know those that wait, where the executor has to be told to go on.
 
     Raises:
         EnvironmentFault: if the environment variable names none.
@@ -170,7 +150,7 @@ def make_executor(context: Context, on_failure: OnFailure, coroutines: Coroutine
     if wanted == "wait_set":
         return WaitSetExecutor(context)
     try:
-        return _events_executor(context, on_failure, coroutines)
+        return _events_executor(context, on_failure)
     except (ImportError, AttributeError, TypeError, RuntimeError) as error:
         get_logger("neuros").warning(
             f"rclpy's EventsExecutor cannot be used here ({error}): falling back to a wait set,"
@@ -179,20 +159,19 @@ def make_executor(context: Context, on_failure: OnFailure, coroutines: Coroutine
         return WaitSetExecutor(context)
 
 
-def _events_executor(context: Context, on_failure: OnFailure, coroutines: Coroutines) -> Executor:
+def _events_executor(context: Context, on_failure: OnFailure) -> Executor:
     from rclpy.experimental.events_executor import EventsExecutor  # may have gone
 
-    with _own_tasks(on_failure, coroutines):
+    with _own_tasks(on_failure):
         executor = EventsExecutor(context=context)
     for name in ("add_node", "create_task", "spin_until_future_complete", "shutdown"):
         getattr(executor, name)
     found: Executor = executor
-    coroutines.post = found.create_task
     return found
 
 
 @contextmanager
-def _own_tasks(on_failure: OnFailure, coroutines: Coroutines) -> Iterator[None]:
+def _own_tasks(on_failure: OnFailure) -> Iterator[None]:
     """Let an executor that is made now take a :class:`Turn` for a task, and guard all others.
 
     It looks up the class of tasks once, when it is made, and there is no other way to tell it.
@@ -203,7 +182,7 @@ def _own_tasks(on_failure: OnFailure, coroutines: Coroutines) -> Iterator[None]:
         if type(handler) is Turn:
             return handler
         made = GuardedTask(handler, *arguments, **keywords)
-        made.on_failure, made.coroutines = on_failure, coroutines
+        made.on_failure = on_failure
         return made
 
     rclpy.task.Task = make_task

@@ -308,30 +308,50 @@ class PluginCallbacks:
         async def entering(*arguments: Any, **keywords: Any) -> Any:
             if not self._is_over:
                 try:
-                    return await self._entering_steps(callback(*arguments, **keywords))
+                    steps = callback(*arguments, **keywords)
+                    return await _EnteringSteps(steps, self._enter, self._loop.note_execution)
                 except BaseException as error:
                     self._give_up(callback, error)
             return arguments[-1] if arguments else None
 
         return entering
 
-    @types.coroutine
-    def _entering_steps(self, steps: Coroutine[Any, Any, Any]) -> Generator[Any, Any, Any]:
-        """Enter the node for each step: code of another node may run between two steps."""
-        try:
-            while True:
-                self._enter()
-                try:
-                    step = steps.send(None)
-                finally:
-                    self._loop.note_execution()
-                yield step
-        except StopIteration as end:
-            return end.value
-
     def _give_up(self, callback: Any, error: BaseException) -> None:
         self._is_over = True
         self._fail(callback, error)
+
+
+class _EnteringSteps(Generator[Any, Any, Any]):
+    """Enters the node for each step of a coroutine: code of another node may run between two steps.
+
+    Attributes:
+        cr_await: the coroutine, by the name under which coroutines show what they wait for.
+    """
+
+    def __init__(
+        self,
+        coroutine: Coroutine[Any, Any, Any],
+        enter: Callable[[], object],
+        note_execution: Callable[[], object],
+    ) -> None:
+        self.cr_await = coroutine
+        self._enter = enter
+        self._note_execution = note_execution
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        return self
+
+    def send(self, value: Any) -> Any:
+        """The next step."""
+        self._enter()
+        try:
+            return self.cr_await.send(value)
+        finally:
+            self._note_execution()
+
+    def throw(self, *error: Any) -> Any:
+        """Raise in the coroutine; so does closing it."""
+        return self.cr_await.throw(*error)
 
 
 class _Rationed:

@@ -30,7 +30,7 @@ from rclpy.context import Context
 from rclpy.node import Node as RosNode
 from rclpy.timer import Timer
 
-from neuros.transport.executors import Coroutines, Turn, WaitSetExecutor, make_executor
+from neuros.transport.executors import Turn, WaitSetExecutor, make_executor
 
 Event = Callable[[], None]
 
@@ -68,12 +68,11 @@ class RosLoop:
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
-        coroutines = Coroutines()
-        self._executor = make_executor(context, on_failure, coroutines)
+        self._executor = make_executor(context, on_failure)
         self._on_failure = on_failure
         self._waker = _Waker()
         self._events: deque[tuple[Event, bool]] = deque()
-        self._turn = Turn(self._take_turn, coroutines)
+        self._turn = Turn(self._take_turn)
         self._has_posted_turn = False
         self._is_turn_stale = False
         self.has_taken_in = True

@@ -17,19 +17,13 @@ from launching import EXAMPLES, launch
 from rclpy.node import Node as RosNode
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
+from rclpy.task import Future, Task
 from std_msgs.msg import Int32
 
 from neuros.backends.domain import choose_domain
 from neuros.errors import EnvironmentFault
 from neuros.transport import ros_loop
-from neuros.transport.executors import (
-    EXECUTOR_VARIABLE,
-    Coroutines,
-    Turn,
-    WaitSetExecutor,
-    make_executor,
-)
+from neuros.transport.executors import EXECUTOR_VARIABLE, Turn, WaitSetExecutor, make_executor
 from neuros.transport.lean_node import LeanNode, PluginCallbacks
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
@@ -229,7 +223,7 @@ def test_without_the_events_executor_a_wait_set_takes_its_place(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, EVENTS, None)  # as if it had been removed
-    executor = make_executor(context, print, Coroutines())
+    executor = make_executor(context, print)
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
     assert capfd.readouterr().err.count("falling back to a wait set") == 1
@@ -239,7 +233,7 @@ def test_with_an_events_executor_that_has_changed_too(
     context: rclpy.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"{EVENTS}.EventsExecutor", lambda *, context: object())
-    executor = make_executor(context, print, Coroutines())
+    executor = make_executor(context, print)
     assert isinstance(executor, WaitSetExecutor)
     executor.shutdown(0)
 
@@ -247,7 +241,7 @@ def test_with_an_events_executor_that_has_changed_too(
 def test_a_turn_stands_in_the_queue_itself_and_no_task_for_it(context: rclpy.Context) -> None:
     """What a loop-back costs depends on that; it goes on working where rclpy changes."""
     turn = Turn(lambda: None)
-    executor = make_executor(context, print, Coroutines())
+    executor = make_executor(context, print)
     assert executor.create_task(turn) is turn
     assert isinstance(executor.create_task(lambda: None), rclpy.task.Task)
     executor.shutdown(0)
@@ -258,7 +252,7 @@ def test_an_unknown_executor_is_refused(
 ) -> None:
     monkeypatch.setenv(EXECUTOR_VARIABLE, "fast")
     with pytest.raises(EnvironmentFault, match="'events' or 'wait_set'"):
-        make_executor(context, print, Coroutines())
+        make_executor(context, print)
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])
@@ -328,26 +322,29 @@ def test_a_coroutine_goes_on_whatever_has_set_its_future(
     node.destroy_node()
 
 
-def test_coroutines_that_wait_do_not_keep_each_other_busy(context: rclpy.Context) -> None:
-    loop, looks = Loop(context), []
-
-    class Never:
-        def __await__(self) -> Iterator[None]:
-            while True:
-                looks.append(1)
-                yield
-
-    async def wait() -> None:
-        await Never()
-
+def test_a_coroutine_that_goes_on_and_fails_is_an_error_once(context: rclpy.Context) -> None:
+    """The executor asks for its error later, and would end the process by SIGSEGV."""
+    loop = Loop(context)
     node = RosNode("node", context=context)
     loop.loop.add_node(node)
-    for _ in range(3):
-        node.executor.create_task(wait)
-    node.executor.create_task(lambda: None)
-    threading.Timer(0.3, loop.loop.stop).start()
-    loop.run()
-    assert 3 <= len(looks) < 30
+    future, told = Future(), []
+
+    async def fail_then() -> None:
+        await future
+        raise ValueError("in a coroutine")
+
+    async def hear_of_it(task: Task) -> None:
+        try:
+            await task
+        except ValueError as error:
+            told.append(str(error))
+        node.create_timer(0.05, loop.loop.stop)  # with which the executor comes back to all tasks
+
+    node.executor.create_task(hear_of_it, node.executor.create_task(fail_then))
+    node.executor.create_task(functools.partial(future.set_result, None))
+    with pytest.raises(ValueError, match="in a coroutine"):
+        loop.run()
+    assert (told, len(loop.failures)) == (["in a coroutine"], 1)
     node.destroy_node()
 
 

@@ -13,6 +13,7 @@ from launching import BACKENDS, launch
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
@@ -174,6 +175,20 @@ def test_a_coroutine_is_entered_again_after_it_has_waited(plugin: Plugin) -> Non
     plugin.ros.create_timer(0.01, ask, callback_group=ReentrantCallbackGroup())
     plugin.run()
     assert entered[1] > entered[0]
+
+
+def test_a_coroutine_goes_on_though_nothing_of_ros_follows(plugin: Plugin) -> None:
+    future = Future()
+
+    async def wait() -> None:
+        timer.cancel()
+        plugin.loop.post(lambda: future.set_result(None))
+        await future
+        plugin.stop()
+
+    timer = plugin.ros.create_timer(0.01, wait)
+    plugin.run()
+    assert future.done()
 
 
 def test_what_the_executor_does_not_serve_is_refused_where_it_is_made(plugin: Plugin) -> None:
