@@ -141,7 +141,8 @@ def _full_at(strikes_at: str) -> Callable[[Surrounding, str, Path], Outcome]:
     def run(self: Surrounding, backend: str, folder: Path) -> Outcome:
         with _small_disk(folder / "disk") as disk:
             trial = Trial(folder, "print_much", strikes_at, _PRINTED_BYTES, disk / "run")
-            with trial.start(backend, duration_s=_DURATION_S) as running:
+            # Also a source that starts late has to have sent what finds no room in the bag.
+            with trial.start(backend, duration_s=2 * _DURATION_S) as running:
                 struck_s = trial.await_strike(running)
                 read_to_end(running, struck_s + 20.0)
                 # A user makes room, and finds ``run.json`` where the run has said.
