@@ -183,7 +183,9 @@ class RemoteEngine:
     def _remove_never_started(self) -> None:
         """Containers whose launcher was killed between two requests."""
         wanted = {"label": AGENT_LABEL, "status": "created"}
-        for container in self._engine.containers.list(all=True, filters=wanted):
+        for container in self._engine.containers.list(
+            all=True, filters=wanted, ignore_removed=True
+        ):
             made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
             if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
                 container.remove(force=True)

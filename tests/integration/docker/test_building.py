@@ -112,7 +112,7 @@ def bench(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Bench]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    containers_before = {each.id for each in engine.containers.list(all=True)}
+    containers_before = {each.id for each in engine.containers.list(all=True, ignore_removed=True)}
     bench = Bench(tmp_path, engine, capsys)
     yield bench
     bench.remove_images()

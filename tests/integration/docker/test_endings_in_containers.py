@@ -76,7 +76,7 @@ def test_a_container_that_was_paused_while_it_computed_is_said_to_be_paused(benc
     with connected() as engine:
         (container,) = (
             each
-            for each in engine.containers.list()
+            for each in engine.containers.list(ignore_removed=True)
             if each.labels.get("neuros.run_folder", "").startswith(f"{bench.folder}/")
         )
         container.pause()
