@@ -68,11 +68,13 @@ def test_what_is_lost_or_changed_is_noticed() -> None:
 
 def test_what_grows_is_noticed() -> None:
     flat, larger, short = (Load("ring", "process", lossless=n) for n in (10**6, 10**6, 10**5))
-    judge_memory(flat, [10_000_000] * 200)
+    judge_memory(flat, [10_000_000] * 200, processes=5)
     for load in (larger, short):
-        judge_memory(load, [10_000_000 + 200_000 * n for n in range(200)])
+        judge_memory(load, [10_000_000 + 200_000 * n for n in range(200)], processes=5)
     assert flat.problems == short.problems == []
     assert larger.problems[0].startswith("memory grew from ")
+    judge_memory(short, [10_000_000 + 1_000_000 * n for n in range(200)], processes=5)
+    assert short.problems[0].startswith("memory grew from ")
     assert list(latency_problems(latency([[1.0] * 500]))) == []
     slower = latency([[1.0] * 250 + [5.0] * 250])
     assert list(latency_problems(slower)) == ["latency grew from 1.00 to 5.00 ms"]

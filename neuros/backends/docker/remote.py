@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 import requests
 from docker import DockerClient
-from docker.errors import DockerException
+from docker.errors import DockerException, NotFound
 
 from neuros.backends.docker.engine import (
     OR_WITHOUT,
@@ -188,7 +188,8 @@ class RemoteEngine:
         ):
             made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
             if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
-                container.remove(force=True)
+                with contextlib.suppress(NotFound):  # another launcher clears up, too
+                    container.remove(force=True)
 
 
 class AgentContainer:
