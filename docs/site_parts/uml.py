@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 _MANY = 25
@@ -128,7 +129,12 @@ def _part(module: str, depth: int, within: str) -> str:
     return ".".join(words[len(within.split(".")) : depth]) if is_within else ""
 
 
-def _imports(file: Path, root: Path) -> Iterator[str]:
+@cache
+def _imports(file: Path, root: Path) -> tuple[str, ...]:
+    return tuple(_imported(file, root))
+
+
+def _imported(file: Path, root: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(file.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -42,6 +42,7 @@ def test_one_orchestration_comes_out_whole(tmp_path: Path) -> None:
     assert len(row["estimates_digest"]) == 8
 
 
+@pytest.mark.acceptance
 def test_a_tick_of_1_ms_of_physics_simulates_a_twentieth_of_the_time(tmp_path: Path) -> None:
     command = ["reproduce", "whiskeye", "--only", "tick_20ms_1ms", "--duration", "2"]
     assert main([*command, "--backend", "in-process", "-o", str(tmp_path)]) == 0
@@ -51,6 +52,7 @@ def test_a_tick_of_1_ms_of_physics_simulates_a_twentieth_of_the_time(tmp_path: P
     assert float(row["intervals"]) > 50, "a tick per millisecond, less those that coalesced"
 
 
+@pytest.mark.acceptance
 def test_the_elevator_goes_on_for_as_long_as_it_is_measured(tmp_path: Path) -> None:
     command = ["reproduce", "elevator", "--duration", "1", "--backend", "in-process"]
     assert main([*command, "-o", str(tmp_path)]) == 0

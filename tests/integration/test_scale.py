@@ -79,7 +79,7 @@ def the_packets_of(count: int, back_end: str, folder: Path, timeout_s: float) ->
         yield connection["received"]
 
 
-@pytest.mark.parametrize(("back_end", "count"), [("process", 40), ("in-process", 64)])
+@pytest.mark.parametrize(("back_end", "count"), [("process", 20), ("in-process", 64)])
 def test_a_packet_goes_over_every_connection(back_end: str, count: int, tmp_path: Path) -> None:
     assert set(the_packets_of(count, back_end, tmp_path, 120.0)) == {1}
 

@@ -91,7 +91,9 @@ def test_the_strict_variant_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
     ],
     ids=["tick", "asynchronous"],
 )
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "backend", ["process", pytest.param("in-process", marks=pytest.mark.acceptance)]
+)
 def test_the_variants_that_may_lose_packets_end_properly(backend, variant, setting, tmp_path):
     run = whiskeye(variant, backend, tmp_path, setting)
     sim_s = run.record["sim_s"]

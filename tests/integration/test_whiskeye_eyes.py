@@ -89,6 +89,7 @@ def test_in_one_process_without_tensorflow_it_says_what_is_missing(tmp_path):
     assert "use --backend process" in run.output
 
 
+@pytest.mark.acceptance
 def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
     tables = []
     for backend in BACKENDS:

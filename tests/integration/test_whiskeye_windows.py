@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from launching import BACKENDS, EXAMPLES, start
+from launching import EXAMPLES, start
 from virtual_display import virtual_display
 
 for needed in ("mujoco", "nest", "matplotlib"):
@@ -14,7 +14,9 @@ TIMEOUT_S = 60.0
 
 
 @pytest.mark.needs("tkinter")
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "backend", ["process", pytest.param("in-process", marks=pytest.mark.acceptance)]
+)
 def test_the_viewer_and_the_plot_open_and_may_be_closed(backend, tmp_path):
     with virtual_display() as user:
         arguments = ("--backend", backend, "--set", "nodes.robot.environment.DURATION=4")
