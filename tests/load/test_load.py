@@ -74,6 +74,9 @@ def test_what_grows_is_noticed() -> None:
     assert larger.problems[0].startswith("memory grew from ")
     judge_memory(short, [10_000_000 + 1_000_000 * n for n in range(200)], processes=5)
     assert short.problems[0].startswith("memory grew from ")
+    grown = Load("1-to-16", "process", lossless=10**6)
+    judge_memory(grown, [600_000_000] * 30 + [730_000_000] * 170, processes=17)  # to its size
+    assert grown.problems == []
     assert list(latency_problems(latency([[1.0] * 500]))) == []
     slower = latency([[1.0] * 250 + [5.0] * 250])
     assert list(latency_problems(slower)) == ["latency grew from 1.00 to 5.00 ms"]
