@@ -143,6 +143,7 @@ def test_a_killed_launcher_leaves_no_container(deployed: Deployed, engine: Docke
         wait_until(lambda: not containers_of(engine, f"sink_{os.getpid()}"), GONE_S + SLACK_S)
 
 
+@pytest.mark.needs("docker")
 def test_an_engine_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
     file = deployment(tmp_path, {"sink": "box"}, docker=f"unix://{tmp_path}/nowhere")
     finished = launch(STREAM, "--deployment", file, cwd=tmp_path, timeout_s=UP_S)
@@ -151,6 +152,7 @@ def test_an_engine_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in finished.output
 
 
+@pytest.mark.needs("docker", "ssh")
 def test_so_is_one_behind_an_ssh_without_answer(tmp_path: Path) -> None:
     file = deployment(
         tmp_path, {"sink": "box"}, docker="ssh://nobody@127.0.0.1:1", ssh_options=["-F", "none"]
