@@ -152,6 +152,13 @@ def test_an_engine_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in finished.output
 
 
+def test_without_the_command_docker_it_is_said_how_to_get_it(tmp_path: Path) -> None:
+    file = deployment(tmp_path, {"sink": "box"}, docker=f"unix://{tmp_path}/nowhere")
+    finished = launch(STREAM, "--deployment", file, cwd=tmp_path, PATH=str(tmp_path))
+    assert finished.exit_code == 4, finished.output
+    assert "there is no command docker here: apt-get install docker.io" in finished.output
+
+
 @pytest.mark.needs("docker", "ssh")
 def test_so_is_one_behind_an_ssh_without_answer(tmp_path: Path) -> None:
     file = deployment(
