@@ -186,8 +186,8 @@ def latency_problems(latency_ms: tuple[float, float, float]) -> Iterator[str]:
 
 def judge_memory(load: Load, samples: Sequence[int], processes: int) -> None:
     """Note the memory, and whether it grew."""
-    # Memory grows to its size with the second of the largest packets: malloc gives the first one
-    # back, and keeps what later ones need. Of a million packets it comes in the first fifth.
+    # Memory grows to its size with a sender's second packet of the largest size, by one step. Of a
+    # million packets it comes in the first fifth.
     begun = samples[len(samples) // 5 :]
     tenth = len(begun) // 10
     if tenth < _FEWEST_TENTH:
