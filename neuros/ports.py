@@ -225,8 +225,11 @@ class Middleware(Protocol):
     def take_in(self) -> None:
         """Handle what had arrived when the loop was stopped, so that it counts; call no plugin."""
 
+    def flush(self) -> None:
+        """Send and receive nothing any more, and let what was sent last leave."""
+
     def close(self) -> None:
-        """Let what was sent last leave, then give up everything."""
+        """Give up everything, once flushed."""
 
 
 class TransportKind(ABC):
@@ -385,7 +388,7 @@ class RunningNode(Protocol):
     def names(self) -> tuple[str, ...]: ...
 
     def poll(self) -> str | None:
-        """``None`` while it runs, then how it ended: "exit code 1", "killed by SIGKILL"."""
+        """``None`` while it runs, then how it ended: "exit code 0", "killed by SIGKILL"."""
 
     @property
     def is_abandoned(self) -> bool:

@@ -12,8 +12,9 @@ import gc
 import io
 import json
 import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ from neuros.registry import TRANSPORTS
 
 _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
 _STANDARD = (0, 1, 2)
+# For closing the middleware, when all else is done. It takes some milliseconds, a second under
+# heavy load. DDS has taken longer than a run has for its end, once in thousands of runs.
+_CLOSING_S = 2
 
 
 def add_node(node: argparse.ArgumentParser) -> None:
@@ -67,7 +71,7 @@ def _run_node(options: argparse.Namespace) -> int:
             record=options.record,
             debug=options.debug,
         )
-        leave.has_leftovers = lambda: bool(getattr(middleware, "has_leftovers", False))
+        leave.middleware = middleware
         return middleware
 
     run_folder = files[0].folders.run
@@ -133,7 +137,7 @@ def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:
 
 
 class _Leave:
-    """Python's last act: open files are closed, and it ends here where ROS has not been given up.
+    """Python's last act: files and middleware are closed; it ends here where ROS is not given up.
 
     Python would close files by itself, but not on :func:`os._exit`, and not those that it finds
     only through objects which the garbage collector leaves alone (:mod:`neuros.node.process`).
@@ -141,7 +145,7 @@ class _Leave:
 
     def __init__(self) -> None:
         self.exit_code: int | None = None
-        self.has_leftovers: Callable[[], bool] = lambda: False
+        self.middleware: Middleware | None = None
 
     def __call__(self) -> None:
         gc.unfreeze()
@@ -152,10 +156,23 @@ class _Leave:
                 file.flush()
                 if file.fileno() not in _STANDARD:
                     file.close()
-        if self.exit_code is None or not self.has_leftovers():
-            return
         ctypes.CDLL(None).fflush(None)  # what libraries in C have printed
-        os._exit(self.exit_code)
+        if self.middleware is None:
+            return
+        with _given(_CLOSING_S):
+            self.middleware.close()
+        if self.exit_code is not None and getattr(self.middleware, "has_leftovers", False):
+            os._exit(self.exit_code)
+
+
+@contextlib.contextmanager
+def _given(limit_s: int) -> Iterator[None]:
+    """End the process by SIGALRM if the block takes longer, be it in C and with the GIL."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
+    signal.alarm(limit_s)
+    yield
+    signal.alarm(0)
 
 
 def _is_inner(file: Any) -> bool:

@@ -234,6 +234,12 @@ class Processes:
             when = f"unexpectedly{''.join(map(self._detector.last_seen, process.names))}"
         return f"{nodes_of(process)} ended {when}: {how}"
 
+    def how_it_left(self, process: RunningNode, how: str) -> str:
+        """One sentence about a process that ended badly after its final report, else empty."""
+        if how == "exit code 0" or {*process.names} & (self.killed | self._has_told_failure):
+            return ""
+        return f"the process of {nodes_of(process)} ended badly after its final report: {how}"
+
 
 def names_of(process: RunningNode) -> str:
     """Its nodes, for people."""

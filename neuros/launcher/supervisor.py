@@ -257,6 +257,8 @@ class Supervisor:
                     self._processes.how_it_failed(process, how, is_stopping=is_stopping),
                     exit_code=4 if process.is_abandoned else 1,
                 )
+            elif text := self._processes.how_it_left(process, how):
+                self._output.log("WARN", text)
 
         for process in self._processes:
             if self._is_cut_off(process):

@@ -91,7 +91,10 @@ class NodeProcess:
         )
 
     def run(self) -> int:
-        """Run to the end; returns 0 if it was asked to end, 1 if a node failed."""
+        """Run to the end; returns 0 if it was asked to end, 1 if a node failed.
+
+        Whoever has made the middleware closes it, as the last act of the process.
+        """
         run_folder = self._files[0].folders.run
         os.chdir(run_folder)
         self._link = ControlLink(self._connect(), TO_NODES, "the supervisor")
@@ -107,7 +110,7 @@ class NodeProcess:
             self._guard(lambda: self.report(is_final=True))
             self._guard(self._peers.close)
             if self._middleware is not None:
-                self._guard(self._middleware.close)
+                self._guard(self._middleware.flush)
             thread.end()
         return 1 if self._has_failed else 0
 

@@ -125,6 +125,9 @@ class WithoutPeers:
     def take_in(self) -> None:
         """Nothing arrives by itself."""
 
+    def flush(self) -> None:
+        """Nothing is sent to anybody."""
+
 
 class NullMiddleware(WithoutPeers):
     """The middleware of one node that has no neighbours (:class:`neuros.ports.Middleware`)."""

@@ -154,16 +154,19 @@ class RosProcess:
             callbacks.close()
         self.loop.take_in()
 
-    def close(self) -> None:
-        """Let what was sent last leave, then give up everything, but for ROS itself in a crowd.
-
-        Others in that crowd notice after 20 s that a process has gone, as with one that was
-        killed; the shared memory of DDS is left to the reaper.
-        """
+    def flush(self) -> None:
+        """Send and receive nothing any more, and let what was sent last leave."""
         self._no_spinning.close()
         for transport in self._transports:
             transport.close()
         self.loop.run_for(_LINGER_S)
+
+    def close(self) -> None:
+        """Give up everything, but for ROS itself in a crowd.
+
+        Others in that crowd notice after 20 s that a process has gone, as with one that was
+        killed; the shared memory of DDS is left to the reaper.
+        """
         self.has_leftovers = self._is_in_a_crowd()
         if self.has_leftovers:
             return

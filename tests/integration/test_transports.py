@@ -69,6 +69,8 @@ class RosNetwork:
         return listener.listen(topic, type_name)
 
     def close(self) -> None:
+        for process in self._processes:
+            process.flush()
         for each in (*self._listeners, *self._processes):
             each.close()
 
