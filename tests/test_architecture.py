@@ -71,7 +71,7 @@ OWNERS = {"Node": "node", "Project": "api", "Run": "api", "sweep": "api"}
 PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
-MESSAGES |= {"std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
+MESSAGES |= {"service_msgs", "std_msgs", "rcl_interfaces", "rosidl_runtime_py"}
 GENERATORS = {f"rosidl_generator_{name}" for name in ("c", "py", "type_description")}
 GENERATORS |= {f"rosidl_typesupport_{name}" for name in ("c", "fastrtps_c", "introspection_c")}
 GENERATORS |= {"rosidl_adapter", "rosidl_cli"}

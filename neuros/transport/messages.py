@@ -24,6 +24,7 @@ from rclpy.type_support import check_for_type_support
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.project.model import Port
 from neuros.transport.codecs import message_codec
+from neuros.transport.numpy_when_used import numpy_when_used
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import checker
 
@@ -37,7 +38,8 @@ def message_class(type_name: str) -> type:
     """
     package, _, name = type_name.replace("/", ".").rpartition(".")
     try:
-        found = getattr(importlib.import_module(package), name)
+        with numpy_when_used():
+            found = getattr(importlib.import_module(package), name)
     except (ImportError, AttributeError) as error:
         raise EnvironmentFault(
             f"message type {type_name} cannot be imported here ({error}): is its package"

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numbers
 import reprlib
 import struct
+import sys
 from array import array
 from collections.abc import Callable, KeysView, Sequence, ValuesView
 from functools import cache
@@ -348,7 +349,7 @@ def _convert_integer(of: Type) -> Convert:
 
 def _convert_float(of: Type) -> Convert:
     is_single = of.code == "f"
-    largest = float(numpy.finfo(of.code).max)
+    largest = (2 - 2**-23) * 2.0**127 if is_single else sys.float_info.max  # IEEE 754
     limits = f"{of.name}: {-largest:.8g} to {largest:.8g}"
 
     def convert(value: Any) -> float:
