@@ -89,8 +89,8 @@ def _interrupt(running: Running) -> None:
 def _expected(interrupt: Interrupt, *, is_known: bool, is_over: bool) -> Expected:
     if not is_known:  # Python answers, or nothing is there any more that could
         return Expected((*_OF_PYTHON, 0), has_record=False, has_bag=False, has_traceback=None)
-    if is_over:
-        return Expected((0, 130))
+    if is_over:  # whoever interrupts it twice may have given up waiting for the bag
+        return Expected((0, 130) if interrupt.count == 1 else (0, 130, 4))
     # It may have come to its end by itself between the look and the signal.
     return Expected((130, 0) if interrupt.at_s > _DURATION_S else (130,), has_bag=False)
 
