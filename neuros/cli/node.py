@@ -149,6 +149,7 @@ class _Leave:
     def __init__(self) -> None:
         self.exit_code: int | None = None
         self.middleware: Middleware | None = None
+        self._pid = os.getpid()
 
     def __call__(self) -> None:
         gc.unfreeze()
@@ -160,7 +161,7 @@ class _Leave:
                 if file.fileno() not in _STANDARD:
                     file.close()
         ctypes.CDLL(None).fflush(None)  # what libraries in C have printed
-        if self.middleware is None:
+        if self.middleware is None or os.getpid() != self._pid:  # a fork of it has no ROS
             return
         with _given(_CLOSING_S):
             self.middleware.close()
@@ -174,8 +175,10 @@ def _given(limit_s: int) -> Iterator[None]:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
     signal.alarm(limit_s)
-    yield
-    signal.alarm(0)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
 
 
 def _is_inner(file: Any) -> bool:

@@ -159,6 +159,34 @@ def test_a_process_that_cannot_leave_ros_ends_without_that(bench: Bench) -> None
     assert (finished.run_folder / "a" / "at exit").exists()
 
 
+FORKS = """
+import atexit, os
+@neuros_tick(seconds=0.02, outputs="o")
+def send(node):
+    count = node.get_user_data() or 0
+    node.set_user_data(count + 1)
+    if count == 3:
+        child = os.fork()
+        if child == 0:
+            atexit._run_exitfuncs()  # as sys.exit does
+            os._exit(7)
+        _, status = os.waitpid(child, 0)
+        (node.run_dir / "child").write_text(str(os.waitstatus_to_exitcode(status)))
+    if count == 20:
+        node.shutdown("enough")
+    return node.make_packet("o")
+"""
+
+
+def test_a_fork_of_a_node_ends_as_a_python_program_and_leaves_ros_to_the_node(bench: Bench) -> None:
+    bench.project("a.o -> b.x", a=FORKS, b=SINK)
+    finished = bench.launch()
+    assert_ended(finished, 0, "a ended the project: enough")
+    assert finished.run_folder is not None
+    assert (finished.run_folder / "a" / "child").read_text() == "7"
+    assert finished.record["connections"][0]["received"] == 21
+
+
 # ------------------------------------------------------------------ lockstep
 
 

@@ -92,7 +92,7 @@ def run(
         load.problems.append(f"no run.json: {error}: {output[-1000:]}")
         return load
     if exit_code:
-        load.problems.append(f"exit code {exit_code}: {record['reason']}")
+        load.problems.append(f"exit code {exit_code}: {record['reason']}: {output[-3000:]}")
         return load
     load.seconds = record["wall_s"]
     told = {
