@@ -325,7 +325,8 @@ def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -
     assert finished.exit_code == 1
     # Its last report may have been made while its hook ran.
     seen = "(, last seen executing 'beat')?"
-    assert re.fullmatch(f"node 'a' ended unexpectedly{seen}: killed by SIGKILL", last_line(finished))
+    why = f"node 'a' ended unexpectedly{seen}: killed by SIGKILL"
+    assert re.fullmatch(why, last_line(finished))
     assert bench.has_saved("b")
 
 
