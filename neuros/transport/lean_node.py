@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import rclpy
-import service_msgs.msg  # noqa: F401  # rclpy does for each service; here NumPy waits until used
+import service_msgs.msg  # noqa: F401  # rclpy imports it for any service, and NumPy with it
 from rclpy.context import Context
 from rclpy.exceptions import ParameterNotDeclaredException as ParameterNotDeclaredException
 from rclpy.node import Node as RosNode

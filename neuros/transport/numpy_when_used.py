@@ -2,6 +2,9 @@
 
 Generated messages import it for their arrays. A node without arrays, whose plugin does without it,
 takes 250 ms of a processor instead of 300 for its start and end, and 27 MB instead of 33.
+
+:class:`importlib.util.LazyLoader` would import it at once: it does so when any attribute is asked
+for, and each further ``import numpy`` asks for ``__spec__``.
 """
 
 from __future__ import annotations
@@ -40,5 +43,4 @@ class _WhenUsed(ModuleType):
         _end(self)
         real = importlib.import_module(_NAME)
         self.__dict__.update(vars(real))
-        self.__class__ = ModuleType  # type: ignore[assignment]
         return getattr(real, name)

@@ -21,6 +21,7 @@ STEP_S = 0.1
 _DURATION_S = 1.0
 _LATEST_S = 30.0
 _BETWEEN_S = 0.02
+_GIVEN_UP = "the bag is not complete (it was not waited for): neuros bag repair "
 _OF_PYTHON = (130, 1, -int(signal.SIGINT))
 
 
@@ -71,13 +72,16 @@ def run(interrupt: Interrupt, folder: Path) -> Outcome:
             _interrupt(running)
             time.sleep(_BETWEEN_S)
         struck_s = time.monotonic()
-        return trial.outcome(
+        outcome = trial.outcome(
             interrupt.place,
             running,
             struck_s,
             _expected(interrupt, is_known=is_known, is_over=is_over),
             is_left=lambda: containers_of(folder) if interrupt.backend == "docker" else (),
         )
+    if outcome.exit_code == 4 and _GIVEN_UP not in outcome.output:
+        outcome.problems.append("exit code 4, and not because its bag was not waited for")
+    return outcome
 
 
 def _interrupt(running: Running) -> None:

@@ -118,6 +118,27 @@ def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None
     assert 5 <= run.lasted_s < 6.5
 
 
+@pytest.mark.parametrize(
+    ("end", "how"), [("os._exit(3)", "exit code 3"), ("os.kill(os.getpid(), 11)", "SIGSEGV")]
+)
+def test_a_process_that_ends_badly_after_its_final_report_is_named(
+    run: Run, end: str, how: str
+) -> None:
+    reports = "import os\nhost.up(); host.wait_for('stop'); host.report(is_final=True); "
+    outcome = run(a=SHUTS_DOWN, b=reports + end)
+    assert outcome.exit_code == 0
+    told = [text for text in run.output.said if "after its final report" in text]
+    assert len(told) == 1
+    assert told[0].startswith("the process of node 'b' ended badly after its final report: ")
+    assert how in told[0]
+
+
+def test_of_one_that_ends_well_nothing_is_said(run: Run) -> None:
+    outcome = run(a=SHUTS_DOWN, b=WELL_BEHAVED)
+    assert outcome.exit_code == 0
+    assert not any("after its final report" in text for text in run.output.said)
+
+
 def test_of_a_process_that_does_not_end_it_is_said_where_its_threads_were(run: Run) -> None:
     stuck = """
 host.up()
