@@ -6,7 +6,7 @@ import re
 import socket
 import struct
 from dataclasses import MISSING, fields
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -224,10 +224,8 @@ def test_a_step_comes_out_as_it_went_in_however_its_bytes_arrive(
     for kind in (Advance, Advanced):
         sent = [each for each in steps if type(each) is kind]
         stream = b"".join(each.to_frame() for each in sent)
-        sizes, left = [], len(stream)
-        while left:
-            sizes.append(data.draw(st.integers(1, left)))
-            left -= sizes[-1]
+        cuts = data.draw(st.sets(st.integers(0, len(stream))))
+        sizes = [end - start for start, end in pairwise(sorted({0, *cuts, len(stream)}))]
         assert read_in_pieces(stream, kind, sizes) == sent
 
 
