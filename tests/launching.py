@@ -27,6 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+import pytest
+
 from tests.preloaded import PreloadedLauncher, may_fork
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -186,6 +188,13 @@ def launch(
     """Run ``neuros launch PROJECT ARGUMENTS`` in the folder ``cwd`` to its end."""
     with start(project, *arguments, cwd=cwd, **environment) as running:
         return running.finish(timeout_s)
+
+
+def each_time(backend: str) -> pytest.MarkDecorator:
+    """Give a test both back ends: this one each time, the other before a release."""
+    others = [each for each in BACKENDS if each != backend]
+    rare = [pytest.param(each, marks=pytest.mark.acceptance) for each in others]
+    return pytest.mark.parametrize("backend", [backend, *rare])
 
 
 def killed_in_a_hook(running: Running, timeout_s: float) -> Finished:

@@ -97,6 +97,7 @@ def test_all_seven_orchestrations_come_out_and_lossless_ones_repeat(tmp_path: Pa
     assert len({row["estimates_digest"] for row in both}) == 1
 
 
+@pytest.mark.acceptance
 @pytest.mark.needs("OpenGL")
 def test_a_network_is_trained_and_its_weights_correct_the_ring(tmp_path: Path) -> None:
     command = ["reproduce", "headdirection", "--duration", "1.5", "--backend", "process"]

@@ -1,4 +1,4 @@
-"""The elevator makes its tour, in every variant and on both back ends."""
+"""The elevator makes its tour, in every variant and on either back end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from launching import BACKENDS, EXAMPLES, Finished, launch
+from launching import EXAMPLES, Finished, each_time, launch
 
 pytest.importorskip("mujoco")
 
@@ -16,7 +16,7 @@ READINGS = "elevator.cabin -> controller.cabin"
 TARGETS = "controller.target -> elevator.target"
 FASTER = ("--set", "nodes.elevator.environment.REAL_TIME_FACTOR=20")
 
-pytestmark = pytest.mark.parametrize("backend", BACKENDS)
+pytestmark = each_time("in-process")
 
 
 def arrivals(run: Finished) -> list[tuple[int, float]]:

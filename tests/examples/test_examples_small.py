@@ -1,4 +1,4 @@
-"""The small examples do what their READMEs say, on both back ends."""
+"""The small examples do what their READMEs say; as processes, test_gallery.py runs them too."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import shutil
 import signal
 from pathlib import Path
 
-import pytest
-from launching import BACKENDS, EXAMPLES, launch, start
+from launching import EXAMPLES, each_time, launch, start
 
 CLOCK = EXAMPLES / "1_tick/clock"
 TENNIS = EXAMPLES / "2_synchronisation/tennis"
 VOTING = EXAMPLES / "2_synchronisation/voting"
 
-pytestmark = pytest.mark.parametrize("backend", BACKENDS)
+pytestmark = each_time("in-process")
 
 
 def test_the_clock_ticks_until_its_time_is_over(backend: str, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from .running import (
 )
 from .shapes import LARGEST_BYTES, SHAPES, Shape
 
-_PACKETS = 3000
+_PACKETS = 1500
 
 
 # Each shape and each back end once.

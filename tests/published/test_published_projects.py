@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from launching import BACKENDS, Finished, launch, start
+from launching import Finished, each_time, launch, start
 
 from neuros.backends.domain import choose_domain
 
 HERE = Path(__file__).resolve().parent
 
-pytestmark = pytest.mark.parametrize("backend", BACKENDS)
+pytestmark = each_time("process")
 
 
 @pytest.fixture(autouse=True)
