@@ -24,6 +24,7 @@ _FORKING.set_forkserver_preload(
     [
         "tests.preloaded",
         "jsonschema",
+        "numpy.ma",  # numpy.unique() imports it
         "tabulate",
         "xxhash",
         "neuros.cli.launch",

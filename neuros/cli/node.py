@@ -27,7 +27,7 @@ from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
 from neuros.registry import TRANSPORTS
-from neuros.transport.numpy_when_used import numpy_when_used
+from neuros.transport.imports_when_used import imports_when_used
 
 _FILE = io.IOBase.__base__ or io.IOBase  # what all files are, in C: quicker to ask for
 _STANDARD = (0, 1, 2)
@@ -65,7 +65,7 @@ def _run_node(options: argparse.Namespace) -> int:
     def make_middleware(
         files: Sequence[NodeFile], on_failure: Callable[[BaseException], None]
     ) -> Middleware:
-        with numpy_when_used():
+        with imports_when_used():
             transport = TRANSPORTS.load(options.transport)
         middleware = transport.middleware(
             files,

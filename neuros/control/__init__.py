@@ -7,6 +7,8 @@ and :data:`TO_OBSERVERS` say who sends which.
 
 A message is one line: a JSON object with its fields and ``kind``, the name of its class in
 snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end supplies it.
+
+Messages are not frozen: making their classes would take each process twice as long.
 """
 
 from __future__ import annotations
@@ -115,7 +117,7 @@ class Message:
 # ---------------------------------------------------------------------- from nodes
 
 
-@dataclass(frozen=True)
+@dataclass
 class Hello(Message):
     """A node process is up; ``plugins``: the file of each node's plugin, as it sees it."""
 
@@ -123,7 +125,7 @@ class Hello(Message):
     plugins: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Report(Message):
     """State and counters of a node: once per second, on a change of state, at the end.
 
@@ -157,7 +159,7 @@ class Report(Message):
     is_final: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Probed(Report):
     """Report of a node between two events, in answer to ``probe``.
 
@@ -175,12 +177,12 @@ class Probed(Report):
     is_idle: bool
 
 
-@dataclass(frozen=True)
+@dataclass
 class Loaded(Message):
     """All plugins of a process are loaded; no hook starts before the answer, ``begin``."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Hooks(Message):
     """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
 
@@ -189,14 +191,14 @@ class Hooks(Message):
     finalise: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass
 class FirstHook(Message):
     """A node starts its first hook."""
 
     node: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Finalising(Message):
     """A node starts a finalise hook; ``""``: it closes its resources; ``None``: they are closed."""
 
@@ -204,7 +206,7 @@ class Finalising(Message):
     hook: str | None
 
 
-@dataclass(frozen=True)
+@dataclass
 class Shutdown(Message):
     """A plugin has called ``node.shutdown``."""
 
@@ -213,7 +215,7 @@ class Shutdown(Message):
     drain_s: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class Failed(Message):
     """A node has failed."""
 
@@ -221,7 +223,7 @@ class Failed(Message):
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Explanation(Message):
     """Why a node does not move, in answer to ``explain``."""
 
@@ -229,7 +231,7 @@ class Explanation(Message):
     lines: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Heard(Message):
     """State of another launcher, received from its node; ``None``: that node is gone."""
 
@@ -237,7 +239,7 @@ class Heard(Message):
     text: str | None
 
 
-@dataclass(frozen=True)
+@dataclass
 class NodeStatus(Message):
     """State and samples of a node, for the observer with this number; in answer to ``look``."""
 
@@ -248,7 +250,7 @@ class NodeStatus(Message):
     samples: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass
 class NewestPacket:
     """The newest packet of an output: its number, from 1, and its ROS serialisation in base64."""
 
@@ -256,7 +258,7 @@ class NewestPacket:
     data: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class AtRest(Message):
     """No event waits in a node process, and no hook may start: answer to ``settle``.
 
@@ -277,7 +279,7 @@ class AtRest(Message):
     packets: Mapping[str, NewestPacket]
 
 
-@dataclass(frozen=True)
+@dataclass
 class WasReset(Message):
     """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
 
@@ -287,58 +289,58 @@ class WasReset(Message):
 # ---------------------------------------------------------------------- to nodes
 
 
-@dataclass(frozen=True)
+@dataclass
 class Probe(Message):
     """Report between two events."""
 
     number: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class Explain(Message):
     """Say why nothing moves."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Drain(Message):
     """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Begin(Message):
     """Start hooks from now on; not sent once the run is ending."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Stop(Message):
     """Start no further hook, finalise and end."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Say(Message):
     """Publish the state of this launcher to its peers."""
 
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Leave(Message):
     """Peers have exchanged all their states: a node that has ended may leave."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Pause(Message):
     """Start no further hook."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Resume(Message):
     """Go on after a pause."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Step(Message):
     """While paused, run ``count`` steps; ``is_driven``: some hooks start without a packet."""
 
@@ -346,7 +348,7 @@ class Step(Message):
     is_driven: bool
 
 
-@dataclass(frozen=True)
+@dataclass
 class Look(Message):
     """Show an observer what the node does; ``wanted``: what to sample, by node and port."""
 
@@ -354,7 +356,7 @@ class Look(Message):
     asker: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class Settle(Message):
     """While paused, answer once nothing moves; ``known``: newest known packet number, by output."""
 
@@ -362,14 +364,14 @@ class Settle(Message):
     known: Mapping[str, int]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Reset(Message):
     """While paused, return to the start and stay paused; ``variables``: environments, by node."""
 
     variables: Mapping[str, Mapping[str, str]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Deliver(Message):
     """A packet of a session for one of its inputs, in base64."""
 
@@ -381,33 +383,33 @@ class Deliver(Message):
 # ---------------------------------------------------------------------- from observers
 
 
-@dataclass(frozen=True)
+@dataclass
 class Watch(Message):
     """An observer is there."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class LookAll(Message):
     """Ask every node for its status once; ``wanted``: what to sample, by node and port."""
 
     wanted: Mapping[str, Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class StepAll(Message):
     """While the run is paused, run ``count`` steps."""
 
     count: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class End(Message):
     """End the run, drained, with exit code 0."""
 
     reason: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Interrupt(Message):
     """Do what Ctrl+C does (``neuros stop``)."""
 
@@ -415,7 +417,7 @@ class Interrupt(Message):
 # ---------------------------------------------------------------------- to observers
 
 
-@dataclass(frozen=True)
+@dataclass
 class PhaseChanged(Message):
     """Phase of the run, whenever it changes."""
 
@@ -423,7 +425,7 @@ class PhaseChanged(Message):
     is_paused: bool
 
 
-@dataclass(frozen=True)
+@dataclass
 class Settled(Message):
     """Nothing moves in the whole run; in answer to ``settle``. Fields as in ``at_rest``."""
 
@@ -432,7 +434,7 @@ class Settled(Message):
     packets: Mapping[str, NewestPacket]
 
 
-@dataclass(frozen=True)
+@dataclass
 class LogRecord(Message):
     """Message of the launcher to the user."""
 
@@ -440,7 +442,7 @@ class LogRecord(Message):
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Ended(Message):
     """All nodes have ended.
 

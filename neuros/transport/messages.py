@@ -24,7 +24,7 @@ from rclpy.type_support import check_for_type_support
 from neuros.errors import EnvironmentFault, WrongValue
 from neuros.project.model import Port
 from neuros.transport.codecs import message_codec
-from neuros.transport.numpy_when_used import numpy_when_used
+from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import checker
 
@@ -38,7 +38,7 @@ def message_class(type_name: str) -> type:
     """
     package, _, name = type_name.replace("/", ".").rpartition(".")
     try:
-        with numpy_when_used():
+        with imports_when_used():
             found = getattr(importlib.import_module(package), name)
     except (ImportError, AttributeError) as error:
         raise EnvironmentFault(

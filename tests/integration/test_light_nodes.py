@@ -20,24 +20,25 @@ def begin(node):
 def step(node, packet):
     node.get_logger().info("a line")
     node.shutdown("enough")
-    (node.run_dir / "numpy").write_text(str("numpy" in sys.modules))
+    found = [name for name in ("numpy", "yaml") if name in sys.modules]
+    (node.run_dir / "modules").write_text(" ".join(found))
     return packet
 """
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
-    ("type_name", "has_numpy"),
+    ("type_name", "modules"),
     [
-        ("std_msgs/msg/String", False),
-        ("geometry_msgs/msg/Twist", False),
-        ("rosgraph_msgs/msg/Clock", False),
-        ("sensor_msgs/msg/Imu", True),
-        ("std_msgs/msg/Float64MultiArray", True),
+        ("std_msgs/msg/String", ""),
+        ("geometry_msgs/msg/Twist", ""),
+        ("rosgraph_msgs/msg/Clock", ""),
+        ("sensor_msgs/msg/Imu", "numpy"),
+        ("std_msgs/msg/Float64MultiArray", "numpy"),
     ],
 )
-def test_a_node_without_arrays_goes_without_numpy(
-    tmp_path: Path, backend: str, type_name: str, has_numpy: bool
+def test_a_node_has_numpy_only_for_arrays_and_no_yaml(
+    tmp_path: Path, backend: str, type_name: str, modules: str
 ) -> None:
     (tmp_path / "a.py").write_text(PLUGIN)
     port = {"type": type_name}
@@ -49,4 +50,4 @@ def test_a_node_without_arrays_goes_without_numpy(
     finished = launch(tmp_path / "p.json", "--backend", backend, cwd=tmp_path)
     assert finished.exit_code == 0, finished.output
     assert finished.run_folder is not None
-    assert (finished.run_folder / "a" / "numpy").read_text() == str(has_numpy)
+    assert (finished.run_folder / "a" / "modules").read_text() == modules

@@ -1,4 +1,4 @@
-"""NumPy is imported when something of it is used, and is then what everybody else imports."""
+"""NumPy and PyYAML are imported when they are used, and are then what everybody else imports."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 
 BEGIN = """
 import sys
-from neuros.transport.numpy_when_used import numpy_when_used
+from neuros.transport.imports_when_used import imports_when_used
 def is_there():
     return "numpy._core" in sys.modules
 """
-IN_BLOCK = "with numpy_when_used():\n    import numpy\n"
+IN_BLOCK = "with imports_when_used():\n    import numpy\n"
 
 
 @pytest.mark.parametrize(
@@ -26,19 +26,22 @@ IN_BLOCK = "with numpy_when_used():\n    import numpy\n"
         + "\nassert stand_in is not numpy and stand_in.ndarray is numpy.ndarray",
         IN_BLOCK + "from numpy.linalg import norm\nassert numpy.linalg.norm is norm",
         IN_BLOCK + "numpy.add\nassert vars(numpy)['pi'] is sys.modules['numpy'].pi",
-        "with numpy_when_used():\n    import numpy\n    numpy.add\n    import numpy as again\n"
+        "with imports_when_used():\n    import numpy\n    numpy.add\n    import numpy as again\n"
         "assert again is sys.modules['numpy']",
         "import numpy as first\n" + IN_BLOCK + "assert numpy is first is sys.modules['numpy']",
         IN_BLOCK + "try: numpy.nothing\nexcept AttributeError as e: assert 'nothing' in str(e)",
-        "try:\n    with numpy_when_used():\n        raise KeyError\nexcept KeyError: pass\n"
+        "try:\n    with imports_when_used():\n        raise KeyError\nexcept KeyError: pass\n"
         "assert 'numpy' not in sys.modules",
         "from threading import Thread\n" + IN_BLOCK + "found = []\nuse = lambda: "
         "found.append(numpy.ndarray)\nthreads = [Thread(target=use) for _ in range(8)]\n"
         "for each in threads: each.start()\nfor each in threads: each.join()\n"
         "assert len(found) == 8 and len({*found}) == 1",
+        "with imports_when_used():\n    import rclpy.parameter as parameter\n"
+        "assert 'yaml' not in sys.modules and parameter.get_parameter_value('[1, 2]').type == 7\n"
+        "import yaml\nassert yaml is not parameter.yaml and yaml.parser is parameter.yaml.parser",
     ],
 )
-def test_numpy_comes_when_it_is_used(program: str) -> None:
+def test_a_module_comes_when_it_is_used(program: str) -> None:
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", BEGIN + program], capture_output=True, text=True
     )
