@@ -38,6 +38,7 @@ def started(
     return run
 
 
+@pytest.mark.acceptance  # the variants that learn in the room are below
 def test_in_the_room_the_ring_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
     tables = []
     for backend in BACKENDS:
