@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
+from zlib import crc32
 
 import pytest
 
@@ -128,7 +129,9 @@ def longest_first(items: list[pytest.Function]) -> None:
         marked = {each.name for each in item.iter_markers()}
         rank = next((rank for rank, kind in enumerate(_LONGEST) if kind in marked), len(_LONGEST))
         ranks[item.path] = min(rank, ranks.get(item.path, rank))
-    waiting = sorted((file for file in ranks if ranks[file] < len(_LONGEST)), key=ranks.__getitem__)
+    waiting = [file for file in ranks if ranks[file] < len(_LONGEST)]
+    # Neighbours are alike; four workers that wait for the same thing would leave the cores idle.
+    waiting.sort(key=lambda file: (ranks[file], crc32(file.name.encode())))
     computing = [file for file in ranks if ranks[file] == len(_LONGEST)]
     places = {file: place / len(waiting) for place, file in enumerate(waiting)}
     places |= {file: 1.2 * place / len(computing) for place, file in enumerate(computing)}
