@@ -27,7 +27,7 @@ def test_any_other_is_answered(name: str) -> None:
     target = TARGETS[name]
     seeds = target.seeds()
 
-    @settings(max_examples=10)
+    @settings(max_examples=20)
     @given(st.randoms(use_true_random=False))
     def check(chance: random.Random) -> None:
         data = changed(seeds, target.mutate, chance)

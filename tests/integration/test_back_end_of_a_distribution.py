@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
-from neuros.testing.back_ends import COUNT, PROJECTS, BackEndChecks, finish, launcher
+from neuros.testing.back_ends import BackEndChecks, Launched, finish, launcher
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,7 +19,6 @@ else:
 
 DISTRIBUTION = Path(__file__).parents[1] / "distributions" / "neuros_nice"
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
-NICE = ("--nice-level", "3")
 
 
 def install(site: Path, name: str, parts: Mapping[str, Mapping[str, str]]) -> None:
@@ -44,19 +43,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     return site
 
 
-@pytest.mark.acceptance
 class TestNice(BackEndChecks):
     back_end = "nice"
-    options = NICE
+    options = ("--nice-level", "3")
 
-
-def test_its_options_its_notices_and_its_record_are_those_of_the_run(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    launched = finish(launcher(PROJECTS / "pipeline", folder, "--backend", "nice", *NICE), folder)
-    assert launched.exit_code == 0, launched.output
-    assert "nodes have the nice level 3" in launched.output
-    assert launched.record["nice"] == {"level": 3}
-    assert launched.counts("relay.number -> sink.number", "sent", "consumed") == [COUNT] * 2
+    def test_its_options_its_notices_and_its_record_are_those_of_the_run(
+        self, run: Callable[..., Launched]
+    ) -> None:
+        launched = run("pipeline")
+        assert "nodes have the nice level 3" in launched.output
+        assert launched.record["nice"] == {"level": 3}
 
 
 def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:

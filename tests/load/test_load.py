@@ -25,7 +25,7 @@ from .running import (
 )
 from .shapes import LARGEST_BYTES, SHAPES, Shape
 
-_PACKETS = 1500
+_PACKETS = 3000
 
 
 # Each shape and each back end once.
