@@ -155,7 +155,8 @@ class NodePorts:
                 where=spec.where,
             )
         if spec.sim_period_s is not None and self._is_clock(port.name):
-            return TickInput(port, subscriptions, spec.sim_period_s, self._clock)
+            period_s = spec.sim_period_s
+            return TickInput(port, subscriptions, period_s, self._clock, self.sim_clock)
         return HookInput(port, subscriptions)
 
     def _subscription(

@@ -1,10 +1,11 @@
 """Simulated time of a node, and its ticks by it: both from the packets of one input, its clock.
 
-Simulated time is that of the clock packet that a hook of the node started on last; where no hook
-takes the clock, of the last one that has arrived. A tick by simulated time is a function hook that
+Simulated time is that of the clock packet that a hook of the node took last; where no hook takes
+the clock, of the last one that has arrived. A tick by simulated time is a function hook that
 requires the clock, and starts on a packet of it that reaches the next due time. Earlier packets it
-passes over: they are taken as soon as they are the oldest, and no function is called. So priority,
-flow control, logging and replay of such a hook are those of any other.
+passes over: they are taken as soon as they are the oldest, and no function is called. While the
+tick runs, simulated time is that of its own packet, though later ones are passed over as it starts.
+So priority, flow control, logging and replay of such a hook are those of any other.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class Periods:
 class TickInput(HookInput):
     """The clock as the input of a tick by simulated time."""
 
-    __slots__ = ("_clock", "_periods")
+    __slots__ = ("_clock", "_periods", "_sim_clock")
 
     def __init__(
         self,
@@ -94,10 +95,12 @@ class TickInput(HookInput):
         subscriptions: list[Subscription],
         period_s: float,
         clock: Callable[[], int],
+        sim_clock: SimClock,
     ) -> None:
         super().__init__(spec, subscriptions)
         self._periods = Periods(period_s)
         self._clock = clock
+        self._sim_clock = sim_clock
 
     def on_filled(self) -> None:
         super().on_filled()
@@ -105,8 +108,10 @@ class TickInput(HookInput):
 
     def take(self, now_ns: int) -> Any:
         packet = super().take(now_ns)
-        self.hook.missed_ticks += self._periods.tick(to_nanoseconds(packet))
+        time_ns = to_nanoseconds(packet)
+        self.hook.missed_ticks += self._periods.tick(time_ns)
         self._pass_over_early_ones(now_ns)
+        self._sim_clock.now_ns = time_ns  # not that of packets which it passes over
         return packet
 
     def _pass_over_early_ones(self, now_ns: int) -> None:

@@ -106,6 +106,16 @@ def test_outstanding_is_sent_minus_acknowledged():
     assert window.outstanding == 1
 
 
+def test_a_window_that_was_overfilled_stays_blocked_until_a_packet_fits():
+    window = SendWindow(wire(OUT, 1))  # two packets may be outstanding
+    for _ in range(5):
+        window.spend(0)
+    window.credit(3, now_ns=0)
+    assert window.is_blocked
+    window.credit(4, now_ns=0)
+    assert not window.is_blocked
+
+
 def test_nothing_is_outstanding_where_nothing_is_acknowledged():
     window = SendWindow(wire(OUT))
     window.spend(0)

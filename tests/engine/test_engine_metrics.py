@@ -24,6 +24,14 @@ def accounting(bench: Bench) -> dict:
 # ------------------------------------------------------------------ time
 
 
+def test_of_several_blocked_outputs_the_first_is_the_cause():
+    bench = Bench(
+        function("f", outputs=["o", "p"], returns=(1, 2)),
+        connections=[wire("node.o -> b.x", 0), wire("node.p -> c.x", 0)],
+    )
+    assert bench.engine.rest() == (State.BLOCKED, "node.o -> b.x")
+
+
 def test_executing_is_booked_per_hook():
     bench = Bench(function("f", "x"), function("g", "x"), connections=[wire(IN)])
     bench.hook_s = 2.0

@@ -106,6 +106,25 @@ def test_a_second_pause_takes_back_what_is_left_of_steps():
     assert sorted(bench.ran) == ["answer", "step", "step"]
 
 
+def test_a_hook_that_has_had_its_step_holds_up_no_other():
+    bench = Bench(function("drive"), function("answer", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)
+    bench.settle()
+    bench.packet(IN)
+    assert bench.ran[-2:] == ["drive", "answer"]  # `drive` comes first again, and may not start
+    assert bench.packet(IN) == ["answer"]
+
+
+def test_in_a_pause_no_time_passes_for_a_tick_that_awaits_a_packet_either():
+    bench = Bench(tick("t", 1.0, "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)
+    assert bench.packet(IN) == ["t"]
+    bench.clock.advance(5.0)
+    assert bench.packet(IN) == []
+
+
 def test_a_step_starts_a_tick_hook_though_no_time_passes():
     bench = Bench(tick("t", 1.0))
     bench.engine.pause()

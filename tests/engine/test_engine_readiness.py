@@ -227,6 +227,19 @@ def test_nothing_else_runs_before_every_initialise_hook_has_run():
     assert bench.settle(1) == ["f"]
 
 
+def test_a_hook_is_ready_where_its_own_start_frees_its_output():
+    own = "node.o -> node.x"
+    bench = Bench(
+        initialise("first", outputs="o", returns="ball"),
+        function("f", "x", "o", "ball"),
+        connections=[wire(own, 0)],
+    )
+    bench.engine.pause()
+    bench.posted_event()  # the first packet arrives
+    assert bench.hook("f").blocked
+    assert bench.hook("f").is_ready()
+
+
 def test_an_initialise_hook_waits_for_its_receivers_and_sends_to_them():
     bench = Bench(
         initialise("init", outputs="o", returns="ball"),

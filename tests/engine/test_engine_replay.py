@@ -21,6 +21,7 @@ from neuros.engine.event_log import (
     ReplayParted,
     Script,
     events_of,
+    is_understood,
     is_whole,
     starts_of,
 )
@@ -195,6 +196,45 @@ def test_a_changed_plugin_that_sends_less_is_told_where_it_parts() -> None:
         again.play()
     assert not again.bench.sent
     assert again.bench.ran == run.bench.ran[: len(again.bench.ran)]
+
+
+def test_a_node_that_only_ticks_does_again_what_it_did() -> None:
+    def bench_of(make_engine: Callable[..., Any]) -> Bench:
+        return Bench(tick("t", 0.01), make_engine=make_engine)
+
+    bench = bench_of(LoggedEngine)
+    for late_s in (0.0, 0.003, 0.025):
+        bench.pass_time(0.01 + late_s)
+    bench.engine.stop_hooks()
+    event_log: Any = bench.engine.event_log  # type: ignore[attr-defined]
+    kinds = [event.kind for event in events_of(event_log)]
+    assert kinds.count(EventKind.TIMER) == 3
+    readings = [reading for event in events_of(event_log) for reading in event.readings]
+    assert bench.clock.now_ns in readings
+
+
+def test_a_node_without_ticks_notes_no_time() -> None:
+    bench = Bench(function("f", "x"), connections=[INCOMING[0]], make_engine=LoggedEngine)
+    bench.packet(str(INCOMING[0]))
+    event_log: Any = bench.engine.event_log  # type: ignore[attr-defined]
+    assert not any(event.readings for event in events_of(event_log))
+
+
+def test_every_kind_of_entry_has_a_number_of_its_own() -> None:
+    assert len({kind.value for kind in EventKind.__members__.values()}) == len(
+        EventKind.__members__
+    )
+
+
+def test_a_log_with_an_entry_of_no_kind_is_not_understood() -> None:
+    _, event_log = some_run()
+    assert is_understood(event_log)
+    assert not is_understood([*event_log, ~31])
+
+
+def test_a_clock_may_stand_at_zero() -> None:
+    _, event_log = some_run()
+    assert next(events_of([0, *event_log])).readings[0] == 0
 
 
 def test_events_carry_their_place_and_position() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.engine.metrics import TickIntervals, in_flight_and_lost
+from neuros.engine.metrics import TickIntervals, TimeBudget, in_flight_and_lost
 
 MS = 1_000_000
 
@@ -53,6 +53,24 @@ def test_an_interval_that_is_too_short_can_be_the_worst() -> None:
 def test_its_memory_does_not_grow_with_the_length_of_an_interval() -> None:
     figures = book(0, 1e5, 3e5).figures()
     assert figures["histogram"] == [[2000.0, 2]]
+
+
+def budget(**seconds: float) -> TimeBudget:
+    return TimeBudget(seconds, waiting={}, blocked={}, idle_s=1.0, scheduling_s=0.5)
+
+
+def test_the_busiest_hook_is_the_one_that_executes_longest() -> None:
+    assert budget(first=1.0, plan=3.0, tail=2.0).busiest_hook == ("plan", 3.0)
+    assert budget().busiest_hook == ("", 0.0)
+
+
+def test_a_nodes_own_time_is_that_of_its_hooks_and_of_scheduling() -> None:
+    assert budget(a=1.0, b=2.0).own_s == 3.5
+    assert budget(a=1.0, b=1.5).share(2.0) == 0.5
+
+
+def test_of_a_run_that_never_was_under_way_every_share_is_0() -> None:
+    assert TimeBudget({}, {}, {}, idle_s=0.0, scheduling_s=0.0).share(0.0) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
 
 from neuros.engine.sim_clock import Periods
 from neuros.errors import HookError
@@ -144,6 +145,30 @@ def tick(node, clock, ask):
     send(node, *steps(16))
     assert ticks(node) == [0.1, 0.2]  # at 0.3 it waits for its other input
     assert node.node.sim_time == 0.28
+
+
+def test_with_packets_of_its_clock_waiting_a_tick_passes_over_those_between_its_times(harness):
+    node = harness(0.1, discard_limit=0, queue_size=8)
+    node.block("at")
+    send(node, 0.1, 0.2, 0.22, 0.24, 0.3, 0.32)
+    node.unblock("at")
+    node.run()
+    assert ticks(node) == [0.1, 0.2, 0.3]
+
+
+def test_a_tick_that_leaves_out_its_clock_has_its_other_inputs(harness):
+    plugin = """
+from neuros.hooks import neuros_tick
+from std_msgs.msg import Float64
+
+@neuros_tick(sim_seconds={period}, inputs="ask", outputs="at")
+def tick(node, ask):
+    return Float64(data=node.sim_time + ask.data)
+"""
+    node = harness(0.1, plugin)
+    node.send("ask", Float64(data=5.0))
+    send(node, 0.1)
+    assert ticks(node) == [5.1]
 
 
 def test_a_clock_that_no_hook_takes_is_known_nevertheless(harness):

@@ -1,4 +1,4 @@
-"""Simulated time on /clock: a node and a plain rclpy program follow the physics."""
+"""Simulated time: on /clock, which a plain rclpy program follows, too, and in ticks by it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from launching import start
+from launching import each_time, launch, start
 
 from containers import require_containers
 from neuros.backends.domain import choose_domain
 from neuros.backends.node_command import with_libraries
 
 PROJECT = Path(__file__).parent / "sim_time"
+TICKS = Path(__file__).parent / "sim_ticks"
 LIMIT_S = 60.0
 IN_A_NAMESPACE = ("--namespace", "/lab", "--remap", "/clock:=clock")
 PLAIN_IN_A_NAMESPACE = ("--ros-args", "-r", "__ns:=/lab", "-r", "/clock:=clock")
@@ -54,3 +55,12 @@ def test_clocks_follow_the_physics(
     for gaps in map(ast.literal_eval, (heard, said[1])):
         # Every 10 ms by the clock of the simulation: a fifth as often as on the wall.
         assert gaps[len(gaps) // 2] == 10, gaps
+
+
+@each_time("process")
+def test_a_slow_tick_sees_its_own_time_though_the_clock_has_run_ahead(
+    backend: str, tmp_path: Path
+) -> None:
+    done = launch(TICKS, "--backend", backend, cwd=tmp_path)
+    assert done.exit_code == 0, done.output
+    assert done.said("brain")[:5] == [f"at {tick / 10:.2f} s" for tick in range(1, 6)]
