@@ -24,10 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = [
-    f"neuros/engine/{name}.py"
-    for name in ("engine", "hook", "input_queue", "lifecycle", "schedule", "send_window")
-]
+MODULES = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("neuros/engine/[!_]*.py"))
 TIMEOUT_S = 600
 LIMITS = "ulimit -t 60 -v 6000000"  # a fault may make a test endless, or its lists
 # One replacement for each arithmetic operator, and for comparisons the neighbour or the opposite:
