@@ -6,7 +6,7 @@ They run on the real engine, in a harness that plays the nodes around.
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -119,6 +119,30 @@ def test_with_a_longer_queue_a_tick_still_sees_its_own_time(harness):
     node.unblock("at")
     node.run()
     assert ticks(node) == [0.1, 0.2, 0.3]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 6), st.integers(0, 4), st.lists(st.booleans(), min_size=7, max_size=7))
+def test_ticks_are_the_same_however_long_the_queue_and_however_late_the_receiver(
+    tmp_path_factory, queue_size, shift, is_late
+):
+    clock = wire("world.clock -> node.clock", discard_limit=0, queue_size=queue_size)
+    file = tmp_path_factory.mktemp("late") / "plugin.py"
+    file.write_text(PLUGIN.format(period=0.1))
+    with PluginHarness(
+        file,
+        inputs={"clock": CLOCK, "ask": NUMBER},
+        outputs={"at": NUMBER, "told": NUMBER},
+        connections=[clock],
+        run_folder=file.parent,
+    ) as node:
+        for step, time_s in enumerate(steps(30), shift):
+            (node.block if is_late[step // 5] else node.unblock)("at")
+            send(node, time_s)
+        node.unblock("at")
+        node.run()
+        assert ticks(node) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+        assert node._engine.all_hooks[0].missed_ticks == 0
 
 
 def test_two_ticks_of_one_node_have_a_schedule_each(harness):
