@@ -214,6 +214,8 @@ class Subscription:
             self.skipped.add(position)
             self.discarded += 1
         self._settle()
+        if queue.packets:
+            queue.hook_input.on_discarded()
 
     def _settle(self) -> None:
         """Count what every taker is past: discarded if one of them lost it, consumed otherwise."""
@@ -266,6 +268,9 @@ class HookInput:
         was_missing, self.missing = self.missing, self._count()
         if self.missing and not was_missing:
             self.hook.on_input_incomplete()
+
+    def on_discarded(self) -> None:
+        """The oldest packet of a queue was discarded, and others are there."""
 
     def _count(self) -> int:
         if self.is_optional:

@@ -106,6 +106,9 @@ class TickInput(HookInput):
         super().on_filled()
         self._pass_over_early_ones(self._clock())
 
+    def on_discarded(self) -> None:
+        self._pass_over_early_ones(self._clock())
+
     def take(self, now_ns: int) -> Any:
         packet = super().take(now_ns)
         time_ns = to_nanoseconds(packet)

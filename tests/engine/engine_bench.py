@@ -69,6 +69,13 @@ def tick(
     return _mark(neuros_tick(seconds, inputs, outputs), name, returns)
 
 
+def sim_tick(
+    name: str, seconds: float, inputs: Any = None, outputs: Any = None, returns: Any = None
+) -> HookSpec:
+    decorator = neuros_tick(sim_seconds=seconds, inputs=inputs, outputs=outputs)
+    return _mark(decorator, name, returns)
+
+
 def finalise(name: str) -> HookSpec:
     return _mark(neuros_finalise(), name, None)
 
@@ -255,6 +262,7 @@ __all__ = [
     "function",
     "initialise",
     "node_for",
+    "sim_tick",
     "tick",
     "wire",
 ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Any
 
 from neuros.hooks import HookKind, HookSpec, InputSpec
@@ -16,17 +17,26 @@ from neuros.project.model import Connection
 Produce = Callable[[HookSpec, int], list[Any]]
 """``produce(spec, count)``: what a hook returns at its count-th execution, one per output."""
 
+CLOCK = "clock"
+"""The input that brings simulated time; its packets are ``Clock`` messages."""
+
 
 class NaiveHook:
     def __init__(self, spec: HookSpec, place: int, sources: dict[str, list[Connection]]) -> None:
         self.spec = spec
+        self.inputs = list(spec.inputs)
+        if spec.sim_period_s is not None and CLOCK not in [port.name for port in spec.inputs]:
+            self.inputs.append(InputSpec(CLOCK))
         self.place = place
         self.last_turn = 0
         self.executions = 0
         self.last_run_ns = 0
         self.queue: dict[Connection, list[tuple[int, int, Any]]] = {
-            c: [] for port in spec.inputs for c in sources.get(port.name, [])
+            c: [] for port in self.inputs for c in sources.get(port.name, [])
         }
+        self.looked_at: Any = None
+        self.time: Fraction | None = None
+        self.periods = 0
         self.position = dict.fromkeys(self.queue, 0)
         self.lost: dict[Connection, set[int]] = {c: set() for c in self.queue}
         self.started: dict[Connection, set[int]] = {c: set() for c in self.queue}
@@ -60,6 +70,7 @@ class NaiveNode:
         self.start_ns: int | None = None
         self.events: deque[tuple[Any, ...]] = deque()
         self.log: list[tuple[Any, ...]] = []
+        self.sim_time: Fraction | None = None
 
     # ---- events
 
@@ -87,8 +98,11 @@ class NaiveNode:
                     assert c.discard_limit != 0
                     hook.lost[c].add(queue.pop(0)[1])
                 queue.append((self.arrivals, self.arrived[c], packet))
+                self.pass_over(hook)
         if not self.takers(c):
             self.acknowledge(c, self.arrived[c])
+            if c.destination_input == CLOCK:
+                self.sim_time = time_of(packet)
         self.one_pass()
 
     def posted_event(self) -> None:
@@ -99,6 +113,35 @@ class NaiveNode:
             self.one_pass()
 
     # ---- rules
+
+    def pass_over(self, hook: NaiveHook) -> None:
+        """The tick takes the oldest packet of its clock, uncalled, until it is due by one."""
+        if hook.spec.sim_period_s is None:
+            return
+        period_s = Fraction(repr(hook.spec.sim_period_s))
+        (c,) = self.sources[CLOCK]
+        while hook.queue[c]:
+            _, _, packet = hook.queue[c][0]
+            if packet is not hook.looked_at:
+                time = time_of(packet)
+                if hook.time is None or time < hook.time:
+                    before = time - Fraction(1, 10**9)
+                    hook.periods = max(0, before // period_s)
+                hook.looked_at, hook.time = packet, time
+            if time_of(packet) // period_s > hook.periods:
+                return
+            self.take(hook, c)
+            self.acknowledge_taken(c)
+
+    def take(self, hook: NaiveHook, c: Connection) -> Any:
+        _, hook.position[c], packet = hook.queue[c].pop(0)
+        hook.started[c].add(hook.position[c])
+        if c.destination_input == CLOCK:
+            self.sim_time = time_of(packet)
+        return packet
+
+    def acknowledge_taken(self, c: Connection) -> None:
+        self.acknowledge(c, min(h.position[c] for h in self.takers(c)))
 
     def one_pass(self) -> None:
         for hook in sorted(self.hooks, key=lambda each: (each.last_turn, each.place)):
@@ -121,7 +164,7 @@ class NaiveNode:
             for each in self.hooks:
                 each.last_run_ns = self.start_ns
         return (
-            all(self.has_input(hook, port) for port in hook.spec.inputs)
+            all(self.has_input(hook, port) for port in hook.inputs)
             and not any(
                 self.is_blocked(hook, c)
                 for port in hook.spec.outputs
@@ -146,7 +189,7 @@ class NaiveNode:
 
     def would_take(self, hook: NaiveHook) -> list[Connection]:
         taken = []
-        for port in hook.spec.inputs:
+        for port in hook.inputs:
             filled = [c for c in self.sources.get(port.name, []) if hook.queue[c]]
             if port.is_all:
                 taken += filled
@@ -181,19 +224,21 @@ class NaiveNode:
         hook.last_run_ns = self.now_ns()
         taken = {}
         for c in self.would_take(hook):
-            _, hook.position[c], taken[c] = hook.queue[c].pop(0)
-            hook.started[c].add(hook.position[c])
+            taken[c] = self.take(hook, c)
+            self.acknowledge_taken(c)
+            if hook.spec.sim_period_s is not None and c.destination_input == CLOCK:
+                hook.periods = time_of(taken[c]) // Fraction(repr(hook.spec.sim_period_s))
+                self.pass_over(hook)
+                self.sim_time = time_of(taken[c])
         arguments = []
-        for port in hook.spec.inputs:
+        for port in hook.inputs:
             sources = self.sources.get(port.name, [])
             if port.is_all:
                 arguments.append([taken.get(c) for c in sources])
             else:
                 arguments.append(next((taken[c] for c in sources if c in taken), None))
-        for c in taken:
-            self.acknowledge(c, min(h.position[c] for h in self.takers(c)))
         hook.executions += 1
-        self.log.append(("run", hook.spec.name, arguments))
+        self.log.append(("run", hook.spec.name, arguments, self.sim_time))
         for port, packet in zip(
             hook.spec.outputs, self.produce(hook.spec, hook.executions), strict=True
         ):
@@ -211,3 +256,8 @@ class NaiveNode:
             for c in hook.queue:
                 takers = self.takers(c)
                 self.acknowledge(c, min((h.position[c] for h in takers), default=self.arrived[c]))
+
+
+def time_of(packet: Any) -> Fraction:
+    """Seconds of a ``Clock`` message."""
+    return packet.clock.sec + Fraction(packet.clock.nanosec, 10**9)

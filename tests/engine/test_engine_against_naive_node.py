@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
-from engine_bench import Clock, function, initialise, node_for, tick
+import rosgraph_msgs.msg
+from engine_bench import Clock, function, initialise, node_for, sim_tick, tick
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
-from naive_node import NaiveNode
+from naive_node import CLOCK, NaiveNode
 
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
+from neuros.engine.sim_clock import with_clocks
 from neuros.hooks import All, HookSpec, Optional
 from neuros.project.model import Connection, Port
+from neuros.time import to_stamp
 
 INPUTS, OUTPUTS, OTHERS = ("x", "y"), ("o", "p"), ("a", "b")
 PERIODS_S = (0.1, 0.25)
@@ -26,10 +31,13 @@ class Written:
     def __init__(self, produce: Callable[[HookSpec, int], list[Any]]) -> None:
         self.log: list[tuple[Any, ...]] = []
         self.events: deque[tuple[str, Callable[[], None]]] = deque()
+        self.engine: Engine
         self._produce = produce
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
-        self.log.append(("run", hook.name, list(arguments)))
+        now_ns = self.engine.sim_clock.now_ns
+        sim_time = None if now_ns is None else Fraction(now_ns, 10**9)
+        self.log.append(("run", hook.name, list(arguments), sim_time))
         packets = self._produce(hook.spec, hook.executions + 1)
         return packets if hook.spec.outputs else None
 
@@ -68,6 +76,9 @@ def nodes(draw: st.DrawFn) -> tuple[list[Connection], list[HookSpec]]:
         *(("node", o, b, "x") for o in OUTPUTS for b in OTHERS),
     ]
     chosen = draw(st.lists(st.sampled_from(ends), unique=True, min_size=1, max_size=6))
+    has_clock = draw(st.booleans())
+    if has_clock:
+        chosen.append(("world", "clock", "node", CLOCK))
     connections = [
         Connection(*end, discard_limit=draw(limits), queue_size=draw(sizes), index=index)
         for index, end in enumerate(chosen)
@@ -75,7 +86,8 @@ def nodes(draw: st.DrawFn) -> tuple[list[Connection], list[HookSpec]]:
     connected = {c.destination_input for c in connections if c.destination_node == "node"}
     specs = []
     for number in range(draw(st.integers(1, 4))):
-        inputs = [
+        takes_clock = [CLOCK] if has_clock and draw(st.integers(0, 3)) == 0 else []
+        inputs = takes_clock + [
             draw(_wrapped(name, name in connected))
             for name in draw(st.lists(st.sampled_from(INPUTS), unique=True))
         ]
@@ -83,14 +95,16 @@ def nodes(draw: st.DrawFn) -> tuple[list[Connection], list[HookSpec]]:
             draw(st.sampled_from([name, Optional(name)]))
             for name in draw(st.lists(st.sampled_from(OUTPUTS), unique=True))
         ]
-        kind = draw(st.sampled_from(["function"] * 4 + ["initialise", "tick"]))
+        kinds = ["function"] * 4 + ["initialise", "tick"] + ["sim tick"] * 3 * has_clock
+        kind = draw(st.sampled_from(kinds))
         name = f"{kind}{number}"
         if kind == "function":
             specs.append(function(name, inputs, outputs))
         elif kind == "initialise":
             specs.append(initialise(name, inputs, outputs))
         else:
-            specs.append(tick(name, draw(st.sampled_from(PERIODS_S)), inputs, outputs))
+            make = tick if kind == "tick" else sim_tick
+            specs.append(make(name, draw(st.sampled_from(PERIODS_S)), inputs, outputs))
     return connections, specs
 
 
@@ -114,15 +128,25 @@ class Pair:
         self.clock = Clock()
         self.effects = Written(produce)
         node = node_for("node", specs, connections)
-        self.engine = Engine(node, connections, specs, self.effects, self.clock)
+        ports = [
+            replace(port, type="rosgraph_msgs/msg/Clock") if port.name == CLOCK else port
+            for port in node.inputs
+        ]
+        node = replace(node, inputs=tuple(ports))
+        self.engine = Engine(node, connections, with_clocks(node, specs), self.effects, self.clock)
+        self.effects.engine = self.engine
         self.naive = NaiveNode("node", connections, specs, produce, self.clock)
         self.inbound = [c for c in self.naive.incoming if c.source_node != "node"]
         self.outbound = [c for c in self.naive.outgoing if c.destination_node != "node"]
         self.packets = 0
+        self.sim_time_s = 0.0
 
     def step(self, kind: str, number: int) -> None:
         if kind == "packet" and self.inbound:
             self._packet(self.inbound[number % len(self.inbound)])
+        elif kind == "clock" and self.inbound and self.inbound[-1].destination_input == CLOCK:
+            self.sim_time_s = self.sim_time_s + number / 200 if number < 38 else 0.0
+            self._packet(self.inbound[-1])
         elif kind == "acknowledgement" and self.outbound:
             c = self.outbound[number % len(self.outbound)]
             self._both("on_acknowledgement", c, min(self.naive.sent[c], number // 4))
@@ -147,7 +171,10 @@ class Pair:
             if outstanding >= c.window:
                 return
         self.packets += 1
-        self._both("on_packet", c, f"{c}#{self.packets}")
+        packet: Any = f"{c}#{self.packets}"
+        if c.destination_input == CLOCK:
+            packet = rosgraph_msgs.msg.Clock(clock=to_stamp(round(self.sim_time_s, 9)))
+        self._both("on_packet", c, packet)
 
     def _both(self, method: str, *arguments: Any) -> None:
         getattr(self.engine, method)(*arguments)
@@ -185,7 +212,8 @@ class Pair:
         assert not lost & consumed
 
 
-kinds = ["packet"] * 5 + ["posted"] * 4 + ["acknowledgement", "acknowledge all", "time"] * 2
+kinds = ["packet"] * 5 + ["posted"] * 4
+kinds += ["acknowledgement", "acknowledge all", "time", "clock", "clock"] * 2
 steps = st.lists(
     st.tuples(st.sampled_from([*kinds, "registration"]), st.integers(0, 40)),
     min_size=10,

@@ -95,6 +95,17 @@ def test_a_simulation_that_starts_anew_ticks_anew(harness):
     assert ticks(node) == [0.1, 0.2, 0.1]
 
 
+def test_where_its_packet_is_discarded_a_tick_looks_at_the_next_one(harness):
+    node = harness(0.1, discard_limit=9, queue_size=2)
+    node.block("at")
+    send(node, 0.1, 0.2, 0.0, 0.02)  # 0.2 is discarded, and the simulation has started anew
+    node.unblock("at")
+    node.run()
+    assert ticks(node) == [0.1]
+    send(node, 0.1)
+    assert ticks(node) == [0.1, 0.1]
+
+
 def test_time_waits_for_a_tick_that_cannot_start(harness):
     """So a lossless clock loses no tick: the simulation stands still, too."""
     node = harness(0.1)
