@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
-from engine_bench import Bench, function, initialise, wire
+from pathlib import Path
 
+import pytest
+from engine_bench import Bench, Clock, function, initialise, wire
+
+from neuros.engine.engine import Engine
 from neuros.engine.send_window import SendWindow
 from neuros.errors import ProtocolError
 from neuros.hooks import All, Optional
+from neuros.project.model import Node, Port
+from neuros.project.qos import Qos
 
 A, B = "a.o -> node.x", "b.o -> node.x"
 OUT = "node.o -> b.x"
@@ -154,6 +159,14 @@ def test_the_input_queue_of_an_external_topic_holds_ten():
     bench.packet("c.o -> node.go")
     assert bench.calls[0][1][0] == 2
     assert bench.engine.subscriptions["x"].discarded == 2
+
+
+@pytest.mark.parametrize(("depth", "capacity"), [(3, 3), (0, 10)])
+def test_the_depth_of_its_quality_of_service_is_that_of_the_input_queue(depth, capacity):
+    port = Port("x", "std_msgs/msg/String", "/x", qos=Qos("reliable", depth=depth))
+    node = Node("node", "neuros_python", Path("/project/plugin.py"), inputs=(port,))
+    engine = Engine(node, [], [function("f", "x")], Bench(), Clock())
+    assert engine.subscriptions["x"].capacity == capacity
 
 
 def test_nothing_is_acknowledged_on_an_external_topic():

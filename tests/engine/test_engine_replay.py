@@ -62,8 +62,10 @@ def whole_bench(make_engine: Callable[..., Any], specs: list[HookSpec]) -> Bench
 class Run:
     """A node, and neighbours that keep the rules but for when they do something."""
 
-    def __init__(self) -> None:
-        self.bench = whole_bench(LoggedEngine, hooks())
+    def __init__(self, specs: list[HookSpec]) -> None:
+        self.bench = whole_bench(LoggedEngine, specs)
+        self.bench.during_call = self.on_call
+        self.calls_until_arrival = 0
         self.arrived: dict[Connection | str, list[Any]] = {c: [] for c in INCOMING} | {"topic": []}
         engine = self.bench.engine
         for connection in (*OUTGOING, CONNECTIONS[3]):
@@ -102,6 +104,14 @@ class Run:
             bench.engine.drain([place for place in places if advance_ns >> place & 1])
         elif what == 10:
             bench.is_taken_in = not bench.is_taken_in
+        elif what == 11:
+            self.calls_until_arrival = 1 + advance_ns % 3
+
+    def on_call(self) -> None:
+        """Something arrives while one of the next hooks runs, so the pass ends after it."""
+        if self.calls_until_arrival:
+            self.calls_until_arrival -= 1
+            self.bench.is_taken_in = self.calls_until_arrival > 0
 
 
 class Again:
@@ -132,19 +142,23 @@ class Again:
     def offer(self) -> None:
         raise AssertionError("there are no threads")
 
-    def play(self) -> None:
+    def play(self) -> dict[int | None, list[str]]:
+        """Returns what had run after the last event of each limit."""
         player = Player(self.script, self.bench.engine, self, self)
+        ran: dict[int | None, list[str]] = {}
         for event in self.script.events():
             player.play(event)
+            ran[event.limit] = self.bench.ran
+        return ran
 
 
-steps = st.lists(st.tuples(st.integers(0, 10), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)
 @given(steps)
 def test_a_node_does_again_what_it_did(given_steps: list[tuple[int, int]]) -> None:
-    run = Run()
+    run = Run(hooks())
     for what, advance_ns in given_steps:
         run.step(what, advance_ns)
     run.bench.engine.stop_hooks()
@@ -159,8 +173,19 @@ def test_a_node_does_again_what_it_did(given_steps: list[tuple[int, int]]) -> No
     assert len(list(starts_of(event_log))) == len(run.bench.calls)
 
 
+def test_a_pass_that_ended_for_what_had_arrived_ends_there_again() -> None:
+    specs = [function(name, "topic") for name in ("first", "second", "third")]
+    run = Run(specs)
+    for what, advance_ns in [(10, 0), (2, 0), (10, 0), (11, 1), (6, 0), (10, 0), (6, 0)]:
+        run.step(what, advance_ns)
+    event_log: Any = run.bench.engine.event_log  # type: ignore[attr-defined]
+    again = Again(run, event_log, specs)
+    assert again.play()[2] == ["first", "second"]
+    assert again.bench.ran == run.bench.ran == ["first", "second", "third"]
+
+
 def some_run() -> tuple[Run, array[int]]:
-    run = Run()
+    run = Run(hooks())
     for what in (6, 0, 3, 4, 6, 1, 6, 5, 6, 1, 3, 4, 6):
         run.step(what, 10_000_000)
     event_log: Any = run.bench.engine.event_log  # type: ignore[attr-defined]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuros.engine.metrics import TickIntervals, TimeBudget, in_flight_and_lost
+from neuros.engine.metrics import TickIntervals, TimeBudget, in_flight_and_lost, time_budget_of
 
 MS = 1_000_000
 
@@ -67,6 +67,12 @@ def test_the_busiest_hook_is_the_one_that_executes_longest() -> None:
 def test_a_nodes_own_time_is_that_of_its_hooks_and_of_scheduling() -> None:
     assert budget(a=1.0, b=2.0).own_s == 3.5
     assert budget(a=1.0, b=1.5).share(2.0) == 0.5
+
+
+def test_a_node_that_has_counted_no_rest_has_rested_for_no_time() -> None:
+    accounting = {"executing": {"f": 0.5}, "waiting": {"x": 0.25}, "idle": None}
+    found = time_budget_of({"accounting": accounting}, running_s=None)
+    assert found == TimeBudget({"f": 0.5}, {"x": 0.25}, {}, idle_s=0.0, scheduling_s=0.0)
 
 
 def test_of_a_run_that_never_was_under_way_every_share_is_0() -> None:
