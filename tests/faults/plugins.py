@@ -15,6 +15,7 @@ DRAINS_WITHIN_S = 5.0
 DURATION_S = 1.5
 _LOOKS_FOR_S = 1.0
 _ATTEMPTS = 3
+_CUT_SHORT = "had to be killed 5 s after the end began"
 
 
 def place_of(cell: Cell) -> Place:
@@ -46,6 +47,8 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int, within_s: float = ENDS_WI
             break
         # On a busy machine a run may be over before its second node has begun.
         outcome.problems = ["no fault struck before the end of the run"]
+    if outcome.exit_code and cell.may_be_cut_short and _CUT_SHORT not in outcome.said:
+        outcome.problems.append(f"exit code {outcome.exit_code}, but not cut short")
     if cell.ends_by_itself and outcome.record:
         # Both count from the first hook.
         outcome.took_s = outcome.record["wall_s"] - DURATION_S
