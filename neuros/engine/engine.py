@@ -333,6 +333,8 @@ class Engine:
         lifecycle, pause = self._lifecycle, self._pause
         if not lifecycle.has_begun:
             return
+        if pause.is_on:
+            pause.wake_ticks()
         if self._schedule.candidates:
             self._is_passing = True
             try:
@@ -396,6 +398,8 @@ class Engine:
         elif hook.spec.kind is HookKind.INITIALISE:
             self._retire(hook)
             self._lifecycle.finish_initialiser(hook)
+            if self._pause.is_on:
+                self._pause.wake_ticks()
 
     def _retire(self, hook: Hook) -> None:
         """Remove the input queues of a hook that will never run again."""

@@ -284,11 +284,13 @@ class Pause:
 
     def grant(self, steps: int, *, is_driven: bool) -> None:
         """Allow further steps; ``is_driven``: some node of the project has hooks that drive."""
-        if not self.is_on:
-            return
-        self._granted += steps
-        self._limits_all = not is_driven
-        for hook in self._ticks:
+        if self.is_on:
+            self._granted += steps
+            self._limits_all = not is_driven
+
+    def wake_ticks(self) -> None:
+        """Ticks that have steps left start now, due or not."""
+        for hook in self._ticks if self._granted else ():
             if hook.is_enabled and self.allows(hook):
                 hook.is_due = True
 

@@ -31,6 +31,7 @@ class NaiveHook:
         self.last_turn = 0
         self.executions = 0
         self.last_run_ns = 0
+        self.starts_in_steps = 0
         self.queue: dict[Connection, list[tuple[int, int, Any]]] = {
             c: [] for port in self.inputs for c in sources.get(port.name, [])
         }
@@ -71,6 +72,9 @@ class NaiveNode:
         self.events: deque[tuple[Any, ...]] = deque()
         self.log: list[tuple[Any, ...]] = []
         self.sim_time: Fraction | None = None
+        self.paused_ns: int | None = None
+        self.time_lost_ns = 0
+        self.steps, self.is_driven = 0, True
 
     # ---- events
 
@@ -103,6 +107,25 @@ class NaiveNode:
             self.acknowledge(c, self.arrived[c])
             if c.destination_input == CLOCK:
                 self.sim_time = time_of(packet)
+        self.one_pass()
+
+    def pause(self) -> None:
+        if self.paused_ns is None:
+            self.paused_ns = self.now_ns()
+        self.steps = 0
+        for hook in self.hooks:
+            hook.starts_in_steps = 0
+
+    def resume(self) -> None:
+        if self.paused_ns is not None:
+            self.time_lost_ns += self.now_ns() - self.paused_ns
+            self.paused_ns = None
+            self.one_pass()
+
+    def step(self, count: int, *, is_driven: bool) -> None:
+        if self.paused_ns is not None:
+            self.steps += count
+            self.is_driven = is_driven
         self.one_pass()
 
     def posted_event(self) -> None:
@@ -145,13 +168,29 @@ class NaiveNode:
 
     def one_pass(self) -> None:
         for hook in sorted(self.hooks, key=lambda each: (each.last_turn, each.place)):
-            if self.is_ready(hook):
+            if self.is_allowed(hook) and self.is_ready(hook):
                 if any(event[0] == "own packet" for event in self.events):
                     break
                 self.run(hook)
         is_loop_back_waiting = any(event[0] == "loop-back" for event in self.events)
-        if not is_loop_back_waiting and any(self.is_ready(hook) for hook in self.hooks):
+        startable = [h for h in self.hooks if self.is_allowed(h) and self.is_ready(h)]
+        if startable and not is_loop_back_waiting:
             self.events.append(("loop-back",))
+
+    def is_allowed(self, hook: NaiveHook) -> bool:
+        """By a pause, and its steps."""
+        if self.paused_ns is None or hook.spec.kind is HookKind.INITIALISE:
+            return True
+        is_tick = hook.spec.period_s is not None
+        drives = is_tick or all(port.is_optional for port in hook.inputs)
+        if drives or not self.is_driven:
+            return hook.starts_in_steps < self.steps
+        return self.steps > 0
+
+    def node_time_ns(self) -> int:
+        """Time stands still while the node is paused."""
+        now_ns = self.now_ns() if self.paused_ns is None else self.paused_ns
+        return now_ns - self.time_lost_ns
 
     def is_ready(self, hook: NaiveHook) -> bool:
         if self.registered != set(self.outgoing):
@@ -160,7 +199,7 @@ class NaiveNode:
         if not is_initialised and hook.spec.kind is not HookKind.INITIALISE:
             return False
         if is_initialised and self.start_ns is None:
-            self.start_ns = self.now_ns()
+            self.start_ns = self.node_time_ns()
             for each in self.hooks:
                 each.last_run_ns = self.start_ns
         return (
@@ -180,11 +219,11 @@ class NaiveNode:
 
     def is_due(self, hook: NaiveHook) -> bool:
         """A due time start + k x period lies between its last run and now."""
-        if hook.spec.period_s is None:
-            return True
+        if hook.spec.period_s is None or self.paused_ns is not None:
+            return True  # a step starts a tick, due or not
         assert self.start_ns is not None
         period_ns = round(hook.spec.period_s * 1e9)
-        ticks = (self.now_ns() - self.start_ns) // period_ns
+        ticks = (self.node_time_ns() - self.start_ns) // period_ns
         return ticks > (hook.last_run_ns - self.start_ns) // period_ns
 
     def would_take(self, hook: NaiveHook) -> list[Connection]:
@@ -221,7 +260,10 @@ class NaiveNode:
     def run(self, hook: NaiveHook) -> None:
         self.turn += 1
         hook.last_turn = self.turn
-        hook.last_run_ns = self.now_ns()
+        if self.paused_ns is None:
+            hook.last_run_ns = self.node_time_ns()
+        else:
+            hook.starts_in_steps += 1
         taken = {}
         for c in self.would_take(hook):
             taken[c] = self.take(hook, c)

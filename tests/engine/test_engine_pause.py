@@ -133,6 +133,18 @@ def test_a_step_starts_a_tick_hook_though_no_time_passes():
     assert bench.ran == ["t", "t"]
 
 
+def test_a_step_that_comes_before_the_node_has_initialised_starts_its_ticks_then():
+    late = Bench(tick("t", 1.0), connections=[wire(OUT)], is_registered=False)
+    late.engine.pause()
+    late.engine.step(1, is_driven=True)
+    assert late.register(OUT) == ["t"]
+
+    bench = Bench(initialise("begin", "x"), tick("t", 1.0), connections=[wire(IN)])
+    bench.engine.pause()
+    bench.engine.step(1, is_driven=True)
+    assert bench.packet(IN) + bench.settle() == ["begin", "t"]
+
+
 def test_a_pause_is_no_time_for_ticks():
     bench = Bench(tick("t", 1.0))
     bench.pass_time(1.0)
