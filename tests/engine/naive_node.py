@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any
 
-from neuros.hooks import HookKind, HookSpec, InputSpec
+from neuros.hooks import HookKind, HookSpec, InputSpec, OutputSpec
 from neuros.project.model import Connection
 
 Produce = Callable[[HookSpec, int], list[Any]]
@@ -32,6 +32,9 @@ class NaiveHook:
         self.executions = 0
         self.last_run_ns = 0
         self.starts_in_steps = 0
+        self.offers: list[tuple[Any, list[Any]]] | None = None
+        self.has_ended = False
+        self.is_in_last_round = False
         self.queue: dict[Connection, list[tuple[int, int, Any]]] = {
             c: [] for port in self.inputs for c in sources.get(port.name, [])
         }
@@ -61,6 +64,7 @@ class NaiveNode:
         for c in self.incoming:
             self.sources.setdefault(c.destination_input, []).append(c)
         self.hooks = [NaiveHook(spec, i, self.sources) for i, spec in enumerate(specs)]
+        self.all_hooks = list(self.hooks)
         self.registered = {c for c in self.outgoing if c.destination_node == name}
         self.sent = dict.fromkeys(self.outgoing, 0)
         self.acknowledged_by_receiver = dict.fromkeys(self.outgoing, 0)
@@ -75,6 +79,7 @@ class NaiveNode:
         self.paused_ns: int | None = None
         self.time_lost_ns = 0
         self.steps, self.is_driven = 0, True
+        self.is_draining = False
 
     # ---- events
 
@@ -109,7 +114,33 @@ class NaiveNode:
                 self.sim_time = time_of(packet)
         self.one_pass()
 
+    def offer(self, packets: dict[str, Any], number: int) -> None:
+        names = tuple(sorted(packets))
+        source = next(
+            (h for h in self.hooks if h.offers is not None and _outputs(h) == names), None
+        )
+        if source is None:
+            outputs = tuple(OutputSpec(name) for name in names)
+            spec = HookSpec(HookKind.FUNCTION, lambda: None, (), outputs)
+            source = NaiveHook(spec, len(self.all_hooks), {})
+            source.offers, source.has_ended = [], self.is_draining
+            self.hooks.append(source)
+            self.all_hooks.append(source)
+        assert source.offers is not None
+        source.offers.append((number, [packets[name] for name in names]))
+        self.one_pass()
+
+    def drain(self, last_round: Sequence[int]) -> None:
+        self.is_draining = True
+        for hook in self.all_hooks:
+            hook.is_in_last_round |= hook.place in last_round
+            is_main_loop = hook.spec.outputs and all(port.is_optional for port in hook.inputs)
+            hook.has_ended |= bool(is_main_loop) or hook.spec.period_s is not None
+        self.resume()
+
     def pause(self) -> None:
+        if self.is_draining:
+            return
         if self.paused_ns is None:
             self.paused_ns = self.now_ns()
         self.steps = 0
@@ -193,7 +224,9 @@ class NaiveNode:
         return now_ns - self.time_lost_ns
 
     def is_ready(self, hook: NaiveHook) -> bool:
-        if self.registered != set(self.outgoing):
+        if self.registered != set(self.outgoing) or hook.has_ended:
+            return False
+        if hook.offers is not None and not hook.offers:
             return False
         is_initialised = all(h.spec.kind is not HookKind.INITIALISE for h in self.hooks)
         if not is_initialised and hook.spec.kind is not HookKind.INITIALISE:
@@ -258,6 +291,7 @@ class NaiveNode:
             self.log.append(("acknowledge", str(c), position))
 
     def run(self, hook: NaiveHook) -> None:
+        hook.has_ended |= hook.is_in_last_round
         self.turn += 1
         hook.last_turn = self.turn
         if self.paused_ns is None:
@@ -280,10 +314,12 @@ class NaiveNode:
             else:
                 arguments.append(next((taken[c] for c in sources if c in taken), None))
         hook.executions += 1
-        self.log.append(("run", hook.spec.name, arguments, self.sim_time))
-        for port, packet in zip(
-            hook.spec.outputs, self.produce(hook.spec, hook.executions), strict=True
-        ):
+        if hook.offers is None:
+            self.log.append(("run", hook.spec.name, arguments, self.sim_time))
+            packets = self.produce(hook.spec, hook.executions)
+        else:
+            number, packets = hook.offers.pop(0)
+        for port, packet in zip(hook.spec.outputs, packets, strict=True):
             if packet is None:
                 continue
             for c in self.outgoing:
@@ -293,11 +329,17 @@ class NaiveNode:
                         self.events.append(("own packet", c, packet))
                     else:
                         self.log.append(("send", str(c), packet))
+        if hook.offers is not None:
+            self.log.append(("accepted", number))
         if hook.spec.kind is HookKind.INITIALISE:
             self.hooks.remove(hook)
             for c in hook.queue:
                 takers = self.takers(c)
                 self.acknowledge(c, min((h.position[c] for h in takers), default=self.arrived[c]))
+
+
+def _outputs(hook: NaiveHook) -> tuple[str, ...]:
+    return tuple(port.name for port in hook.spec.outputs)
 
 
 def time_of(packet: Any) -> Fraction:

@@ -19,10 +19,14 @@ from neuros.engine.hook import Hook
 from neuros.engine.sim_clock import with_clocks
 from neuros.hooks import All, HookSpec, Optional
 from neuros.project.model import Connection, Port
+from neuros.project.qos import DEPTH
 from neuros.time import to_stamp
 
 INPUTS, OUTPUTS, OTHERS = ("x", "y"), ("o", "p"), ("a", "b")
 PERIODS_S = (0.1, 0.25)
+TOPIC = "topic"
+EXTERNAL = Connection("", "", "node", TOPIC, queue_size=DEPTH)
+"""An external topic, as the naive node sees it."""
 
 
 class Written:
@@ -76,7 +80,7 @@ def nodes(draw: st.DrawFn) -> tuple[list[Connection], list[HookSpec]]:
         *(("node", o, b, "x") for o in OUTPUTS for b in OTHERS),
     ]
     chosen = draw(st.lists(st.sampled_from(ends), unique=True, min_size=1, max_size=6))
-    has_clock = draw(st.booleans())
+    has_clock, has_topic = draw(st.booleans()), draw(st.integers(0, 3)) == 0
     if has_clock:
         chosen.append(("world", "clock", "node", CLOCK))
     connections = [
@@ -84,12 +88,14 @@ def nodes(draw: st.DrawFn) -> tuple[list[Connection], list[HookSpec]]:
         for index, end in enumerate(chosen)
     ]
     connected = {c.destination_input for c in connections if c.destination_node == "node"}
+    connected |= {TOPIC} if has_topic else set()
     specs = []
     for number in range(draw(st.integers(1, 4))):
         takes_clock = [CLOCK] if has_clock and draw(st.integers(0, 3)) == 0 else []
         inputs = takes_clock + [
             draw(_wrapped(name, name in connected))
-            for name in draw(st.lists(st.sampled_from(INPUTS), unique=True))
+            for name in draw(st.lists(st.sampled_from((*INPUTS, TOPIC)), unique=True))
+            if name in (*INPUTS, *connected)
         ]
         outputs = [
             draw(st.sampled_from([name, Optional(name)]))
@@ -127,7 +133,8 @@ class Pair:
 
         self.clock = Clock()
         self.effects = Written(produce)
-        node = node_for("node", specs, connections)
+        has_topic = any(port.name == TOPIC for spec in specs for port in spec.inputs)
+        node = node_for("node", specs, connections, [TOPIC] if has_topic else [])
         ports = [
             replace(port, type="rosgraph_msgs/msg/Clock") if port.name == CLOCK else port
             for port in node.inputs
@@ -135,8 +142,10 @@ class Pair:
         node = replace(node, inputs=tuple(ports))
         self.engine = Engine(node, connections, with_clocks(node, specs), self.effects, self.clock)
         self.effects.engine = self.engine
-        self.naive = NaiveNode("node", connections, specs, produce, self.clock)
+        sources = [*connections, EXTERNAL] if has_topic else connections
+        self.naive = NaiveNode("node", sources, specs, produce, self.clock)
         self.inbound = [c for c in self.naive.incoming if c.source_node != "node"]
+        self.clocks = [c for c in self.inbound if c.destination_input == CLOCK]
         self.outbound = [c for c in self.naive.outgoing if c.destination_node != "node"]
         self.packets = 0
         self.sim_time_s = 0.0
@@ -144,9 +153,9 @@ class Pair:
     def step(self, kind: str, number: int) -> None:
         if kind == "packet" and self.inbound:
             self._packet(self.inbound[number % len(self.inbound)])
-        elif kind == "clock" and self.inbound and self.inbound[-1].destination_input == CLOCK:
+        elif kind == "clock" and self.clocks:
             self.sim_time_s = self.sim_time_s + number / 200 if number < 38 else 0.0
-            self._packet(self.inbound[-1])
+            self._packet(self.clocks[0])
         elif kind == "acknowledgement" and self.outbound:
             c = self.outbound[number % len(self.outbound)]
             self._both("on_acknowledgement", c, min(self.naive.sent[c], number // 4))
@@ -162,6 +171,14 @@ class Pair:
                 self._both("on_timer")
         elif kind == "pause":
             self._both(("pause", "resume")[number % 2])
+        elif kind == "offer" and self.engine.outputs:
+            self.packets += 1
+            names = [name for place, name in enumerate(OUTPUTS, 1) if (1 + number % 3) & place]
+            packets = {n: f"offer#{self.packets}" for n in names if n in self.engine.outputs}
+            self._offer(packets or dict.fromkeys(self.engine.outputs, "offer"), self.packets)
+        elif kind == "drain":
+            places = range(len(self.naive.all_hooks))
+            self._both("drain", [place for place in places if number >> place & 1])
         elif kind == "step":
             self._both("step", 1 + number % 3, is_driven=number % 4 > 0)
         elif kind == "posted" and self.naive.events:
@@ -178,7 +195,12 @@ class Pair:
         packet: Any = f"{c}#{self.packets}"
         if c.destination_input == CLOCK:
             packet = rosgraph_msgs.msg.Clock(clock=to_stamp(round(self.sim_time_s, 9)))
-        self._both("on_packet", c, packet)
+        self.engine.on_packet(TOPIC if c is EXTERNAL else c, packet)
+        self.naive.on_packet(c, packet)
+
+    def _offer(self, packets: dict[str, Any], number: int) -> None:
+        self.engine.offer(packets, lambda: self.effects.log.append(("accepted", number)))
+        self.naive.offer(packets, number)
 
     def _both(self, method: str, *arguments: Any, **options: Any) -> None:
         getattr(self.engine, method)(*arguments, **options)
@@ -197,7 +219,7 @@ class Pair:
             self._compare_books(c)
 
     def _compare_books(self, c: Connection) -> None:
-        subscription = self.engine.subscriptions[c]
+        subscription = self.engine.subscriptions[TOPIC if c is EXTERNAL else c]
         assert subscription.received == self.naive.arrived[c]
         assert (
             subscription.received
@@ -219,7 +241,7 @@ class Pair:
 
 kinds = ["packet"] * 5 + ["posted"] * 4
 kinds += ["acknowledgement", "acknowledge all", "time", "clock", "clock"] * 2
-kinds += ["pause", "step"]
+kinds += ["pause", "step", "offer"]
 steps = st.lists(
     st.tuples(st.sampled_from([*kinds, "registration"]), st.integers(0, 40)),
     min_size=10,
@@ -228,14 +250,22 @@ steps = st.lists(
 
 
 @settings(max_examples=250, deadline=None)
-@given(node=nodes(), steps=steps, gaps=st.integers(0, 3), is_registered_first=st.booleans())
-def test_the_engine_agrees_with_the_naive_node(node, steps, gaps, is_registered_first):
+@given(
+    node=nodes(),
+    steps=steps,
+    gaps=st.integers(0, 3),
+    is_registered_first=st.booleans(),
+    drained_at=st.integers(0, 100),
+)
+def test_the_engine_agrees_with_the_naive_node(node, steps, gaps, is_registered_first, drained_at):
     pair = Pair(*node, gaps)
     pair._both("start")
     if is_registered_first:
         for c in pair.outbound:
             pair.step("registration", pair.outbound.index(c))
-    for kind, number in steps:
+    for place, (kind, number) in enumerate(steps):
+        if place == drained_at:
+            pair.step("drain", number)
         pair.step(kind, number)
     runs = sum(entry[0] == "run" for entry in pair.naive.log)
     event("hooks ran: " + ("none" if not runs else "some" if runs < 10 else "many"))
