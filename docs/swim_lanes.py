@@ -10,7 +10,7 @@ It needs what WhiskEye needs. Run it where nothing else runs, and look at what i
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -54,6 +54,11 @@ def draw(name: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(RUNS)} (all)")
+    names = parser.parse_args().names or [*RUNS]
+    if unknown := [name for name in names if name not in RUNS]:
+        parser.error(f"there is no {unknown[0]}; there are {', '.join(RUNS)}")
     with tempfile.TemporaryDirectory() as folder:
-        for name in sys.argv[1:] or RUNS:
+        for name in names:
             draw(name, Path(folder) / name)
