@@ -163,8 +163,8 @@ def install() -> None:
     cycles = Cycles(Path(os.environ["NEUROS_CYCLES"]))
     load, make_context = node.load_plugin, ContextSwitch.make_context
 
-    def noting_hooks(plugin: Path, name: str) -> Sequence[HookSpec]:
-        return cycles.add(name, load(plugin, name))
+    def noting_hooks(plugin: Path, name: str, *rest: Any) -> Sequence[HookSpec]:
+        return cycles.add(name, load(plugin, name, *rest))
 
     def noting_context(self: ContextSwitch, environment: Mapping[str, str], *rest: Any) -> Context:
         context = make_context(self, environment, *rest)

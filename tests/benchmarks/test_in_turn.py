@@ -22,6 +22,11 @@ def switch() -> Any:
     return SimpleNamespace(**runpy.run_path(str(in_turn.SWITCH / "sitecustomize.py")))
 
 
+@pytest.mark.parametrize("part", ["ledger", "recording"])
+def test_all_that_is_taken_out_is_there(switch: Any, part: str) -> None:
+    assert not [name for owner, name in switch.PARTS[part]() if not hasattr(owner, name)]
+
+
 def test_without_its_books_a_connection_counts_and_notes_no_times(switch: Any) -> None:
     taken_out = switch.without_ledger()
     window: Any = SendWindow(Connection("a", "out", "b", "in_", 0))
