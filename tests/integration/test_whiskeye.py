@@ -69,6 +69,9 @@ def test_the_visualiser_writes_a_picture_a_table_and_the_error(hybrid):
         assert sum(bool(row[column]) for row in rows) == found[count]
     for connection, count in ((ESTIMATE, "estimates"), (TRUTH, "truths")):
         assert hybrid.connection(connection)["consumed"] == found[count]
+    true = [int(row["stamp_ns"]) for row in rows if row["truth_rad"]]
+    estimated = [int(row["stamp_ns"]) for row in rows if row["estimate_rad"]]
+    assert found["samples"] == sum(true[0] <= stamp <= true[-1] for stamp in estimated)
 
 
 def test_the_strict_variant_is_the_same_bit_for_bit_on_every_back_end(tmp_path):
