@@ -77,6 +77,9 @@ def test_what_grows_is_noticed() -> None:
     grown = Load("1-to-16", "process", lossless=10**6)
     judge_memory(grown, [600_000_000] * 30 + [730_000_000] * 170, processes=17)  # to its size
     assert grown.problems == []
+    waiting = [*[220_000_000] * 8, *[340_000_000] * 12]  # 16 of the largest, at times
+    judge_memory(grown, [*[340_000_000] * 10, *[220_000_000] * 190, *waiting], processes=17)
+    assert grown.problems == []
     assert list(latency_problems(latency([[1.0] * 500]))) == []
     slower = latency([[1.0] * 250 + [5.0] * 250])
     assert list(latency_problems(slower)) == ["latency grew from 1.00 to 5.00 ms"]
