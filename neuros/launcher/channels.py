@@ -125,14 +125,13 @@ class Channels:
     def send_to(self, link: ControlLink, message: Message) -> None:
         """Send to one; what does not go through now goes with the next, or :meth:`flush`.
 
-        What observers want and get is left out while too much waits; what ends a run never is.
+        What an observer looks at is left out while too much waits. What it waits for, or has sent
+        to a node, never is.
         """
         if link not in self._links:
             return
-        may_be_left_out = link not in self._nodes or isinstance(
-            message, control.Look | control.Deliver
-        )
-        if may_be_left_out and len(link.unsent) >= _MOST_UNSENT_BYTES:
+        is_full = len(link.unsent) >= _MOST_UNSENT_BYTES
+        if is_full and isinstance(message, control.Look | control.NodeStatus | control.LogRecord):
             return
         link.unsent += encode(message)
         link.flush()

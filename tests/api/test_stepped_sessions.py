@@ -21,7 +21,7 @@ import pytest
 from api_projects import ENDLESS, THROWER, dice
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64, String, UInt8MultiArray
 from test_python_api import thrown
 
 import neuros
@@ -75,6 +75,15 @@ def look(node):
     image = node.make_packet("image")
     image.data = bytes(4_000_000)
     return image
+"""
+SEER = """
+from neuros.hooks import Optional, neuros_function
+
+@neuros_function(inputs=[Optional("image"), Optional("command")], outputs="seen")
+def see(node, image, command):
+    seen = node.make_packet("seen")
+    seen.data = -1.0 if command is None or image is None else command.data
+    return seen
 """
 BRAIN = """
 from neuros.hooks import neuros_function
@@ -435,6 +444,26 @@ def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_
         run = s._live.wait(DEADLINE_S)
     assert run.exit_code == 130
     assert run.nodes["eye"]["report"] == "final"
+
+
+@pytest.mark.filterwarnings("ignore:.*of node 'seer' is not connected")
+@pytest.mark.parametrize("backend", ["in-process", "process"])
+def test_packets_that_are_sent_at_once_are_all_there_however_large(
+    tmp_path: Path, backend: str
+) -> None:
+    inputs = [port("image", "std_msgs/msg/UInt8MultiArray"), port("command")]
+    seer = {"name": "seer", "plugin": "seer.py", "container": "neuros_python"}
+    (tmp_path / "seer.py").write_text(SEER)
+    nodes = [{**seer, "inputs": inputs, "outputs": [port("seen")]}]
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": nodes}))
+    found = []
+    with neuros.Project.from_file(tmp_path).session(backend=backend) as s:
+        for number in range(5):
+            s.send("seer.image", UInt8MultiArray(data=bytes(2_000_000)))
+            s.send("seer.command", Float64(data=float(number)))
+            s.step(timeout_s=DEADLINE_S)
+            found.append(s["seer.seen"].packet.data)
+    assert found == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 def test_the_program_is_interrupted_in_a_step_and_goes_on(held: Session) -> None:

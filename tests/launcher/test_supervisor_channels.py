@@ -13,14 +13,20 @@ import pytest
 from neuros.backends.control_sockets import UnixListener, connect
 from neuros.control import (
     TO_NODES,
+    TO_OBSERVERS,
+    Deliver,
     End,
+    Ended,
     Explanation,
     Failed,
     Hello,
+    LogRecord,
     Look,
     LookAll,
     Probe,
+    Settled,
     Stop,
+    WasReset,
     Watch,
 )
 from neuros.control.link import ControlLink, kind_of
@@ -57,6 +63,17 @@ def kinds(channels: Channels) -> list[Any]:
         "refused" if isinstance(message, ControlError) else kind_of(type(message))
         for _, message in channels.receive()
     ]
+
+
+def received(channels: Channels, node: Node, until: Any) -> list[Any]:
+    """What arrives there, up to a message, or within 5 s."""
+    got: list[Any] = []
+    node.socket.settimeout(0.1)
+    deadline_s = time.monotonic() + 5.0
+    while until not in got and time.monotonic() < deadline_s:
+        got += node.receive() or []
+        channels.flush()
+    return got
 
 
 def test_what_was_said_before_hanging_up_is_heard_in_one_go(channels: Channels, node: Node) -> None:
@@ -224,9 +241,35 @@ def test_the_end_of_a_run_reaches_a_node_to_which_much_is_to_be_sent(
     for _ in range(300):
         channels.send(Look({"a": {"x" * 10_000: {}}}, 1))
     channels.send(Stop())
-    got: list[Any] = []
-    node.socket.settimeout(5.0)
-    while Stop() not in got:
-        got += node.receive() or []
-        channels.flush()
+    got = received(channels, node, until=Stop())
+    assert got[-1] == Stop()
     assert len(got) < 300, "what observers want is left out"
+
+
+def test_what_a_session_sends_reaches_a_node_to_which_much_is_to_be_sent(
+    channels: Channels, node: Node
+) -> None:
+    node.send(Hello(("a",)))
+    assert kinds(channels) == ["hello"]
+    packets = [Deliver("a", "image", letter * 2_000_000) for letter in "xyz"]
+    for packet in packets:
+        channels.send_to_node("a", packet)
+    assert received(channels, node, until=packets[-1]) == packets
+
+
+def test_an_observer_that_reads_late_misses_records_and_not_what_it_waits_for(
+    channels: Channels, tmp_path: Path
+) -> None:
+    observer = Node(tmp_path)
+    observer.accept(TO_OBSERVERS)
+    observer.send(Watch())
+    ((link, _),) = channels.receive()
+    for _ in range(300):
+        channels.send_to(link, LogRecord("INFO", "x" * 10_000))
+    answers = [Settled(1, {}, {}), WasReset(""), Ended(0, "done", {}, 1.0, None, True)]
+    for answer in answers:
+        channels.send_to(link, answer)
+    got = received(channels, observer, until=answers[-1])
+    assert got[-3:] == answers
+    assert 0 < len(got) - 3 < 300
+    observer.close()
