@@ -129,8 +129,7 @@ class Outcome:
         name = report.node
         if not self.has_final_report(name):
             self.reports[name] = report
-            if report.fault and report.fault not in self.faults:
-                self.faults.append(report.fault)
+            self.faults += [each for each in report.faults if each not in self.faults]
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 

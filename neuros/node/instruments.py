@@ -77,6 +77,9 @@ class NodeRecorder:
     Args:
         encode: serialises a packet.
         sim_time_s: the simulated time of the node, ``None`` where it owns none.
+
+    Attributes:
+        failure: why nothing more is recorded, ``None`` while all is well.
     """
 
     def __init__(
@@ -90,6 +93,7 @@ class NodeRecorder:
         self._encode = encode
         self._sim_time_s = sim_time_s
         self._logger = logger
+        self.failure: str | None = None
 
     def attach(self, tap: Tap) -> None:
         """Keep the packets there, if they are recorded."""
@@ -108,6 +112,7 @@ class NodeRecorder:
             self._recorder.keep(stream, data or self._encode(packet), self._sim_time_s())
         except OSError as error:
             self.close()
+            self.failure = f"its packets are not recorded to the end: {error.strerror}"
             self._logger.error(
                 f"its packets are not recorded from now on: {error.strerror}; the run goes on"
             )

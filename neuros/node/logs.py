@@ -144,19 +144,23 @@ _ASKER = -1  # observers have numbers from 1
 
 
 class WorldLog:
-    """Writes the world of one node, about once per second. ``folder`` is the node's own."""
+    """Writes the world of one node, about once per second. ``folder`` is the node's own.
+
+    Attributes:
+        failure: why nothing more is written, ``None`` while all is well.
+    """
 
     def __init__(self, folder: Path, logger: Logger) -> None:
         self._file = folder / WORLD_LOG
         self._logger = logger
         self._version: str | None = None
-        self._is_broken = False
+        self.failure: str | None = None
         self._lock = threading.Lock()
 
     def write(self, look: WorldLook) -> None:
         """Add the frames since the last time. Any thread; what fails ends the log, not the run."""
         with self._lock:
-            if self._is_broken:
+            if self.failure is not None:
                 return
             try:
                 seen = dict(look({"frames": True}, _ASKER))
@@ -166,5 +170,5 @@ class WorldLog:
                 with self._file.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(seen) + "\n")
             except Exception as error:
-                self._is_broken = True
+                self.failure = f"its world is not recorded to the end: {error}"
                 self._logger.warning(f"the world is not recorded any more: {error}")

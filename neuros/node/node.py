@@ -129,7 +129,8 @@ class NodeRuntime:
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
-            file, middleware, self._transport, self._time, sampler, clock, world_log
+            *(file, middleware, self._transport, self._time, sampler, clock),
+            *(self._recorder, world_log),
         )
         node, tap = file.node, self._effects.tap
         arrivals = {

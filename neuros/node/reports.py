@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -11,6 +11,7 @@ from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeSt
 from neuros.engine.engine import Engine
 from neuros.engine.snapshot import explain, snapshot, steadily
 from neuros.hooks import HookKind, HookSpec
+from neuros.node.instruments import NodeRecorder
 from neuros.node.logs import PacketLog, WorldLog
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
@@ -33,6 +34,7 @@ class NodeReports:
     _time: SimulatedTime
     _sampler: Sampler
     _clock: Callable[[], int]
+    _recorder: NodeRecorder | None = None
     _world_log: WorldLog | None = None
     _engine: Engine | None = None
     _packet_log: PacketLog | None = None
@@ -90,11 +92,18 @@ class NodeReports:
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
             "stack": self._stack(metrics),
-            "fault": None if self._packet_log is None else self._packet_log.failure,
+            "faults": tuple(self._faults()),
             "foreign": {name: n for name, n in self._transport.foreign.items() if n},
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
         }
+
+    def _faults(self) -> Iterator[str]:
+        if self._packet_log is not None and self._packet_log.failure is not None:
+            yield self._packet_log.failure
+        for part in (self._recorder, self._world_log):
+            if part is not None and part.failure is not None:
+                yield f"node '{self._file.node.name}': {part.failure}"
 
     def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
         """The stack of the plugin, if its hook runs for long, or the node is to end."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import shutil
 import signal
@@ -257,6 +258,39 @@ def test_a_spool_that_cannot_be_written_ends_no_experiment(troubled: Finished) -
     assert "200 of 200 packets of /neuros/relay/total/sink/total/data are not" in troubled.output
     assert recorded(troubled)[NUMBER]["recorded"] == 200
     assert troubled.connection("relay.total -> sink.total")["consumed"] == 200
+
+
+TALK = """
+import resource
+from neuros.hooks import neuros_initialise, neuros_tick
+
+@neuros_initialise()
+def start(node):
+    node.set_user_data(0)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+
+@neuros_tick(seconds=0.005, outputs="word")
+def say(node):
+    node.set_user_data(node.get_user_data() + 1)
+    if node.get_user_data() == 50:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+    if node.get_user_data() == 100:
+        node.shutdown("all is said")
+    word = node.make_packet("word")
+    word.data = "x" * 10_000
+    return word
+"""
+
+
+def test_packets_of_an_external_topic_that_are_not_recorded_are_said(tmp_path: Path) -> None:
+    word = {"name": "word", "type": "std_msgs/msg/String", "external_topic": "/word"}
+    talk = {"name": "talk", "container": "neuros_python", "plugin": "talk.py", "outputs": [word]}
+    (tmp_path / "talk.py").write_text(TALK)
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [talk]}))
+    run = launch(tmp_path, "-r", "-t", "/word", cwd=tmp_path, timeout_s=TIMEOUT_S)
+    assert run.exit_code == 4
+    assert run.said("neuros")[-1].startswith("node 'talk': its packets are not recorded to the end")
+    assert 0 < recorded(run)["/word"]["recorded"] < 100
 
 
 # ------------------------------------------------------------------ SIGKILL
