@@ -30,7 +30,7 @@ from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import RunningNode
 
 STOP_S = 5.0
-"""What nodes have for their finalise hooks and for flushing, in all."""
+"""What a node has for its finalise hooks and for flushing, in all."""
 
 # Reading where nodes stand begins so long before they are killed, and may hold that up for so long.
 _READ_EARLY_S, _READ_S = 1.0, 0.5
@@ -95,6 +95,15 @@ class Shutdown:
         if self.phase is Phase.RUNNING:
             self._begun.update(names)
         return self.phase is Phase.RUNNING
+
+    def note_finalising(self, node: str, hook: str | None) -> None:
+        """A node finalises; one that shares its process has its time from when its turn comes."""
+        is_next = not self._declarations.is_finalising(node)
+        self._declarations.note_finalising(node, hook)
+        process = self._processes.with_node(node)
+        is_beside_others = process is not None and len(process.names) > 1
+        if self.phase is Phase.STOPPING and is_next and is_beside_others:
+            self._deadline_s = time.monotonic() + STOP_S
 
     def counts_failure_of(self, name: str) -> bool:
         """Whether it matters that a node fails: not if it was killed as the run ended well."""
@@ -205,9 +214,17 @@ class Shutdown:
         late = [name for name in process.names if not self._outcome.has_final_report(name)]
         unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
         why = "; ".join(unfinished) or "its process did not end"
-        self._outcome.fail(
-            f"{nodes_of(process)} had to be killed {STOP_S:g} s after the end began: {why}"
-        )
+        at_it = self._finalising_in(process)
+        who = f"node '{at_it}'" if at_it else nodes_of(process)
+        since = "it began to finalise" if at_it else "the end began"
+        self._outcome.fail(f"{who} had to be killed {STOP_S:g} s after {since}: {why}")
+
+    def _finalising_in(self, process: RunningNode) -> str:
+        """The node that keeps the others of its process waiting while it finalises; else empty."""
+        if len(process.names) == 1:
+            return ""
+        at_it = filter(self._declarations.is_finalising, process.names)
+        return next((name for name in at_it if not self._outcome.has_final_report(name)), "")
 
     def _unfinished(self, name: str, now_s: float) -> list[str]:
         """Clauses about a node that has not made its final report."""
@@ -251,6 +268,8 @@ class Shutdown:
         for process in processes:
             self._processes.kill(process)
         for process, texts, read in stood:
+            if at_it := self._finalising_in(process):  # others may be of the same plugin
+                texts = {name: text for name, text in texts.items() if name == at_it}
             for name, text in texts.items():
                 self._output.log("ERROR", f"{name} was at this point when it was killed:\n{text}")
             if not texts and read.threads:

@@ -202,7 +202,7 @@ class Supervisor:
                 self._declarations.take(message)
                 self._detector.note_loaded(message.node)
             case control.Finalising(node, hook):
-                self._declarations.note_finalising(node, hook)
+                self._shutdown.note_finalising(node, hook)
             case control.FirstHook():
                 if self.outcome.started_s is None:
                     self.outcome.started_s = time.monotonic()

@@ -107,7 +107,7 @@ class NodeProcess:
             self._guard(self._live)
             for node in self._nodes:
                 self._guard(functools.partial(node.finalise, runs_hooks=self._has_begun))
-            self._guard(lambda: self.report(is_final=True))
+                self._guard(functools.partial(self._report_last, node))
             self._guard(self._peers.close)
             if self._middleware is not None:
                 self._guard(self._middleware.flush)
@@ -187,11 +187,15 @@ class NodeProcess:
         if self._steps is not None:
             self._steps.wake()
 
-    def report(self, *, is_final: bool = False) -> None:
+    def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
             node.reports.write_logs()
-            self._tell(node.reports.report(is_final=is_final))
+            self._tell(node.reports.report())
+
+    def _report_last(self, node: NodeRuntime) -> None:
+        node.reports.write_logs()
+        self._tell(node.reports.report(is_final=True))
 
     def _probe(self, number: int) -> None:
         """Report the state of all nodes at one moment."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from ending_bench import RELAY, SINK, Bench, assert_ended, last_line, made_bench
+from ending_bench import ENDS, RELAY, SINK, SOURCE, Bench, assert_ended, last_line, made_bench
 from endings import KEEP_THE_GIL, RUNS
 from launching import BACKENDS
 
@@ -84,14 +84,34 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
 
 
 def test_so_is_one_whose_finalise_hook_hangs_though_all_else_went_well(tmp_path: Path) -> None:
+    """In process it alone is to blame: not one before it, nor those that wait behind it."""
     with made_bench(tmp_path, "in-process") as bench:
-        bench.project(a=RUNS + HANGS, b=RUNS)
+        bench.project(good=RUNS, a=RUNS + HANGS, b=RUNS)
+        finished = bench.launch("--duration", "0.5")
         assert_ended(
-            bench.launch("--duration", "0.5"),
+            finished,
             1,
-            "nodes 'a' and 'b' had to be killed 5 s after the end began: finalise hook 'close' of"
+            "node 'a' had to be killed 5 s after it began to finalise: finalise hook 'close' of"
             " 'a' did not finish; finalise hook 'save' of 'b' did not run",
         )
+        assert "in close\n" in finished.record["nodes"]["a"]["stack"]
+
+
+TAKES_2_S = """
+@neuros_finalise()
+def close(node):
+    threading.Event().wait(2.0)
+"""
+
+
+def test_each_node_has_its_five_seconds_and_its_counters_are_complete(bench: Bench) -> None:
+    """In process as elsewhere, though the three of them take 6 s there."""
+    bench.project("a.o -> c.x", a=SOURCE + ENDS + TAKES_2_S, b=RUNS + TAKES_2_S, c=SINK + TAKES_2_S)
+    finished = bench.launch()
+    assert_ended(finished, 0, "a ended the project: enough")
+    assert bench.saved("a", "b", "c")
+    counted = finished.connection("a.o -> c.x")
+    assert counted["sent"] == counted["received"] == counted["consumed"] > 0
 
 
 def test_two_ctrl_c_while_hooks_finalise_are_no_good_end(bench: Bench) -> None:
