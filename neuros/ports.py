@@ -285,6 +285,9 @@ class NodeContext(Protocol):
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
 
+    def note_simulated_time(self) -> bool:
+        """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
+
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at a simulated world; see :mod:`neuros.simulators.mujoco.scene`."""
 

@@ -81,6 +81,13 @@ class PluginServices:
             except BaseException as error:  # the others must still be closed
                 self._failures.report(as_node_error(error, "failed while it was closed: "))
 
+    def note_time(self) -> bool:
+        """Simulated time has gone on in another thread; returns whether it is not over."""
+        is_over = self.time.is_over
+        if is_over:
+            self._loop.post_from_thread(lambda: self._failures.guard(self.time.look))
+        return not is_over
+
     def fail_from_thread(self, error: BaseException) -> None:
         """End the project with an error that happened outside the hooks."""
         self._loop.post_from_thread(lambda: self._failures.report(error))
@@ -297,6 +304,10 @@ class NodeHandle:
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
         self._services.time.own(read_s)
+
+    def note_simulated_time(self) -> bool:
+        """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
+        return self._services.note_time()
 
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at a simulated world, as the dashboard does."""

@@ -42,6 +42,7 @@ class SimulatedTime:
         self._is_owned = False
         self.expected_end_s: float | None = None
         self._duration_s = duration_s if node.owns_time else None
+        self._has_told = False
         self._clock = clock
         self._on_over = on_over
         self._timeline = Timeline()
@@ -94,15 +95,22 @@ class SimulatedTime:
         if self.is_watched:
             self.look()
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the duration has passed. Any thread."""
+        if self._duration_s is None or (time_s := self.now_s) is None:
+            return False
+        return time_s >= self._duration_s - 1e-9
+
     def look(self) -> None:
         """It may have gone on; it may be over."""
         time_s = self.now_s
         if time_s is None:
             return
         self._timeline.note(time_s, self._clock() / 1e9)
-        if self._duration_s is not None and time_s >= self._duration_s - 1e-9:
-            duration_s, self._duration_s = self._duration_s, None
-            self._on_over(duration_s)
+        if self._duration_s is not None and self.is_over and not self._has_told:
+            self._has_told = True
+            self._on_over(self._duration_s)
 
     def report(self, now_ns: int) -> dict[str, Any]:
         """The time, and the points ``(simulated, wall)`` since this was last asked. Any thread."""

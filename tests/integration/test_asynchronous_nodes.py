@@ -37,6 +37,13 @@ def explode(node):
     with sim.paused():
         sim.data.joint("j").qvel[0] = 1e300
 """
+OBEYS = """
+from neuros.hooks import neuros_function
+
+@neuros_function(inputs="torque")
+def obey(node, torque):
+    node.get_user_data().command("torque", torque)
+"""
 THREAD = """
 import threading
 from neuros.hooks import neuros_finalise, neuros_initialise
@@ -178,6 +185,24 @@ def test_a_run_ends_drained_while_the_stepping_is_blocked(run, tmp_path):
     assert ended.exit_code == 0, ended.output
     assert counts(ended) == (1, 1, 0, 0, 0)
     assert ended.record["sim_s"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("has_sensor", [True, False], ids=["a rare sensor", "no sensor"])
+def test_a_simulated_duration_is_kept_whatever_the_simulator_sends(run, tmp_path, has_sensor):
+    pytest.importorskip("mujoco")
+    motor = '<actuator><motor name="m" joint="j" gear="1 0 0 0 0 0"/></actuator></mujoco>'
+    (tmp_path / "robot.py").write_text(ROBOT.replace("</mujoco>", motor) + OBEYS)
+    robot = {"name": "robot", "container": "neuros_mujoco", "plugin": "robot.py"}
+    torque = {"name": "torque", "type": FLOAT, "external_topic": "/nobody/publishes/this"}
+    robot["inputs"] = [torque | {"mujoco": {"actuator": "m"}}]
+    if has_sensor:
+        rare = {"name": "out", "type": CLOCK, "mujoco": {"sensor": "clock", "rate": 0.1}}
+        robot["outputs"] = [rare]
+    written(tmp_path, [robot], [])
+    ended = run("--duration", "1sim")
+    assert ended.exit_code == 0, ended.output
+    assert ended.output.splitlines()[-1].endswith("robot ended the project: 1 s of simulated time")
+    assert ended.record["sim_s"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_an_error_in_the_stepping_thread_ends_the_project_with_its_cause(run, tmp_path):

@@ -93,6 +93,7 @@ class SimulatedNode:
         self.closers: list[Callable[[], None]] = []
         self.failures: list[BaseException] = []
         self.read_time_s: Callable[[], float] = lambda: -1.0
+        self.ends_at_s = float("inf")
         self.look_at_world: WorldLook | None = None
 
     def make_packet(self, output: str) -> Any:
@@ -110,6 +111,9 @@ class SimulatedNode:
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         self.read_time_s = read_s
+
+    def note_simulated_time(self) -> bool:
+        return self.read_time_s() < self.ends_at_s
 
     def show_world(self, look: WorldLook) -> None:
         self.look_at_world = look

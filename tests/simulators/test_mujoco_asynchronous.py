@@ -204,6 +204,15 @@ def test_an_error_in_the_thread_fails_the_node(tmp_path, monkeypatch):
     sim.stop()
 
 
+def test_stepping_ends_with_the_time_of_the_run_though_nothing_is_sent():
+    node = SimulatedNode({})
+    node.ends_at_s = 1.0
+    sim = MuJoCo(node, WORLD)
+    sim.run_asynchronous(None)
+    node.wait_until(lambda: not sim.is_running)
+    assert sim.sim_time == pytest.approx(1.0, abs=0.03)
+
+
 @pytest.mark.parametrize("factor", [0, -1, float("inf"), float("nan")])
 def test_a_real_time_factor_is_positive(factor, node):
     with pytest.raises(ModelError, match="real_time_factor is positive or None"):

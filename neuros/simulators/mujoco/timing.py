@@ -229,7 +229,8 @@ class FreeRun:
     """Repeats: a bout of steps, wait for the wall clock, hand over the packets that are due.
 
     Handing over waits while a reliable connection is blocked, and stepping with it; model and data
-    are free for visitors of the lock meanwhile. An error ends the node.
+    are free for visitors of the lock meanwhile. An error ends the node. It ends by itself when the
+    simulated time of the run is over.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -298,4 +299,5 @@ class FreeRun:
         finally:
             self._lock.leave()
         self.pacer.hold(self._sim_time())
-        return not packets or self._node.submit(packets, cancelled)
+        may_go_on = not packets or self._node.submit(packets, cancelled)
+        return may_go_on and self._node.note_simulated_time()
