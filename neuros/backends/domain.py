@@ -74,11 +74,8 @@ def choose_domain(
     ``EnvironmentFault`` if all domains are taken.
     """
     folder = folder or _shared_folder()
-    text = environ.get("ROS_DOMAIN_ID", "").strip()
-    if explicit is not None:
-        return _told(_valid(str(explicit), "-d/--domain-id"), "-d", folder)
-    if text:
-        return _told(_valid(text, "ROS_DOMAIN_ID"), "ROS_DOMAIN_ID", folder)
+    if (given := given_domain(explicit, environ)) is not None:
+        return _told(given, "ROS_DOMAIN_ID" if explicit is None else "-d", folder)
     if has_external_topics_or_partial:
         return _told(0, "default, where other ROS nodes are", folder)
     ports = _udp_ports()
@@ -91,6 +88,18 @@ def choose_domain(
         f"all ROS domains from {AUTOMATIC[0]} to {AUTOMATIC[-1]} are in use on this machine: end "
         "other runs, or choose one with -d/--domain-id"
     )
+
+
+def given_domain(explicit: int | None, environ: Mapping[str, str]) -> int | None:
+    """The domain that a user asks for: ``explicit``, else ``ROS_DOMAIN_ID``; else ``None``.
+
+    Raises:
+        UsageError: for an id that is none.
+    """
+    text = environ.get("ROS_DOMAIN_ID", "").strip()
+    if explicit is not None:
+        return _valid(str(explicit), "-d/--domain-id")
+    return _valid(text, "ROS_DOMAIN_ID") if text else None
 
 
 def _told(domain: int, reason: str, folder: Path) -> DomainLock:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import signal
 import sys
@@ -15,10 +14,11 @@ from types import FrameType
 from neuros.api.loading import workspaces_of
 from neuros.api.plan import are_made, make_environments
 from neuros.backends.pythons import Pythons
-from neuros.errors import UsageError
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import message_cache
 from neuros.project.model import NodeFile
+from neuros.recording.run_file import read_object
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -111,9 +111,10 @@ def find_messages_of(run: Path) -> None:
     """Let this very process find the packages of a run, given its folder or its bag."""
     for folder in (run, run.parent):
         for file in folder.glob("*/node.json"):
-            with suppress(OSError, ValueError):
-                content = json.loads(file.read_text("utf-8"))
-                entries = (Path(path).parent.name for path in content.get("messages", ()))
+            with suppress(OSError, EnvironmentFault):
+                listed = read_object(file).get("messages")
+                told = listed if isinstance(listed, list) else []
+                entries = (Path(path).parent.name for path in told if isinstance(path, str))
                 paths = [str(message_cache(os.environ) / entry / "python") for entry in entries]
                 sys.path[:0] = [path for path in paths if path not in sys.path]
             return

@@ -6,6 +6,7 @@ import argparse
 import atexit
 import faulthandler
 import json
+import math
 import os
 import shutil
 import sys
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from neuros.project.model import NodeFile
     from neuros.replay.replayed_node import ReplayedNode
 
+
+_LEAST_RATE, _LONGEST_DELAY_S = 1e-6, 1e6
+_HIGHEST_PORT = (1 << 16) - 1
 
 EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
 
@@ -112,6 +116,8 @@ def add_replayed(replayed: argparse.ArgumentParser) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
+    if options.debugpy is not None and not 0 < options.debugpy <= _HIGHEST_PORT:
+        raise UsageError(f"replay: --debugpy must be a port from 1 to {_HIGHEST_PORT}")
     if options.node is not None:
         return _replay_node(options)
     if options.pdb or options.debugpy is not None or options.output is not None:
@@ -121,12 +127,18 @@ def _replay(options: argparse.Namespace) -> int:
             "replay: name a node to run again (--node NAME), or what to publish (--topic NAME, or"
             " --topic '*' for all)"
         )
-    if not options.rate > 0 or options.delay < 0 or options.wait_matching_subscriptions < 0:
-        raise UsageError("replay: --rate must be above 0; --delay and -w must be 0 or more")
+    if not _LEAST_RATE <= options.rate < math.inf:
+        raise UsageError(f"replay: --rate must be {_LEAST_RATE:g} or more, and finite")
+    if not 0 <= options.delay <= _LONGEST_DELAY_S:
+        raise UsageError(f"replay: --delay must be from 0 to {_LONGEST_DELAY_S:g} s")
+    if options.wait_matching_subscriptions < 0:
+        raise UsageError("replay: -w must be 0 or more")
+    from neuros.backends.domain import given_domain
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
     from neuros.transport.ros_topics import RosTopic, play
 
+    domain_id = given_domain(options.domain_id, os.environ)
     find_messages_of(Path(options.run))
     with open_bag(options.run) as bag:
         if bag.damage is not None:
@@ -143,7 +155,7 @@ def _replay(options: argparse.Namespace) -> int:
             rate=options.rate,
             delay_s=options.delay,
             subscriptions=options.wait_matching_subscriptions,
-            domain_id=options.domain_id,
+            domain_id=domain_id,
         )
     print(f"{sent} packets on {len(chosen)} topics")
     return 0

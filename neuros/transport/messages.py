@@ -11,12 +11,14 @@ so that its constructor runs once.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import re
 import warnings
 from array import array
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias, cast
 
 import numpy
 from rclpy.type_support import check_for_type_support
@@ -28,6 +30,8 @@ from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import checker
 
+_TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9_]*)")
+
 
 @cache
 def message_class(type_name: str) -> type:
@@ -36,21 +40,35 @@ def message_class(type_name: str) -> type:
     Raises:
         EnvironmentFault: if its package is not installed or has no such message.
     """
-    package, _, name = type_name.replace("/", ".").rpartition(".")
+    named = _TYPE_NAME.fullmatch(type_name)
+    if named is None:
+        raise EnvironmentFault(f"{type_name!r} is not a message type: write package/msg/Name")
+    package, name = named.groups()
     try:
+        _require_messages(package)
         with imports_when_used():
-            found = getattr(importlib.import_module(package), name)
-    except (ImportError, AttributeError) as error:
+            found = getattr(importlib.import_module(f"{package}.msg"), name)
+        with warnings.catch_warnings():
+            # What ROS loads for its first message uses a module that Python calls deprecated.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            check_for_type_support(found)
+    except (ImportError, AttributeError, ValueError) as error:
         raise EnvironmentFault(
             f"message type {type_name} cannot be imported here ({error}): is its package"
             " installed in this node's container?"
         ) from error
-    assert isinstance(found, type)
-    with warnings.catch_warnings():
-        # What ROS loads for its first message uses a module that Python calls deprecated.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        check_for_type_support(found)
-    return found
+    return cast(type, found)
+
+
+def _require_messages(package: str) -> None:
+    """Raise ``ImportError`` for what is no message package, without importing it.
+
+    Bags, and other programs in the ROS domain, name types, too.
+    """
+    spec = importlib.util.find_spec(package)
+    folders = (spec and spec.submodule_search_locations) or ()
+    if not any(Path(folder, "msg").is_dir() for folder in folders):
+        raise ImportError(f"no message package named '{package}'")
 
 
 def checked(port: Port, packet: Any) -> Any:

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import rclpy
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node as RosNode
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from neuros.errors import EnvironmentFault
 from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
@@ -26,6 +28,8 @@ _LAST_S = 5.0
 _POLL_S = 0.01
 # A connection's own depth goes with acknowledgements, which a player does not get.
 _DEPTH = 1000
+_LONGEST_SLEEP_S = 3600.0  # times of a damaged bag may be centuries apart
+_DEEPEST = (1 << 31) - 1  # DDS has 32 bits for it
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,17 @@ class Listener:
         self.stop()
 
 
+def _check(topic: RosTopic) -> None:
+    """Raise ``EnvironmentFault`` for a topic that cannot be published: a bag may say anything."""
+    try:
+        validate_full_topic_name(topic.name)
+    except InvalidTopicNameException as error:
+        why = " ".join(str(error).splitlines()[0].split())
+        raise EnvironmentFault(f"topic {topic.name!r} cannot be published: {why}") from None
+    if not 0 <= topic.depth <= _DEEPEST:
+        raise EnvironmentFault(f"topic {topic.name} cannot be published with depth {topic.depth}")
+
+
 def play(
     topics: Sequence[RosTopic],
     packets: Iterable[tuple[int, str, bytes]],
@@ -151,9 +166,11 @@ def play(
         subscriptions: how many every topic must have before that, however long it takes.
 
     Raises:
-        EnvironmentFault: if a message type is not installed here.
+        EnvironmentFault: if a message type is not installed here, or a topic cannot be published.
     """
     kinds = [message_class(topic.type) for topic in topics]
+    for topic in topics:
+        _check(topic)
     os.environ.setdefault(RANGE_VARIABLE, "LOCALHOST")
     context = _context(domain_id)
     node = LeanNode("neuros_replay", context)
@@ -170,9 +187,9 @@ def play(
         start_s, first_ns = time.monotonic(), None
         for at_ns, name, data in packets:
             first_ns = at_ns if first_ns is None else first_ns
-            wait_s = start_s + (at_ns - first_ns) / 1e9 / rate - time.monotonic()
-            if wait_s > 0:
-                time.sleep(wait_s)
+            due_s = start_s + (at_ns - first_ns) / 1e9 / rate
+            while (wait_s := due_s - time.monotonic()) > 0:
+                time.sleep(min(wait_s, _LONGEST_SLEEP_S))
             publishers[name].handle.publish_raw(data)
             count += 1
         for publisher in publishers.values():
