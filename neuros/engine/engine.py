@@ -107,7 +107,7 @@ class Engine:
         self._lifecycle = Lifecycle(self._schedule, self.send_windows, clock)
         self._sources: dict[tuple[str, ...], Source] = {}
         self._ticks = [h for h in self.all_hooks if h.spec.kind is HookKind.TICK]
-        self._pause = Pause(self._lifecycle, self._ticks)
+        self._pause = Pause(self._lifecycle, self._ticks, lambda: self._arrivals)
         self._has_posted_loop_back = False
         self._is_passing = False
         self.executing: Hook | None = None

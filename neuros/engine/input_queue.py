@@ -291,6 +291,13 @@ class HookInput:
             queue.subscription.is_external and not queue.packets for queue in self.queues
         )
 
+    def has_waited(self, arrival: int) -> bool:
+        """Whether what it needs of an external topic had come by then."""
+        return self.is_optional or not any(
+            queue.subscription.is_external and queue.packets and queue.packets[0][0] > arrival
+            for queue in self.queues
+        )
+
     def chosen(self) -> InputQueue | None:
         """For a plain input: the queue whose oldest packet has waited longest."""
         if len(self.queues) == 1:

@@ -245,16 +245,24 @@ class Pause:
     A step of a synchronous simulation is one start of each hook that drives it: one that needs no
     packet (a main loop, a tick, the thread of a simulator). The other hooks answer what they
     receive, until nothing is left to answer. In a project that nothing drives (two players and a
-    ball), each hook starts once.
+    ball), each hook starts once. The world outside does not pause: what it sends after a step has
+    begun waits for the next one, else there would always be something to answer.
 
     Ticks have a time of their own, which stands still meanwhile: none is missed by a pause.
+
+    Args:
+        arrivals: how many packets have arrived at the node.
 
     Attributes:
         is_on: whether the node is paused.
     """
 
-    def __init__(self, lifecycle: Lifecycle, ticks: Sequence[Hook]) -> None:
+    def __init__(
+        self, lifecycle: Lifecycle, ticks: Sequence[Hook], arrivals: Callable[[], int]
+    ) -> None:
         self._lifecycle = lifecycle
+        self._arrivals = arrivals
+        self._arrived = 0
         self._ticks = ticks
         self._since_ns = 0
         self._granted = 0
@@ -286,6 +294,7 @@ class Pause:
         """Allow further steps; ``is_driven``: some node of the project has hooks that drive."""
         if self.is_on:
             self._granted += steps
+            self._arrived = self._arrivals()
             self._limits_all = not is_driven
 
     def wake_ticks(self) -> None:
@@ -300,7 +309,7 @@ class Pause:
             return True
         if self._limits_all or drives(hook):
             return self._started.get(hook, 0) < self._granted
-        return self._granted > 0
+        return self._granted > 0 and all(port.has_waited(self._arrived) for port in hook.inputs)
 
     def cause_of_rest(self, candidates: Iterable[Hook]) -> Rest:
         """``PAUSED``, or ``SCHEDULING`` if a hook of a step is about to start."""
@@ -310,6 +319,8 @@ class Pause:
     def note_start(self, hook: Hook) -> None:
         """A hook starts while the node is paused."""
         started = self._started[hook] = self._started.get(hook, 0) + 1
+        if drives(hook):
+            self._arrived = self._arrivals()
         if hook.period_ns:
             hook.is_due = started < self._granted
 

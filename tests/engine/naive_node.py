@@ -79,6 +79,7 @@ class NaiveNode:
         self.paused_ns: int | None = None
         self.time_lost_ns = 0
         self.steps, self.is_driven = 0, True
+        self.arrivals_by_step = 0
         self.is_draining = False
 
     # ---- events
@@ -157,6 +158,7 @@ class NaiveNode:
         if self.paused_ns is not None:
             self.steps += count
             self.is_driven = is_driven
+            self.arrivals_by_step = self.arrivals
         self.one_pass()
 
     def posted_event(self) -> None:
@@ -212,11 +214,18 @@ class NaiveNode:
         """By a pause, and its steps."""
         if self.paused_ns is None or hook.spec.kind is HookKind.INITIALISE:
             return True
-        is_tick = hook.spec.period_s is not None
-        drives = is_tick or all(port.is_optional for port in hook.inputs)
-        if drives or not self.is_driven:
+        if self.drives(hook) or not self.is_driven:
             return hook.starts_in_steps < self.steps
-        return self.steps > 0
+        return self.steps > 0 and all(
+            port.is_optional or queue[0][0] <= self.arrivals_by_step
+            for port in hook.inputs
+            for c in self.sources.get(port.name, [])
+            if (queue := hook.queue[c]) and not c.source_node  # an external topic
+        )
+
+    def drives(self, hook: NaiveHook) -> bool:
+        is_tick = hook.spec.period_s is not None
+        return is_tick or all(port.is_optional for port in hook.inputs)
 
     def node_time_ns(self) -> int:
         """Time stands still while the node is paused."""
@@ -298,6 +307,8 @@ class NaiveNode:
             hook.last_run_ns = self.node_time_ns()
         else:
             hook.starts_in_steps += 1
+            if hook.spec.kind is not HookKind.INITIALISE and self.drives(hook):
+                self.arrivals_by_step = self.arrivals
         taken = {}
         for c in self.would_take(hook):
             taken[c] = self.take(hook, c)

@@ -70,6 +70,37 @@ def test_in_a_step_hooks_answer_all_that_they_receive():
     assert [bench.packet(IN) for _ in range(3)] == [["f"]] * 3
 
 
+def test_what_comes_from_outside_after_a_step_has_begun_waits_for_the_next_one():
+    bench = Bench(function("f", "x"), external_inputs=["x"])
+    bench.engine.pause()
+    for _ in range(2):
+        assert bench.packet("x") == []
+    bench.engine.step(1, is_driven=True)
+    bench.settle()
+    assert bench.ran == ["f", "f"]
+    for _ in range(2):
+        assert bench.packet("x") == []
+    bench.engine.step(1, is_driven=True)
+    bench.settle()
+    assert bench.ran == ["f"] * 4
+
+
+def test_of_several_steps_each_begins_with_a_start_of_a_hook_that_drives():
+    bench = Bench(
+        function("step", outputs="o", returns="reading"),
+        function("f", "x"),
+        connections=[wire(OUT, 0)],
+        external_inputs=["x"],
+    )
+    bench.engine.pause()
+    bench.engine.step(2, is_driven=True)  # its receiver is behind
+    assert bench.packet("x") == []
+    bench.acknowledge_to_node(OUT, 1)
+    bench.settle()
+    assert bench.ran == ["step", "step", "f"]
+    assert bench.packet("x") == []
+
+
 def test_where_nothing_drives_the_project_each_hook_starts_once_per_step():
     bench = Bench(function("f", "x"), connections=[wire(IN, 0, queue_size=3)])
     bench.engine.pause()
