@@ -61,6 +61,7 @@ class SessionLink:
         self._arrivals.register(supervisor)
         self._unsent: list[tuple[str, str, bytes]] = []
         self._number = self._answered = 0
+        self._is_due = False  # whether the nodes have still to answer a step
 
     def send(self, message: Message) -> None:
         """Send to the supervisor, behind all that was sent before."""
@@ -69,7 +70,7 @@ class SessionLink:
 
     def deliver(self, node: str, input_name: str, content: bytes) -> None:
         """Send a packet, with the next step at the latest."""
-        if self._nodes is None:
+        if self._nodes is None or self._is_due:
             self._supervisor.send(Deliver(node, input_name, base64.b64encode(content).decode()))
             return
         self._unsent.append((node, input_name, content))
@@ -97,6 +98,8 @@ class SessionLink:
 
         if not self.wait_for(is_answer, end_s):
             return None
+        if self._is_due:  # a step that was given up, and may have begun late
+            return self.settle(known, end_s) if self._hear_answer(end_s) else None
         self._answered = self._number
         if self._nodes is None:
             with contextlib.suppress(OSError):  # they are in several processes, or out of reach
@@ -114,6 +117,9 @@ class SessionLink:
     ) -> Advanced | None:
         """Go on by rounds, then wait until nothing moves.
 
+        While an answer of the nodes is due (a step was given up), this goes by the supervisor, as
+        all else that is said: the nodes may write that answer, and do not read meanwhile.
+
         Args:
             known: outputs to show, and the number of the newest known packet.
             end_s: as for :meth:`wait_for`, whose errors it raises.
@@ -121,24 +127,14 @@ class SessionLink:
         Returns:
             ``None`` if the run has ended.
         """
-        if self._nodes is None:
+        if self._nodes is None or self._is_due:
             return self.settle(known, end_s, rounds=rounds)
         self._number += 1
         self._send_to(self._nodes, rounds, known)
-        while self._nodes is not None:
-            is_over = False
-            for number in self._ready(end_s):
-                if number == self._supervisor.fileno():
-                    is_over = self._hear_supervisor(lambda _: False) is not None
-                    continue
-                for answer in self._hear_nodes():
-                    if answer.number == self._number:
-                        self._answered = answer.number
-                        return answer
-            if is_over:
-                return None
-        self.wait_for(lambda _: False, end_s)  # the supervisor says why they have gone
-        return None
+        answer = self._hear_answer(end_s)
+        if answer is not None:
+            self._answered = answer.number
+        return answer
 
     def wait_for(self, is_wanted: Callable[[Message], bool], end_s: float | None) -> bool:
         """Until such a message comes from the supervisor; ``False`` once the run has ended.
@@ -156,11 +152,11 @@ class SessionLink:
     def leave_nodes(self) -> None:
         """Send what waits, and hear the nodes no more: none waits for its answer to be read."""
         if self._nodes is not None:
-            if self._unsent:
+            if self._unsent and not self._is_due:
                 self._send_to(self._nodes, 0, {})
             self._arrivals.unregister(self._nodes)
             self._nodes.close()
-            self._nodes = None
+            self._nodes, self._is_due = None, False
 
     def close(self) -> None:
         """Hang up."""
@@ -184,19 +180,37 @@ class SessionLink:
             is_over = is_over or isinstance(message, Ended)
         return False if is_over else None
 
+    def _hear_answer(self, end_s: float | None) -> Advanced | None:
+        """What the nodes answer; ``None`` if the run has ended."""
+        while self._nodes is not None:
+            is_over = False
+            for number in self._ready(end_s):
+                if number == self._supervisor.fileno():
+                    is_over = self._hear_supervisor(lambda _: False) is not None
+                elif answers := self._hear_nodes():
+                    return answers[0]
+            if is_over:
+                return None
+        self.wait_for(lambda _: False, end_s)  # the supervisor says why they have gone
+        return None
+
     def _hear_nodes(self) -> list[Advanced]:
+        """The answer to the last step, once it has come."""
         assert self._nodes is not None
         answers = self._nodes.receive()
         if answers is None:
             self.leave_nodes()
-        return answers or []
+            return []
+        self._is_due = self._is_due and not answers
+        return answers
 
     def _catch_up(self) -> None:
         """Wait for the nodes: what they are told on two ways comes in any order."""
-        if self._nodes is not None and (self._unsent or self._answered != self._number):
+        if self._nodes is not None and self._unsent:
             self.advance(0, {}, None)
 
     def _send_to(self, nodes: StepLink[Advanced], rounds: int, known: Mapping[str, int]) -> None:
+        self._is_due = True
         nodes.send(Advance(self._number, rounds, known, tuple(self._unsent)))
         self._unsent.clear()
 

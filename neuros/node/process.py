@@ -81,7 +81,9 @@ class NodeProcess:
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
-        self._settling: control.Settle | Advance | None = None
+        self._asked: control.Settle | None = None
+        self._step: Advance | None = None
+        self._is_settling = False
         self._has_begun = self._is_draining = self._has_been_reset = False
         self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
@@ -143,8 +145,8 @@ class NodeProcess:
             self._probe(message.number)
             return
         if isinstance(message, control.Settle):
-            self._settling = message
-            self._settle(message)
+            self._asked = message
+            self._begin_settling()
             return
         if isinstance(message, control.Reset):
             self._reset(message.variables)
@@ -209,7 +211,7 @@ class NodeProcess:
 
     def _advance(self, step: Advance) -> None:
         """Do a step of the session, if the run is not at its end."""
-        self._settling = step
+        self._step = step
         for name, input_name, content in step.packets:
             if name not in self._by_name:
                 raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
@@ -219,31 +221,38 @@ class NodeProcess:
             is_driven = any(engine.is_driving for engine in engines)
             for node in self._nodes:
                 node.step(step.rounds, is_driven=is_driven)
-        self._settle(step)
+        self._begin_settling()
 
-    def _settle(self, asked: control.Settle | Advance) -> None:
+    def _begin_settling(self) -> None:
+        if not self._is_settling:
+            self._is_settling = True
+            self._settle()
+
+    def _settle(self) -> None:
         """Answer once no event waits: a hook that may start has a loop-back waiting.
 
-        Of several questions the last one counts, else each would wait for the other.
+        This is one event for the supervisor and the session, else each would wait for the other.
+        Of several questions of the supervisor the last one counts.
         """
         assert self._middleware is not None
         loop = self._middleware.loop
-        if asked is not self._settling:
-            if isinstance(asked, Advance) and isinstance(self._settling, control.Settle):
-                assert self._steps is not None
-                loop.post_loop_back(self._steps.take)  # a later step of it is heard all the same
-            return
         if loop.has_waiting_events or not loop.has_taken_in:
-            loop.post_loop_back(lambda: self._settle(asked))
-        elif isinstance(asked, control.Settle):
-            if not self.is_ending:
-                self._tell(_at_rest(self._nodes, asked))
-        elif not (self._is_draining or self.is_ending):  # else the supervisor tells of the end
+            loop.post_loop_back(self._settle)
+            return
+        asked, step = self._asked, self._step
+        self._asked = self._step = None
+        self._is_settling = False
+        if step is not None and not (self._is_draining or self.is_ending):
             for node in self._nodes:
                 node.pause()  # takes back what hooks could not use of a step
             assert self._steps is not None
-            self._steps.answer(asked, self._by_name)
-            loop.post_loop_back(self._steps.take)
+            self._steps.answer(step, self._by_name)
+            if asked is None:
+                loop.post_loop_back(self._steps.take)
+            else:
+                self._steps.watch()  # what the supervisor says next comes before the next step
+        if asked is not None and not self.is_ending:  # else the supervisor tells of the end
+            self._tell(_at_rest(self._nodes, asked))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
         """Bring all nodes back to their start, once no event waits, if they can be."""

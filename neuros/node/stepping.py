@@ -58,10 +58,10 @@ class SessionSteps:
             self._selector.unregister(self._listener)
             self._link = StepLink(stream, Advance, "the session")
             self._arrivals.register(stream)
-            self._watch()
+            self.watch()
         return True
 
-    def _watch(self) -> None:
+    def watch(self) -> None:
         """Let the control thread wait, which may be in ``epoll_wait`` meanwhile: that is allowed.
 
         Once that thread has ended, its selector is closed, and the run at its end.
@@ -89,7 +89,7 @@ class SessionSteps:
         if self._waker in arrived or not arrived:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._waker)
-            self._watch()
+            self.watch()
             return
         steps = self._link.receive()
         if steps is None:

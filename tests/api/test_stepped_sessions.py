@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import re
@@ -66,6 +67,19 @@ def steer(node, wheels):
         raise RuntimeError("a wheel has broken")
     place, steps = node.get_user_data() or (1.0, 0)
     node.set_user_data((place + wheels.data, steps))
+"""
+ECHO = """
+import time
+from neuros.hooks import neuros_function, Optional
+
+@neuros_function(inputs=Optional("image"), outputs="image")
+def look(node, image):
+    while not (node.run_dir / "go").exists():
+        time.sleep(0.05)
+    if image is None:
+        image = node.make_packet("image")
+        image.data = bytes(1_000_000)
+    return image
 """
 EYE = """
 from neuros.hooks import neuros_tick
@@ -141,6 +155,17 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     project = neuros.Project.from_file(cart(folder))
     with project.session(backend="in-process", output=folder / "run") as s:
         yield s
+
+
+@contextlib.contextmanager
+def ended_at_the_deadline(s: Session) -> Iterator[None]:
+    """Whatever hangs in there fails instead, since the run is interrupted."""
+    timer = threading.Timer(DEADLINE_S, s._live.interrupt)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def poses(s: Session, rounds: int) -> list[float]:
@@ -418,6 +443,29 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         (s.folder / "brain" / "go").touch()
         s.step(timeout_s=DEADLINE_S)
         assert s["robot.pose"].count == 2
+
+
+@pytest.mark.filterwarnings("ignore:.*'image' of node 'brain' is not connected")
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_each_other(
+    tmp_path: Path, back_end: str
+) -> None:
+    """Each is larger than the buffers between them: who only writes waits for who only writes."""
+    images = [port("image", "std_msgs/msg/UInt8MultiArray")]
+    brain = {"name": "brain", "plugin": "brain.py", "container": "neuros_python"}
+    (tmp_path / "brain.py").write_text(ECHO)
+    nodes = [{**brain, "inputs": images, "outputs": images}]
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": nodes}))
+    project = neuros.Project.from_file(tmp_path)
+    with project.session(backend=back_end) as s, ended_at_the_deadline(s):
+        assert s["brain.image"].count == 0
+        with pytest.raises(TimeoutError):
+            s.step(timeout_s=0.1)
+        s.send("brain.image", UInt8MultiArray(data=b"\1" * 1_000_000))
+        (s.folder / "brain" / "go").touch()
+        assert s.step(timeout_s=DEADLINE_S)
+        assert s["brain.image"].count == 2
+        assert s["brain.image"].packet.data[-1] == 1
 
 
 @pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
