@@ -130,7 +130,8 @@ class Session:
 
         Raises:
             RunError: if it has failed, or had ended before.
-            TimeoutError: if it takes longer; what goes on is waited for by the next step.
+            TimeoutError: if it takes longer; what goes on is waited for by the next step, but not by
+                :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`.
             UsageError: for ``sim_s`` where no node owns simulated time, and for a length that is
                 negative or not finite.
         """
@@ -219,7 +220,8 @@ class Session:
 
     def _has_come_to_rest(self) -> bool:
         try:
-            return self._advance(0)
+            # A round that was given up may go on for ever: it ends as a free run does.
+            return self.run(duration_s=0.0) if self._link.is_behind else self._advance(0)
         except RunError:
             return False
 
@@ -278,7 +280,8 @@ class Session:
 
         with self._lock:
             self._check_running()
-            self._advance(0)  # what was sent has arrived then
+            if not self._link.is_behind:  # else a round goes on, perhaps for ever
+                self._advance(0)  # what was sent has arrived then
             self._link.send(LookAll({}))
             if not self._wait_for(is_last, None):
                 self._check_running()

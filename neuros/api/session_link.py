@@ -63,6 +63,11 @@ class SessionLink:
         self._number = self._answered = 0
         self._is_due = False  # whether the nodes have still to answer a step
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether a step was given up, and nothing has come to rest since."""
+        return self._answered != self._number
+
     def send(self, message: Message) -> None:
         """Send to the supervisor, behind all that was sent before."""
         self._catch_up()

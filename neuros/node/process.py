@@ -152,6 +152,8 @@ class NodeProcess:
             self._reset(message.variables)
             return
         self._is_draining = self._is_draining or isinstance(message, control.Drain)
+        if isinstance(message, control.Resume):
+            self._give_up_settling()
         for node in self._nodes:
             match message:
                 case control.Drain(last_round):
@@ -228,6 +230,14 @@ class NodeProcess:
             self._is_settling = True
             self._settle()
 
+    def _give_up_settling(self) -> None:
+        """The run goes on freely: where it came to rest, an answer would hold it again."""
+        step, self._asked, self._step = self._step, None, None
+        if step is not None:
+            assert self._steps is not None
+            self._steps.answer(step, self._by_name)
+            self._steps.watch()
+
     def _settle(self) -> None:
         """Answer once no event waits: a hook that may start has a loop-back waiting.
 
@@ -236,10 +246,11 @@ class NodeProcess:
         """
         assert self._middleware is not None
         loop = self._middleware.loop
-        if loop.has_waiting_events or not loop.has_taken_in:
+        asked, step = self._asked, self._step
+        self._is_settling = asked is not None or step is not None
+        if self._is_settling and (loop.has_waiting_events or not loop.has_taken_in):
             loop.post_loop_back(self._settle)
             return
-        asked, step = self._asked, self._step
         self._asked = self._step = None
         self._is_settling = False
         if step is not None and not (self._is_draining or self.is_ending):

@@ -35,7 +35,9 @@ from neuros.errors import ProjectError, RunError, UsageError
 from neuros.launcher.supervisor import Supervisor
 
 # The input that a test pushes the robot by.
-pytestmark = pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*'(push|clock|wind)' of node '(robot|left)' is not connected"
+)
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = [
     "in-process",
@@ -99,6 +101,24 @@ def see(node, image, command):
     seen.data = -1.0 if command is None or image is None else command.data
     return seen
 """
+PLAYER = """
+from neuros.hooks import neuros_function, neuros_initialise, Optional
+
+@neuros_initialise(outputs=Optional("ball"))
+def serve(node):
+    return node.make_packet("ball") if node.name == "left" else None
+
+@neuros_function(inputs="ball", outputs="ball")
+def play(node, ball):
+    return ball
+"""
+REFEREE = """
+from neuros.hooks import neuros_tick
+
+@neuros_tick(seconds=0.01)
+def watch(node):
+    pass
+"""
 BRAIN = """
 from neuros.hooks import neuros_function
 
@@ -140,6 +160,30 @@ def cart(folder: Path) -> Path:
     }
     (made / "project.json").write_text(json.dumps(project, indent=1))
     return made
+
+
+def rally(folder: Path) -> Path:
+    """Two players and a ball between them that a referee watches by the clock: it never rests."""
+    (folder / "player.py").write_text(PLAYER)
+    (folder / "referee.py").write_text(REFEREE)
+    ball = [port("ball")]
+    players = {"left": [port("ball"), port("wind")], "right": ball}
+    nodes: list[dict[str, Any]] = [
+        {"name": name, "plugin": "player.py", "inputs": inputs, "outputs": ball}
+        for name, inputs in players.items()
+    ]
+    nodes.append({"name": "referee", "plugin": "referee.py"})
+    ends = ("left", "right"), ("right", "left")
+    keys = ("source_node", "source_output", "destination_node", "destination_input")
+    project = {
+        "nodes": [{**node, "container": "neuros_python"} for node in nodes],
+        "connections": [
+            {**dict(zip(keys, (a, "ball", b, "ball"), strict=True)), "discard_limit": 0}
+            for a, b in ends
+        ],
+    }
+    (folder / "project.json").write_text(json.dumps(project))
+    return folder
 
 
 @pytest.fixture(autouse=True)
@@ -466,6 +510,28 @@ def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_
         assert s.step(timeout_s=DEADLINE_S)
         assert s["brain.image"].count == 2
         assert s["brain.image"].packet.data[-1] == 1
+
+
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_a_round_that_never_ends_hinders_nothing_but_steps(tmp_path: Path, back_end: str) -> None:
+    project = neuros.Project.from_file(rally(tmp_path))
+    with project.session(backend=back_end) as s, ended_at_the_deadline(s):
+        for _ in range(2):
+            with pytest.raises(TimeoutError):
+                s.step(timeout_s=0.2)
+        counters = s.state()["left"].counters
+        assert counters is not None
+        assert counters.metrics["hooks"]["play"]["executions"] > 1
+        for number in range(100):
+            s.send("left.wind", Float64(data=float(number)))
+        assert s.run(duration_s=0.1)
+        before = s["left.ball"].count
+        assert s.run(duration_s=0.1)
+        assert s["left.ball"].count > before
+        with pytest.raises(TimeoutError):
+            s.step(timeout_s=0.2)
+        s.reset()
+        assert s["left.ball"].count == 1
 
 
 @pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
