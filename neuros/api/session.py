@@ -46,6 +46,7 @@ from neuros.transport.messages import RosPackets, checked
 _CONNECT_S = 0.01
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
+_MOST_VARIATION = 2.0
 
 
 class Session:
@@ -130,8 +131,8 @@ class Session:
 
         Raises:
             RunError: if it has failed, or had ended before.
-            TimeoutError: if it takes longer; what goes on is waited for by the next step, but not by
-                :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`.
+            TimeoutError: if it takes longer; what goes on is waited for by the next step, but not
+                by :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`.
             UsageError: for ``sim_s`` where no node owns simulated time, and for a length that is
                 negative or not finite.
         """
@@ -361,16 +362,24 @@ class Session:
             yield from (None for _ in range(rounds))
 
     def _run_sim(self, duration_s: float) -> bool:
+        """Grant many rounds at once, but so few that none begins after the end.
+
+        Nodes that are stepped without the supervisor know the end, too. For the others: rounds may
+        gain different times, so they are taken to gain up to twice the most of so far on average,
+        and what is left is halved again and again.
+        """
         end_s = self._sim_now() + duration_s
-        count, at_rest = 1, 0
+        count, at_rest, most_s = 1, 0, 0.0
         while (now_s := self._sim_now()) < end_s - _FINE:
-            if not self._advance(count):
+            if not self._advance(count, end_sim_s=end_s - _FINE):
                 return False
             gained_s = self._sim_now() - now_s
             at_rest = 0 if gained_s > 0 else at_rest + 1
             self._check_progress(at_rest)
+            most_s = max(most_s, gained_s / count)
             if gained_s > 0:
-                count = max(1, int((end_s - self._sim_now()) / gained_s * count * (1 - _FINE)))
+                safe = int((end_s - self._sim_now()) / (_MOST_VARIATION * most_s))
+                count = max(1, min(2 * count, safe))
         return True
 
     def _sim_now(self) -> float:
@@ -388,9 +397,11 @@ class Session:
                 " does a hook wait for an input that the session has to send?"
             )
 
-    def _advance(self, rounds: int, end_s: float | None = None) -> bool:
+    def _advance(
+        self, rounds: int, end_s: float | None = None, end_sim_s: float | None = None
+    ) -> bool:
         """Go on by rounds, and wait until nothing moves; whether the run goes on."""
-        return self._note(self._link.advance(rounds, self._known, end_s))
+        return self._note(self._link.advance(rounds, self._known, end_s, end_sim_s))
 
     def _settle(self) -> bool:
         """Wait until nothing moves, after what was said to the supervisor."""

@@ -118,7 +118,11 @@ class SessionLink:
         return Advanced(self._number, found[0].sim_times, packets)
 
     def advance(
-        self, rounds: int, known: Mapping[str, int], end_s: float | None
+        self,
+        rounds: int,
+        known: Mapping[str, int],
+        end_s: float | None,
+        end_sim_s: float | None = None,
     ) -> Advanced | None:
         """Go on by rounds, then wait until nothing moves.
 
@@ -128,6 +132,8 @@ class SessionLink:
         Args:
             known: outputs to show, and the number of the newest known packet.
             end_s: as for :meth:`wait_for`, whose errors it raises.
+            end_sim_s: no round begins at this simulated time; only where steps go straight to the
+                nodes.
 
         Returns:
             ``None`` if the run has ended.
@@ -135,7 +141,7 @@ class SessionLink:
         if self._nodes is None or self._is_due:
             return self.settle(known, end_s, rounds=rounds)
         self._number += 1
-        self._send_to(self._nodes, rounds, known)
+        self._send_to(self._nodes, rounds, known, end_sim_s)
         answer = self._hear_answer(end_s)
         if answer is not None:
             self._answered = answer.number
@@ -214,9 +220,15 @@ class SessionLink:
         if self._nodes is not None and self._unsent:
             self.advance(0, {}, None)
 
-    def _send_to(self, nodes: StepLink[Advanced], rounds: int, known: Mapping[str, int]) -> None:
+    def _send_to(
+        self,
+        nodes: StepLink[Advanced],
+        rounds: int,
+        known: Mapping[str, int],
+        end_sim_s: float | None = None,
+    ) -> None:
         self._is_due = True
-        nodes.send(Advance(self._number, rounds, known, tuple(self._unsent)))
+        nodes.send(Advance(self._number, rounds, known, tuple(self._unsent), end_sim_s))
         self._unsent.clear()
 
 

@@ -35,28 +35,32 @@ class Advance(NamedTuple):
         rounds: so many steps.
         known: outputs whose packets are asked for, and the number of the newest known packet.
         packets: node, input and content of each packet of the session.
+        end_sim_s: a simulated time at which no further step begins; each step waits for the one
+            before then.
     """
 
     number: int
     rounds: int
     known: Mapping[str, int]
     packets: Sequence[tuple[str, str, bytes]]
+    end_sim_s: float | None = None
 
     def to_frame(self) -> bytes:
         """The message as bytes."""
         sizes = [(node, name, len(content)) for node, name, content in self.packets]
         contents = [content for *_, content in self.packets]
-        return _frame([self.number, self.rounds, self.known, sizes], contents)
+        return _frame([self.number, self.rounds, self.known, sizes, self.end_sim_s], contents)
 
     @classmethod
     def from_frame(cls, head: Any, body: bytes) -> Advance:
         """The message of a frame. Raises ``ValueError`` or ``TypeError``."""
-        number, rounds, known, sizes = head
+        number, rounds, known, sizes, end_sim_s = head
         _require(int, number, rounds, *known.values())
+        _require(float, *(() if end_sim_s is None else (end_sim_s,)))
         _require(str, *(text for *texts, _ in sizes for text in texts))
         parts = _split(body, [size for *_, size in sizes])
         packets = [(node, name, part) for (node, name, _), part in zip(sizes, parts, strict=True)]
-        return cls(number, rounds, known, packets)
+        return cls(number, rounds, known, packets, end_sim_s)
 
 
 class Advanced(NamedTuple):

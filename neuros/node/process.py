@@ -213,17 +213,29 @@ class NodeProcess:
 
     def _advance(self, step: Advance) -> None:
         """Do a step of the session, if the run is not at its end."""
-        self._step = step
         for name, input_name, content in step.packets:
             if name not in self._by_name:
                 raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
             self._by_name[name].deliver(input_name, content)
-        if step.rounds:
+        self._begin_rounds(step)
+        self._begin_settling()
+
+    def _begin_rounds(self, step: Advance) -> None:
+        """Begin those of a step, or the next one where it ends at a time."""
+        count = step.rounds if step.end_sim_s is None else min(step.rounds, 1)
+        self._step = step._replace(rounds=step.rounds - count)
+        if count:
             engines = [node.engine for node in self._nodes if node.engine is not None]
             is_driven = any(engine.is_driving for engine in engines)
             for node in self._nodes:
-                node.step(step.rounds, is_driven=is_driven)
-        self._begin_settling()
+                node.step(count, is_driven=is_driven)
+
+    def _goes_on(self, step: Advance) -> bool:
+        """Whether further rounds of a step are to begin."""
+        if not step.rounds or step.end_sim_s is None:
+            return False
+        times = (node.sim_time for node in self._nodes)
+        return max((s for s in times if s is not None), default=0.0) < step.end_sim_s
 
     def _begin_settling(self) -> None:
         if not self._is_settling:
@@ -251,18 +263,24 @@ class NodeProcess:
         if self._is_settling and (loop.has_waiting_events or not loop.has_taken_in):
             loop.post_loop_back(self._settle)
             return
+        is_over = self._is_draining or self.is_ending  # then the supervisor tells of the end
+        if step is not None and not is_over:
+            for node in self._nodes:
+                node.pause()  # takes back what hooks could not use of a round
+            if self._goes_on(step):
+                self._begin_rounds(step)
+                loop.post_loop_back(self._settle)
+                return
         self._asked = self._step = None
         self._is_settling = False
-        if step is not None and not (self._is_draining or self.is_ending):
-            for node in self._nodes:
-                node.pause()  # takes back what hooks could not use of a step
+        if step is not None and not is_over:
             assert self._steps is not None
             self._steps.answer(step, self._by_name)
             if asked is None:
                 loop.post_loop_back(self._steps.take)
             else:
                 self._steps.watch()  # what the supervisor says next comes before the next step
-        if asked is not None and not self.is_ending:  # else the supervisor tells of the end
+        if asked is not None and not self.is_ending:
             self._tell(_at_rest(self._nodes, asked))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:

@@ -101,6 +101,19 @@ def see(node, image, command):
     seen.data = -1.0 if command is None or image is None else command.data
     return seen
 """
+LEAPS = """
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="clock")
+def step(node):
+    rounds = (node.get_user_data() or 0) + 1
+    node.set_user_data(rounds)
+    clock = node.make_packet("clock")
+    if rounds > 30:  # of 1 ms each
+        clock.clock.sec, rounds = 100 * (rounds - 30), 30
+    clock.clock.nanosec = rounds * 1_000_000
+    return clock
+"""
 PLAYER = """
 from neuros.hooks import neuros_function, neuros_initialise, Optional
 
@@ -118,6 +131,20 @@ from neuros.hooks import neuros_tick
 @neuros_tick(seconds=0.01)
 def watch(node):
     pass
+"""
+READINGS = """
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="clock")
+def step(node):
+    # To the next reading of joints (50 Hz) or of a camera (30 Hz); a second has 300 parts.
+    part = (node.get_user_data() or 0) + 1
+    while part % 6 and part % 10:
+        part += 1
+    node.set_user_data(part)
+    clock = node.make_packet("clock")
+    clock.clock.sec, clock.clock.nanosec = divmod(part * 10**9 // 300, 10**9)
+    return clock
 """
 BRAIN = """
 from neuros.hooks import neuros_function
@@ -160,6 +187,15 @@ def cart(folder: Path) -> Path:
     }
     (made / "project.json").write_text(json.dumps(project, indent=1))
     return made
+
+
+def eye(folder: Path, plugin: str) -> Path:
+    """A node that has the time of a simulator."""
+    clock = [port("clock", "rosgraph_msgs/msg/Clock")]
+    node = {"name": "eye", "plugin": "eye.py", "container": "neuros_python", "outputs": clock}
+    (folder / "eye.py").write_text(plugin)
+    (folder / "project.json").write_text(json.dumps({"nodes": [node]}))
+    return folder
 
 
 def rally(folder: Path) -> Path:
@@ -423,6 +459,27 @@ def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
     end_s = held.sim_time + 1.0
     assert held.run(duration_sim_s=1.0)
     assert held.sim_time == pytest.approx(end_s)
+
+
+@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
+    tmp_path: Path, back_end: str
+) -> None:
+    with neuros.Project.from_file(eye(tmp_path, READINGS)).session(backend=back_end) as s:
+        for rounds in range(1, 8):
+            s.step(rounds, timeout_s=DEADLINE_S)
+            assert s.sim_time is not None
+            end_s = s.sim_time + 1.0
+            assert s.run(duration_sim_s=1.0)
+            assert s.sim_time == pytest.approx(end_s)
+
+
+@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
+def test_in_process_no_round_of_a_free_run_begins_after_its_end(tmp_path: Path) -> None:
+    with neuros.Project.from_file(eye(tmp_path, LEAPS)).session(backend="in-process") as s:
+        assert s.run(duration_sim_s=2.0)
+        assert s.sim_time == pytest.approx(100.03)
 
 
 def test_a_free_run_of_wall_time_is_held_again(held: Session) -> None:
