@@ -429,6 +429,11 @@ class Settling:
         self._pause_s, self._last = 0.0, None
         self._begin_round()
 
+    def give_up(self, asker: ControlLink) -> None:
+        """This one lets the run go on, and waits for no answer any more."""
+        if asker is self._asker:
+            self._asker = self._due_s = None
+
     def take(self, answer: control.AtRest) -> None:
         """Take an answer of a process, perhaps to the last round."""
         if answer.number != self._round or self._asker is None:

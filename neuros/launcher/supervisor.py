@@ -224,6 +224,9 @@ class Supervisor:
             case control.AtRest():
                 if self._shutdown.phase is Phase.RUNNING:  # else the session hears of the end
                     self._settling.take(message)
+            case control.Resume():
+                self._settling.give_up(link)
+                self.observers.take(link, message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
             case _:

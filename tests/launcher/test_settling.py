@@ -165,3 +165,21 @@ def test_nodes_that_have_not_begun_are_waited_for(asked: Asked) -> None:
     settling.look()
     settling.take(AtRest(("a", "b"), asked.rounds[-1].number, True, {}, {}, {}, {}))
     assert asked.told
+
+
+def test_who_lets_the_run_go_on_is_answered_no_more_and_holds_it_no_more(asked: Asked) -> None:
+    now_s = 0.0
+    settling = Settling(["a"], cast(Channels, asked), lambda: now_s)
+    settling.ask(SESSION, Settle(1, {}))
+    not_begun = AtRest(("a",), asked.rounds[-1].number, False, {}, {}, {}, {})
+    settling.take(not_begun)
+    settling.give_up(cast(ControlLink, object()))
+    now_s += settling.wait_s + 1.0
+    settling.look()
+    assert len(asked.rounds) == 2
+    settling.give_up(SESSION)
+    settling.take(AtRest(("a",), asked.rounds[-1].number, True, {}, {}, {}, {}))
+    now_s += 1.0
+    settling.look()
+    assert len(asked.rounds) == 2
+    assert not asked.told
