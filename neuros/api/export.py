@@ -21,8 +21,9 @@ import json
 import os
 import re
 import shutil
+import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
@@ -36,12 +37,13 @@ from neuros.api.request import ExportOptions
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
-from neuros.errors import UsageError
+from neuros.errors import Problem, ProjectError, UsageError
 from neuros.executors.executor import JobResources
 from neuros.executors.slurm import slurm_script
 from neuros.options import options_of
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
+from neuros.project.scanner import display_name
 from neuros.project.split import split, translated
 from neuros.project.suggest import did_you_mean
 
@@ -59,6 +61,8 @@ _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
+_MOST_LINKED = 100_000
+_INSTEAD = "put a copy in place of the link, or remove it"
 # What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
 
@@ -176,14 +180,16 @@ class Export:
         """Write the folder; returns the file for the engine.
 
         Raises:
+            ProjectError: if the project has links or files that may not go into an image.
             UsageError: if the folder is taken or cannot be written, or a node needs what it
                 cannot have there.
         """
         form = FORMS[self.options.form]
         self._check(form)
+        found = files_to_copy(self.project.folder, self.folder)
         with _new(self.folder):
             self._make_folders()
-            self._copy()
+            self._copy(found)
             (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
             (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
             content = json.dumps(parts_to_json(self.project, self.files), indent=2) + "\n"
@@ -230,21 +236,15 @@ class Export:
         # Volumes begin as what the image has there, and whoever a container runs as writes to them.
         (self.folder / "image/runs").chmod(0o1777)
 
-    def _copy(self) -> None:
+    def _copy(self, found: Collection[Path]) -> None:
+        """Fill the image; ``found``: what of the project goes into it, and nothing else does."""
         image = self.folder / "image"
-        here = self.folder.resolve()
 
         def left_out(folder: str, names: list[str]) -> Iterable[str]:
-            itself = [name for name in names if (Path(folder) / name).resolve() == here]
-            return {*_NOT_COPIED(folder, names), *itself}
+            return [name for name in names if Path(folder, name) not in found]
 
         try:
-            shutil.copytree(
-                self.project.folder,
-                image / "project",
-                ignore=left_out,
-                ignore_dangling_symlinks=True,
-            )
+            shutil.copytree(self.project.folder, image / "project", ignore=left_out)
         except shutil.Error as error:
             why = "\n".join(f"{path} cannot be copied: {text}" for path, _, text in error.args[0])
             raise UsageError(why) from error
@@ -259,13 +259,79 @@ class Export:
             shutil.copytree(python.parent, folder, ignore=_NOT_COPIED)
 
 
+def files_to_copy(project: Path, output: Path) -> set[Path]:
+    """The files and folders of a project that go into its images, by paths that may have links.
+
+    ``output``, the folder to be written, is none of them, and neither is a link to nothing.
+
+    Raises:
+        ProjectError: naming every link out of the project or into a circle, and whatever is
+            neither a file nor a folder.
+    """
+    root, own = project.resolve(), output.resolve()
+    found: set[Path] = set()
+    wrong: dict[Path, tuple[Path, str]] = {}  # by where it lies, to which several paths may lead
+    linked = 0
+    # With the folders on the way to it, and whether that goes through a link.
+    folders: list[tuple[Path, tuple[Path, ...], bool]] = [(project, (root,), False)]
+    while folders:
+        folder, around, is_linked = folders.pop()
+        try:
+            names = os.listdir(around[-1])
+        except OSError as error:
+            wrong[around[-1]] = folder, f"cannot be read ({error.strerror}): allow it"
+            continue
+        for name in sorted({*names} - _NOT_COPIED(str(folder), names)):
+            path, place = folder / name, around[-1] / name
+            is_link = place.is_symlink()
+            target = Path(os.path.realpath(place)) if is_link else place
+            if own in (target, *target.parents):
+                continue
+            if root not in (target, *target.parents):
+                wrong[place] = path, f"leads out of the project's folder, to {target}: {_INSTEAD}"
+                continue
+            try:
+                mode = target.stat().st_mode
+            except OSError:  # the link leads to nothing
+                continue
+            through_link = is_linked or is_link
+            linked += through_link
+            if linked > _MOST_LINKED:
+                why = f"with it, links stand for more than {_MOST_LINKED:,} files: {_INSTEAD}"
+                wrong[place] = path, why
+                folders.clear()
+                break
+            if stat.S_ISDIR(mode):
+                if target in around:
+                    wrong[place] = path, f"leads back to a folder that it lies in: {_INSTEAD}"
+                    continue
+                folders.append((path, (*around, target), through_link))
+            elif not stat.S_ISREG(mode):
+                wrong[place] = path, "is neither a file nor a folder: remove it"
+                continue
+            found.add(path)
+    if wrong:
+        raise _NotExported(
+            [Problem(display_name(path), 0, 0, "", text) for path, text in wrong.values()]
+        )
+    return found
+
+
+class _NotExported(ProjectError):
+    outcome = "nothing was written"
+
+
 def slug(name: str) -> str:
     """A name as DNS and image names take it: lower case, digits, and - between them."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "project"
 
 
 def export(project: Project, messages: Sequence[Path], options: ExportOptions) -> Path:
-    """Write a project for another engine; returns the file for it. Raises ``UsageError``."""
+    """Write a project for another engine; returns the file for it.
+
+    Raises:
+        ProjectError, UsageError: as :meth:`Export.write` does.
+    """
     without = {"slurm": _OF_CONTAINERS}.get(options.form, _OF_SLURM)
     for each in options_of(ExportOptions):
         if each.name in without and getattr(options, each.name) != each.default:

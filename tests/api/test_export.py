@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +20,7 @@ from neuros.api.part import part_plan, parts_to_json, reach_peers, read_parts
 from neuros.api.plan import Network
 from neuros.api.request import ExportOptions, Request
 from neuros.cli.main import main
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault, ProjectError, UsageError
 from neuros.project.load import load_project
 from neuros.project.model import Folders, Project
 from neuros.project.split import split
@@ -244,21 +246,86 @@ def test_a_folder_with_anything_in_it_is_not_written_to(project: Project) -> Non
         exported(project, "compose")
 
 
-def test_a_link_to_nothing_is_left_out_and_what_cannot_be_copied_is_named(project: Project) -> None:
+def test_a_link_within_the_project_stands_for_a_copy_and_one_to_nothing_is_left_out(
+    project: Project,
+) -> None:
+    (project.folder / ".kept").mkdir()
+    (project.folder / ".kept" / "large").write_text("kept by a tool")
+    (project.folder / "large").symlink_to(".kept/large")
+    (project.folder / "again").symlink_to(project.folder / ".kept")
     (project.folder / "old_data").symlink_to("gone")
     assert services(project, "compose")
-    (project.folder / "itself").symlink_to(".")
-    with pytest.raises(UsageError, match=r"itself.* cannot be copied: .*symbolic links"):
-        exported(project, "swarm")
+    copy = project.folder.parent / "compose" / "image" / "project"
+    for name in ("large", "again/large"):
+        assert (copy / name).read_text() == "kept by a tool"
+        assert not (copy / name).is_symlink()
+    assert {path.name for path in copy.iterdir()}.isdisjoint({"old_data", ".kept"})
 
 
-def test_a_failed_export_leaves_nothing_behind(project: Project, tmp_path: Path) -> None:
-    (project.folder / "itself").symlink_to(".")
+def test_links_out_of_the_project_or_in_a_circle_and_devices_are_all_named_before_it_is_written(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret").write_text("of the machine")
+    for name, target in {
+        "conf": tmp_path / "secret",
+        "data.bin": "/dev/zero",
+        "home": "..",
+        "old": "/gone",
+        "a": ".",
+        "b": ".",
+        "left/back": "../right",
+        "right/back": "../left",
+    }.items():
+        (project.folder / name).parent.mkdir(exist_ok=True)
+        (project.folder / name).symlink_to(target)
+    os.mkfifo(project.folder / "pipe")
+    with pytest.raises(ProjectError) as raised:
+        exported(project, "compose")
+    instead = "put a copy in place of the link, or remove it"
+    circle = f"leads back to a folder that it lies in: {instead}"
+    away = "leads out of the project's folder, to"
+    told = {str(problem).removeprefix("dice/") for problem in raised.value.problems}
+    assert told == {
+        f"a: {circle}",
+        f"b: {circle}",
+        f"conf: {away} {tmp_path}/secret: {instead}",
+        f"data.bin: {away} /dev/zero: {instead}",
+        f"home: {away} {tmp_path}: {instead}",
+        f"left/back/back: {circle}",
+        f"old: {away} /gone: {instead}",
+        "pipe: is neither a file nor a folder: remove it",
+        f"right/back/back: {circle}",
+    }
+    assert not (tmp_path / "compose").exists()
+
+
+def test_links_that_stand_for_ever_more_files_are_refused(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neuros.api.export._MOST_LINKED", 1000)
+    (project.folder / "d0").mkdir()
+    for number in range(1, 40):
+        folder = project.folder / f"d{number}"
+        folder.mkdir()
+        for name in ("a", "b"):
+            (folder / name).symlink_to(f"../d{number - 1}")
+    with pytest.raises(ProjectError, match="links stand for more than 1,000 files: put a copy"):
+        exported(project, "compose")
+
+
+def test_a_failed_export_leaves_nothing_behind(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: str, target: str, **_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copystat", full)
     output = tmp_path / "new"
     for was_there in (False, True):
         if was_there:
             output.mkdir()
-        with pytest.raises(UsageError, match="cannot be copied"):
+        with pytest.raises(UsageError, match=r"cannot be copied: .*No space left"):
             export(project, [], ExportOptions(form="compose", output=str(output)))
         assert output.exists() == was_there
         assert not was_there or not any(output.iterdir())
