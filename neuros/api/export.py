@@ -33,8 +33,10 @@ from typing import Any
 import yaml
 
 from neuros.api.part import parts_to_json
-from neuros.api.request import ExportOptions
+from neuros.api.plan import named_peers, time_problems
+from neuros.api.request import ExportOptions, parse_duration
 from neuros.backends.containers import bare_name, files_of, find_recipe
+from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
 from neuros.errors import Problem, ProjectError, UsageError
@@ -60,6 +62,13 @@ _OF_SLURM = ("place", "spread")
 _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
+_LABEL = "[a-z0-9](?:[a-z0-9-]*[a-z0-9])?"
+_CLAIM = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*")  # RFC 1123
+# https://github.com/distribution/reference: a host, or a part of the path, and further parts.
+_PART = r"[a-z0-9]+(?:(?:\.|__?|-+)[a-z0-9]+)*"
+_HOST = rf"(?:(?i:{_LABEL}(?:\.{_LABEL})*)|\[[0-9A-Fa-f:]+\])(?::[0-9]+)?"
+_REGISTRY = re.compile(rf"(?:{_HOST}|{_PART})(?:/{_PART})*/?")
+_MOST_MACHINES = 65_536  # no cluster has more
 _NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
 _MOST_LINKED = 100_000
 _INSTEAD = "put a copy in place of the link, or remove it"
@@ -336,6 +345,7 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
     for each in options_of(ExportOptions):
         if each.name in without and getattr(options, each.name) != each.default:
             raise UsageError(f"{each.flags[-1]} is not for {options.form}")
+    _check_options(project, options)
     if options.form != "slurm":
         return Export(project, messages, options).write()
     script = _slurm_script_of(project, options)
@@ -343,6 +353,26 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
     with _new(folder):
         (folder / "job.sh").write_text(script, "utf-8")
     return folder / "job.sh"
+
+
+def _check_options(project: Project, options: ExportOptions) -> None:
+    """Refuse what the launchers of its nodes, or their engine, would refuse later."""
+    if problems := time_problems(project, project.nodes, parse_duration(options.duration)):
+        raise _NotExported(problems)
+    if options.domain_id is not None:
+        valid_domain(str(options.domain_id), "-d/--domain-id")
+    if options.peers is not None:
+        named_peers(options.peers)
+    if options.registry and not _REGISTRY.fullmatch(options.registry):
+        raise UsageError(
+            f"--registry {options.registry!r}: no name of an image can begin so: give a registry"
+            " and a path in lower case, as in registry.lab:5000/robots"
+        )
+    if options.volume_claim and not _CLAIM.fullmatch(options.volume_claim):
+        raise UsageError(
+            f"--volume-claim {options.volume_claim!r}: is no name for Kubernetes: give lower case"
+            " letters, digits, - and ., at most 253, with a letter or digit at both ends"
+        )
 
 
 @contextlib.contextmanager
@@ -603,7 +633,7 @@ def _slurm_script_of(project: Project, options: ExportOptions) -> str:
     """The script for a checked project, with the resources that its nodes declare.
 
     Raises:
-        UsageError: if a node is placed that the project lacks.
+        UsageError: if a node is placed that the project lacks, or on no possible number.
     """
     names = [node.name for node in project.nodes]
     places = {name: number for number, name in enumerate(names)} if options.spread else {}
@@ -611,10 +641,15 @@ def _slurm_script_of(project: Project, options: ExportOptions) -> str:
         if name not in names:
             hint = did_you_mean(name, names) or f"it has {', '.join(names)}"
             raise UsageError(f"--place {name}={number}: the project has no such node; {hint}")
+        if not 0 <= number < _MOST_MACHINES:
+            raise UsageError(
+                f"--place {name}={number}: is no node of an allocation: give a number from 0 to"
+                f" {_MOST_MACHINES - 1:,}"
+            )
         places[name] = number
     on_each = [
         tuple(node for node in project.nodes if places.get(node.name, 0) == number)
-        for number in range(max(places.values(), default=0) + 1)
+        for number in {0, *places.values()}
     ]
     beside = Path(sys.executable).with_name("neuros")
     changes = options.set or ()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.api.request import Request
+from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
 from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
@@ -74,6 +74,15 @@ def chosen_network(network: bool, peers: str | None) -> Network:
     """
     if peers is None:
         return Network(network)
+    return Network(True, tuple(dict.fromkeys(map(_address, named_peers(peers)))))
+
+
+def named_peers(peers: str) -> list[str]:
+    """The addresses and names in a text of ``--peers``.
+
+    Raises:
+        UsageError: if one can be neither.
+    """
     wanted = [part.strip() for part in peers.split(",")]
     nonsense = [part for part in wanted if not _is_possible(part)]
     if nonsense:
@@ -81,7 +90,7 @@ def chosen_network(network: bool, peers: str | None) -> Network:
             f"--peers {peers}: {', '.join(map(repr, nonsense))} is neither an IPv4 address nor the"
             " name of a host: give them as in --peers 10.0.0.7,robot.local"
         )
-    return Network(True, tuple(dict.fromkeys(map(_address, wanted))))
+    return wanted
 
 
 def _is_possible(text: str) -> bool:
@@ -251,7 +260,7 @@ def make_plan(
     if request.isolate:
         _check_isolation(plan)
     conflicts = nest_conflicts(project, names) if back_end.is_one_process else ()
-    if problems := [*conflicts, *_time_problems(plan)]:
+    if problems := [*conflicts, *time_problems(project, plan.nodes, request.end)]:
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
@@ -380,15 +389,16 @@ def _check_isolation(plan: Plan) -> None:
         )
 
 
-def _time_problems(plan: Plan) -> Sequence[Problem]:
-    if plan.request.end.sim_s is None:
+def time_problems(project: Project, nodes: Sequence[Node], end: Duration) -> Sequence[Problem]:
+    """What is wrong if these nodes are to end in simulated time."""
+    if end.sim_s is None:
         return ()
-    owners = [node.name for node in plan.nodes if node.owns_time]
+    owners = [node.name for node in nodes if node.owns_time]
     if len(owners) == 1:
         return ()
     return [
         Problem(
-            str(plan.project.file),
+            str(project.file),
             1,
             1,
             "/nodes",

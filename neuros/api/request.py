@@ -330,10 +330,13 @@ FORMS = ("compose", "swarm", "kubernetes", "slurm")
 
 
 def _placed(text: str) -> tuple[str, int]:
-    node, is_given, number = text.rpartition("=")
-    if not (is_given and number.isdecimal()):
-        raise ArgumentTypeError(f"'{text}': give NODE=NUMBER, as in robot=1")
-    return node, int(number)
+    node, _, number = text.rpartition("=")
+    try:
+        if node:
+            return node, int(number)
+    except ValueError:  # more digits than a number may have, too
+        pass
+    raise ArgumentTypeError(f"'{text}': give NODE=NUMBER, as in robot=1")
 
 
 @dataclass(frozen=True, kw_only=True)

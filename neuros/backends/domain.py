@@ -98,8 +98,8 @@ def given_domain(explicit: int | None, environ: Mapping[str, str]) -> int | None
     """
     text = environ.get("ROS_DOMAIN_ID", "").strip()
     if explicit is not None:
-        return _valid(str(explicit), "-d/--domain-id")
-    return _valid(text, "ROS_DOMAIN_ID") if text else None
+        return valid_domain(str(explicit), "-d/--domain-id")
+    return valid_domain(text, "ROS_DOMAIN_ID") if text else None
 
 
 def _told(domain: int, reason: str, folder: Path) -> DomainLock:
@@ -109,7 +109,8 @@ def _told(domain: int, reason: str, folder: Path) -> DomainLock:
     return DomainLock(domain, reason, lock)
 
 
-def _valid(text: str, source: str) -> int:
+def valid_domain(text: str, source: str) -> int:
+    """The domain id in a text of ``source``; raises ``UsageError`` if it is none."""
     # Nothing but ASCII digits: int() would also take "1_0", "+1" and other scripts' digits.
     if text.isascii() and text.isdigit() and int(text) <= _HIGHEST:
         return int(text)

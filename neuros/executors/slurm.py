@@ -113,8 +113,12 @@ class SlurmExecutor(SweepExecutor):
 
 def _job_name(plan: SweepPlan) -> str:
     """A name for the jobs of this sweep, and of no other."""
-    project = re.sub(r"[^A-Za-z0-9_-]", "-", plan.name)
-    return f"neuros-{project}-{hashlib.sha256(str(plan.folder).encode()).hexdigest()[:8]}"
+    return f"neuros-{_plain(plan.name)}-{hashlib.sha256(str(plan.folder).encode()).hexdigest()[:8]}"
+
+
+def _plain(name: str) -> str:
+    """The name of a project, as a line of ``#SBATCH`` takes it."""
+    return re.sub(r"[^A-Za-z0-9_-]", "-", name)
 
 
 def _parameters(partition: str | None, plan: SweepPlan) -> dict[str, Any]:
@@ -271,7 +275,7 @@ def slurm_script(
     nodes = {node: f"node{number}" for node, number in elsewhere.items()}
     name = os.path.basename(os.path.abspath(project)).removesuffix(".json")
     return _SCRIPT.format(
-        name=name,
+        name=_plain(name),
         count=max(numbers, default=0) + 1,
         resources="".join(f"#SBATCH {line}\n" for line in _lines(resources or JobResources())),
         deployment=json.dumps({"hosts": hosts, "nodes": nodes}, indent=2),

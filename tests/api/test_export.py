@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ from neuros.api.part import part_plan, parts_to_json, reach_peers, read_parts
 from neuros.api.plan import Network
 from neuros.api.request import ExportOptions, Request
 from neuros.cli.main import main
-from neuros.errors import EnvironmentFault, ProjectError, UsageError
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.project.load import load_project
 from neuros.project.model import Folders, Project
 from neuros.project.split import split
@@ -358,6 +359,68 @@ def test_names_that_kubernetes_refuses_are_told_at_once(project: Project) -> Non
         f"node '{long.name}'",
     ]
     assert services(project, "compose")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"duration": "nan"}, "--duration nan: give seconds, such as 30, or simulated"),
+        ({"duration": "2sim"}, "--duration in simulated time needs exactly one node that owns"),
+        ({"domain_id": 9999}, "-d/--domain-id: '9999' is not a ROS domain id"),
+        ({"peers": "10.0.0.7,a b"}, "'a b' is neither an IPv4 address nor the name of a host"),
+    ],
+)
+@pytest.mark.parametrize("form", ["compose", "slurm"])
+def test_what_a_launch_refuses_an_export_refuses(
+    project: Project, form: str, options: Mapping[str, Any], told: str
+) -> None:
+    if form == "slurm" and "peers" in options:
+        told = "--peers is not for slurm"
+    with pytest.raises(NeurosError, match=re.escape(told)):
+        export(project, (), ExportOptions(form=form, **options))
+    assert not Path(f"dice-{form}").exists()
+
+
+@pytest.mark.parametrize(
+    "registry",
+    ["registry.lab:5000/robots", "Registry.Lab/robots/", "me", "a_user", "[::1]:5000/a__b/c.d"],
+)
+def test_a_registry_is_the_beginning_of_an_image_s_name(project: Project, registry: str) -> None:
+    image = services(project, "compose", registry=registry)["counter"]["image"]
+    assert image.startswith(f"{registry.rstrip('/')}/dice-neuros-mujoco:")
+
+
+@pytest.mark.parametrize("registry", ["a b", "lab/Robots", "https://lab", "lab//a", "lab:x/a", "-"])
+def test_a_registry_that_no_image_can_have_is_refused(project: Project, registry: str) -> None:
+    with pytest.raises(UsageError, match=f"--registry '{registry}': no name of an image"):
+        exported(project, "compose", registry=registry)
+
+
+@pytest.mark.parametrize("claim", ["runs\nx: y", "runs\n", "Runs", "-runs", "a..b", "r" * 254])
+def test_a_claim_that_kubernetes_cannot_have_is_refused(project: Project, claim: str) -> None:
+    with pytest.raises(UsageError, match=r"--volume-claim '.*': is no name for Kubernetes"):
+        exported(project, "kubernetes", volume_claim=claim)
+    assert exported(project, "kubernetes", volume_claim="runs.of-2026")
+
+
+@pytest.mark.parametrize("number", [-1, 65_536, 99_999_999_999])
+def test_a_node_is_placed_where_a_cluster_can_have_one(
+    project: Project, tmp_path: Path, number: int
+) -> None:
+    with pytest.raises(UsageError, match=f"--place counter={number}: is no node of an allocation"):
+        export(project, (), ExportOptions(form="slurm", place=(("counter", number),)))
+    last = ExportOptions(form="slurm", place=(("counter", 65_535),), output=tmp_path / "job")
+    assert "#SBATCH --nodes=65536\n" in export(project, (), last).read_text()
+
+
+def test_a_job_has_the_project_s_name_without_what_slurm_would_read(
+    project: Project, tmp_path: Path
+) -> None:
+    folder = project.folder.rename(tmp_path / "my dice\n#SBATCH --exclusive")
+    project = replace(project, file=folder / project.file.name)
+    script = export(project, (), ExportOptions(form="slurm", output=tmp_path / "job")).read_text()
+    assert "#SBATCH --job-name=my-dice--SBATCH---exclusive\n" in script
+    assert "#SBATCH --output=my-dice--SBATCH---exclusive-%j.log\n" in script
 
 
 def test_an_invalid_project_is_not_exported(
