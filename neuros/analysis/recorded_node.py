@@ -14,6 +14,7 @@ from neuros.engine.event_log import is_understood
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
+from neuros.project.scanner import read_bytes
 from neuros.project.split import node_file_from_json
 from neuros.project.validate import mistake
 from neuros.recording.recording_plan import RecordingPlan, load_plan
@@ -71,7 +72,7 @@ class RecordedNode:
         self.plan: RecordingPlan = load_plan(run.folder)
         self._bag: Bag = open_bag(run.folder)
         self.event_log: array[int] = array("q")
-        data = _event_log_of(run.folder, self._name).read_bytes()
+        data = read_bytes(_event_log_of(run.folder, self._name))
         self.event_log.frombytes(data[: len(data) // 8 * 8])
         if not is_understood(self.event_log):
             raise EnvironmentFault(f"{_event_log_of(run.folder, self._name)} is damaged")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.analysis.run_record import open_run, run_table
 from neuros.errors import RunError
+from neuros.project.scanner import read_bytes
 
 if TYPE_CHECKING:
     from neuros.bag import Bag
@@ -125,7 +126,7 @@ class Run:
         if node not in self.nodes:
             raise KeyError(f"{node}: there are {', '.join(self.nodes)}")
         file = self.folder / node / "node.log"
-        return file.read_text("utf-8", "replace") if file.exists() else ""
+        return read_bytes(file).decode("utf-8", "replace") if file.exists() else ""
 
     def check(self) -> Run:
         """This run, if it ended normally.

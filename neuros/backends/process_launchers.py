@@ -24,6 +24,7 @@ from neuros.backends.node_command import (
     signal_in_words,
 )
 from neuros.errors import EnvironmentFault
+from neuros.files import open_log
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
@@ -147,7 +148,7 @@ class RunningProcess:
         self._log = process.log
         try:
             process.log.parent.mkdir(parents=True, exist_ok=True)
-            with open(process.log, "ab") as output, children_on(process.cores):
+            with open_log(process.log) as output, children_on(process.cores):
                 self._process = subprocess.Popen(
                     process.command,
                     stdin=subprocess.DEVNULL,

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from neuros.backends.node_command import process_environment, with_libraries
 from neuros.errors import EnvironmentFault
+from neuros.files import open_log
 
 END = b"end\n"
 """What the recorder is told when nothing more will come."""
@@ -46,7 +47,7 @@ def start_sidecar(
     """
     whole = process_environment(os.environ, environment)
     try:
-        with open(log, "ab") as file:
+        with open_log(log) as file:
             process = subprocess.Popen(
                 list(command),
                 stdin=subprocess.PIPE,

@@ -47,7 +47,7 @@ def _run_recorder(options: argparse.Namespace) -> int:
         else:
             counts = _record(run, load_plan(run), problems.add)
     except (NeurosError, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
         problems.add(
             f"the recording has stopped: {reason}; the bag can be read, and neuros bag repair"
             f" {run} adds the packets that it lacks"

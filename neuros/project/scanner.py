@@ -13,7 +13,6 @@ import json
 import math
 import os
 import re
-import stat
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from neuros.errors import Problem
+from neuros.files import open_ordinary
 
 _MAX_DEPTH = 100
 _MOST_BYTES = 4 << 20
@@ -159,11 +159,8 @@ def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
         OSError: if it cannot be read, has more than ``most_bytes``, or is a pipe or device, which
             may have no end.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError("it is not an ordinary file")
-        if most_bytes is not None and status.st_size > most_bytes:
+    with open_ordinary(path) as file:
+        if most_bytes is not None and os.fstat(file.fileno()).st_size > most_bytes:
             raise OSError(f"it has more than {most_bytes >> 20} MiB")
         return file.read()
 

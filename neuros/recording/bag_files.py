@@ -29,6 +29,7 @@ from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
+from neuros.files import write_whole
 from neuros.project.message_types import message_folder
 from neuros.recording.recording_plan import Topic
 
@@ -153,9 +154,8 @@ class BagWriter:
         """Make the bag on the disk complete. Raises ``OSError``."""
         information = self._information()
         self._file.checkpoint(_yaml(information))
-        new = self._folder / "metadata.yaml.tmp"
-        new.write_text(_yaml({"rosbag2_bagfile_information": information}) + "\n", "utf-8")
-        new.replace(self._folder / "metadata.yaml")
+        text = _yaml({"rosbag2_bagfile_information": information})
+        write_whole(self._folder / "metadata.yaml", f"{text}\n".encode())
 
     def close(self) -> None:
         """Make it complete, and write nothing any more. Raises ``OSError``."""

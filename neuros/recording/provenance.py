@@ -15,6 +15,7 @@ from typing import Any
 
 from neuros.distribution import __version__
 from neuros.project.model import Node
+from neuros.project.scanner import read_bytes
 
 _GIT_PATIENCE_S = 5.0
 _VERSIONS = "versions.json"
@@ -64,8 +65,8 @@ def note_versions(node_folder: Path) -> None:
 
 def _noted_versions(node_folder: Path) -> Any:
     try:
-        return json.loads((node_folder / _VERSIONS).read_text("utf-8"))
-    except (OSError, ValueError):  # it never began, or the disk was full
+        return json.loads(read_bytes(node_folder / _VERSIONS))
+    except (OSError, ValueError, RecursionError):  # it never began, or the disk was full
         return None
 
 

@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.files import open_ordinary
+from neuros.project.scanner import read_bytes
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recording_plan import (
     BAG_NAME,
@@ -241,7 +243,7 @@ class _SpoolSource:
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
     """Whether no other process writes the bag of a run, now and within the block."""
-    with open(run / PLAN_NAME, "rb") as plan:
+    with open_ordinary(run / PLAN_NAME) as plan:
         try:
             fcntl.flock(plan, fcntl.LOCK_EX | fcntl.LOCK_NB)
             is_alone = True
@@ -295,8 +297,8 @@ def repair(
             return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:
         raise EnvironmentFault(
-            f"the bag of {run} cannot be completed: {error.strerror}; what is there was left as it"
-            " is"
+            f"the bag of {run} cannot be completed: {error.strerror or error}; what is there was"
+            " left as it is"
         ) from error
 
 
@@ -307,7 +309,7 @@ def recorded_counts(run: Path) -> dict[str, int]:
         topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        information = json.loads((run / BAG_NAME / "metadata.yaml").read_text("utf-8"))
+        information = json.loads(read_bytes(run / BAG_NAME / "metadata.yaml"))
         topics = information["rosbag2_bagfile_information"]["topics_with_message_count"]
         return {topic["topic_metadata"]["name"]: int(topic["message_count"]) for topic in topics}
     return {}

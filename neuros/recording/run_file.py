@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.files import write_whole
 from neuros.project.scanner import read_bytes
 from neuros.project.validate import mistake
 
@@ -19,14 +19,7 @@ FORMAT = 2
 
 def write_run_file(record: Mapping[str, Any], folder: Path) -> None:
     """Write it, the whole of it or nothing. Raises ``OSError``."""
-    part = folder / f".{RUN_FILE}"
-    try:
-        part.write_text(json.dumps(record, indent=2) + "\n", "utf-8")
-        part.replace(folder / RUN_FILE)
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
+    write_whole(folder / RUN_FILE, f"{json.dumps(record, indent=2)}\n".encode())
 
 
 def read_run_file(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
+from neuros.files import descriptor_of, make_folder, open_ordinary, write_whole
 from neuros.ports import Way
+from neuros.project.scanner import read_bytes
 from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
 
 FILE_BYTES = 8 << 20
@@ -161,7 +163,7 @@ class SpoolReader:
         numbers = self._numbers()
         if not numbers:
             return False
-        with open(self._path(numbers[-1]), "rb") as file:
+        with open_ordinary(self._path(numbers[-1])) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -198,7 +200,7 @@ class SpoolReader:
         numbers = [n for n in self._numbers() if self._file is None or n > self._file]
         if not numbers:
             return False
-        self._descriptor = os.open(self._path(numbers[0]), os.O_RDONLY)
+        self._descriptor = descriptor_of(self._path(numbers[0]))
         self._file = numbers[0]
         self._rest = b""
         return True
@@ -249,11 +251,9 @@ class ListenedSpool:
     def add(self, topic: Topic) -> int:
         """The number of a new topic. Raises ``OSError``."""
         self._topics.append(topic)
-        self._folder.mkdir(exist_ok=True)
+        make_folder(self._folder)
         text = json.dumps([asdict(each) for each in self._topics])
-        new = self._folder / f"{_LIST}.new"
-        new.write_text(text, "utf-8")
-        new.replace(self._folder / _LIST)
+        write_whole(self._folder / _LIST, text.encode())
         return len(self._topics) - 1
 
     def keep(self, number: int, wall_ns: int, data: bytes) -> None:
@@ -268,14 +268,14 @@ class ListenedSpool:
 def listened_topics(run: Path) -> list[Topic]:
     """The topics that have been heard so far, in the order of their numbers."""
     try:
-        return [Topic(**each) for each in json.loads((run / LISTENER / _LIST).read_text("utf-8"))]
+        return [Topic(**each) for each in json.loads(read_bytes(run / LISTENER / _LIST))]
     except FileNotFoundError:
         return []
 
 
 def forget_listened(run: Path) -> None:
     """Remove the list; its spool must have been removed before."""
-    for name in (_LIST, f"{_LIST}.new"):
+    for name in (_LIST, f".{_LIST}"):
         (run / LISTENER / name).unlink(missing_ok=True)
     if (run / LISTENER).is_dir():
         (run / LISTENER).rmdir()

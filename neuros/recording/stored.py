@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault
+from neuros.files import open_ordinary
 from neuros.recording.bag_files import (
     CHANNEL,
     CHUNK,
@@ -67,7 +68,7 @@ def stored_messages(
         EnvironmentFault: if they are compressed, which is not how NeuROS records.
     """
     for path in sorted(folder.glob("*.mcap")):
-        with open(path, "rb") as file:
+        with open_ordinary(path) as file:
             for topic, log_ns, publish_ns, _, data, is_right in _of_mcap(file, complain):
                 yield Stored(topic, log_ns, publish_ns, bytes(data), not is_right)
     for path in sorted(folder.glob("*.db3")):
@@ -93,7 +94,7 @@ class StoredTopics:
         """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
         found: list[Stored] = []
         for path in sorted(self._folder.glob("*.mcap")):
-            with open(path, "rb") as file:
+            with open_ordinary(path) as file:
                 if path not in self._places:
                     self._places[path] = _places_in(file, self._complain)
                 row = iter(self._places[path].get(topic, ()))
@@ -207,10 +208,15 @@ def _check_definitions(reader: Reader) -> None:
 
 
 def _check_summaries(folder: Path) -> None:
-    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says."""
-    for path in folder.glob("*.mcap"):
-        with open(path, "rb") as file:
-            _summary_of(file)
+    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says.
+
+    Raises ``OSError`` for what is no file, such as a pipe.
+    """
+    for path in folder.glob("*"):
+        if path.suffix in (".mcap", ".db3", ".yaml"):
+            with open_ordinary(path) as file:
+                if path.suffix == ".mcap":
+                    _summary_of(file)
 
 
 def _summary_of(file: BinaryIO) -> bytes:

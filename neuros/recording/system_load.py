@@ -14,10 +14,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
+
+from neuros.files import open_new
 
 FILE_NAME = "system_load.csv"
 
@@ -341,7 +344,9 @@ class LoadMonitor(threading.Thread):
         """Write rows until the end, or until there is no room for them."""
         try:
             # Line by line, so that it can be read while the run goes on.
-            with open(self._path, "w", 1, "utf-8", newline="") as file:
+            with TextIOWrapper(
+                open_new(self._path), "utf-8", newline="", line_buffering=True
+            ) as file:
                 self._write(csv.writer(file))
         except OSError as error:
             self.failure = (

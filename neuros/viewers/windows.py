@@ -13,6 +13,7 @@ from typing import Any
 from neuros.backends.docker.launcher import ToolContainer, find_tool_image
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault
+from neuros.files import write_whole
 from neuros.ports import BackEnd, Reaper
 from neuros.project.model import Port, Project
 from neuros.viewers.viewer import Shown, Viewer
@@ -127,7 +128,7 @@ class _ToolViewer(Viewer):
 
 def _configured(run: Shown) -> Sequence[str]:
     path = run.folder / RVIZ_FILE
-    path.write_text(rviz_configuration(run.project), "utf-8")
+    write_whole(path, rviz_configuration(run.project).encode())
     return ["-d", str(path)]
 
 

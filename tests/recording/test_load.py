@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from neuros.recording import system_load
 from neuros.recording.system_load import (
     FILE_NAME,
     LAUNCHER,
@@ -233,9 +235,9 @@ def test_rows_can_be_read_while_the_run_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_told_at_the_end_and_ends_nothing_but_the_monitor(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / FILE_NAME).symlink_to("/dev/full")
+    monkeypatch.setattr(system_load, "open_new", lambda _: io.FileIO("/dev/full", "wb"))
     monitor = run(tmp_path, Meter(5))
     monitor.join(DEADLINE_S)
     assert not monitor.is_alive()

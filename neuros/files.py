@@ -1,0 +1,82 @@
+"""Files in folders that others may write to, as nodes may to the run folder.
+
+There, a link would have us change a file elsewhere, and a pipe would have us wait for ever. So what
+is written takes the place of whatever has its name, and only ordinary files are read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+# What opening says of a file that is not there, of a link, and of a pipe that nobody reads.
+_NO_FILE = (errno.ENOENT, errno.ELOOP, errno.ENXIO)
+
+
+def open_ordinary(path: Path) -> BinaryIO:
+    """Open a file for reading. Raises ``OSError``: also if it is a pipe, a device or a folder."""
+    return open(path, "rb", opener=lambda *_: descriptor_of(path))
+
+
+def descriptor_of(path: Path, more_flags: int = 0) -> int:
+    """As :func:`open_ordinary`, without a buffer."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | more_flags)
+    if _is_ordinary(descriptor):
+        return descriptor
+    os.close(descriptor)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError("it is not an ordinary file")
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Open a new file in the place of what is there. Raises ``OSError``: also for a folder."""
+    path.unlink(missing_ok=True)
+    return open(os.open(path, _APPEND | os.O_CREAT | os.O_EXCL, 0o666), "wb")
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Open a file for appending; anything but a file is replaced by a new one.
+
+    Raises ``OSError``: also for a folder.
+    """
+    try:
+        descriptor = os.open(path, _APPEND | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno not in _NO_FILE:
+            raise
+        return open_new(path)
+    if not _is_ordinary(descriptor):
+        os.close(descriptor)
+        return open_new(path)
+    os.set_blocking(descriptor, True)
+    return open(descriptor, "ab")
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write the whole of a file, or leave what was there. Raises ``OSError``: also for a folder."""
+    part = path.with_name(f".{path.name}")
+    try:
+        with open_new(part) as file:
+            file.write(data)
+        part.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder where there is none. Raises ``OSError``: also for a link to a folder."""
+    path.mkdir(exist_ok=True)
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "it is a link to another folder", str(path))
+
+
+def _is_ordinary(descriptor: int) -> bool:
+    return stat.S_ISREG(os.fstat(descriptor).st_mode)

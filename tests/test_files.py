@@ -1,0 +1,158 @@
+"""Files in folders that others may write to: no link is followed, and no pipe is waited for."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from neuros.backends.node_command import last_line
+from neuros.files import make_folder, open_log, open_new, open_ordinary, write_whole
+from neuros.recording.recorder import counts_of
+from neuros.recording.recording_plan import Topic
+from neuros.recording.run_file import write_run_file
+from neuros.recording.spool import ListenedSpool, SpoolReader
+
+
+@pytest.fixture
+def victim(tmp_path: Path) -> Path:
+    """A file elsewhere, which has to stay as it is."""
+    file = tmp_path / "elsewhere.txt"
+    file.write_text("mine")
+    return file
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    return folder
+
+
+def through_new(path: Path) -> None:
+    with open_new(path) as file:
+        file.write(b"ours")
+
+
+def through_log(path: Path) -> None:
+    with open_log(path) as file:
+        file.write(b"ours")
+
+
+def through_whole(path: Path) -> None:
+    write_whole(path, b"ours")
+
+
+WAYS = pytest.mark.parametrize("write", [through_new, through_log, through_whole])
+
+
+@WAYS
+@pytest.mark.parametrize("name", ["x", ".x"])
+def test_what_is_written_takes_the_place_of_a_link(
+    run: Path, victim: Path, write: Callable[[Path], None], name: str
+) -> None:
+    (run / name).symlink_to(victim)
+    write(run / "x")
+    assert victim.read_text() == "mine"
+    assert (run / "x").read_text() == "ours"
+    assert not (run / "x").is_symlink()
+
+
+@WAYS
+@pytest.mark.parametrize("name", ["x", ".x"])
+@pytest.mark.parametrize("has_reader", [False, True])
+def test_what_is_written_takes_the_place_of_a_pipe(
+    run: Path, write: Callable[[Path], None], name: str, has_reader: bool
+) -> None:
+    os.mkfifo(run / name)
+    reader = os.open(run / name, os.O_RDONLY | os.O_NONBLOCK) if has_reader else None
+    write(run / "x")
+    assert (run / "x").read_text() == "ours"
+    if reader is not None:
+        os.close(reader)
+
+
+@WAYS
+def test_a_folder_stays_and_is_named(run: Path, write: Callable[[Path], None]) -> None:
+    (run / "x").mkdir()
+    with pytest.raises(IsADirectoryError, match="x"):
+        write(run / "x")
+    assert [each.name for each in run.iterdir()] == ["x"]
+
+
+@WAYS
+def test_a_new_file_has_the_mode_of_any_other(run: Path, write: Callable[[Path], None]) -> None:
+    (run / "ordinary").touch()
+    write(run / "x")
+    modes = {stat.S_IMODE((run / name).stat().st_mode) for name in ("ordinary", "x")}
+    assert len(modes) == 1
+
+
+def test_a_log_goes_on(run: Path) -> None:
+    through_log(run / "x")
+    through_log(run / "x")
+    assert (run / "x").read_text() == "oursours"
+
+
+def test_a_folder_is_not_made_through_a_link(run: Path, tmp_path: Path) -> None:
+    make_folder(run / "own")
+    make_folder(run / "own")
+    (run / "link").symlink_to(tmp_path)
+    with pytest.raises(OSError, match="it is a link to another folder"):
+        make_folder(run / "link")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (os.mkfifo, "it is not an ordinary file"),
+        (lambda path: os.symlink("/dev/zero", path), "it is not an ordinary file"),
+        (os.mkdir, "Is a directory"),
+    ],
+)
+def test_only_files_are_read(run: Path, make: Callable[[Path], None], said: str) -> None:
+    make(run / "x")
+    with pytest.raises(OSError, match=said):
+        open_ordinary(run / "x")
+
+
+# ---------------------------------------------------------------------- in a run folder
+
+
+def test_a_node_cannot_have_the_record_written_elsewhere(run: Path, victim: Path) -> None:
+    for name in ("run.json", ".run.json"):
+        (run / name).symlink_to(victim)
+    write_run_file({"reason": "done"}, run)
+    assert victim.read_text() == "mine"
+    assert "done" in (run / "run.json").read_text()
+
+
+def test_a_node_cannot_have_the_list_of_topics_written_elsewhere(run: Path, victim: Path) -> None:
+    (run / ".listener").mkdir()
+    for name in ("topics.json", ".topics.json", "topics.json.new"):
+        (run / ".listener" / name).symlink_to(victim)
+    ListenedSpool(run).add(Topic("/x", "std_msgs/msg/String"))
+    assert victim.read_text() == "mine"
+
+
+def test_a_node_cannot_have_topics_listed_in_another_folder(run: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (run / ".listener").symlink_to(elsewhere)
+    with pytest.raises(OSError, match="it is a link to another folder"):
+        ListenedSpool(run).add(Topic("/x", "std_msgs/msg/String"))
+    assert not [*elsewhere.iterdir()]
+
+
+def test_nobody_waits_for_a_pipe_that_a_node_has_left(run: Path) -> None:
+    for name in ("node.log", "spool/00000000", "bag/metadata.yaml"):
+        (run / name).parent.mkdir(exist_ok=True)
+        os.mkfifo(run / name)
+    assert last_line(run / "node.log") == ""
+    with pytest.raises(OSError, match="it is not an ordinary file"):
+        SpoolReader(run).read(1)
+    with pytest.raises(OSError, match="it is not an ordinary file"):
+        counts_of(run)
