@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
+from neuros.files import write_whole
 from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
@@ -54,6 +56,9 @@ def _report(options: argparse.Namespace) -> int:
     from neuros.analysis.run_record import open_for_review
 
     run = open_for_review(options.run)
+    folder = options.output or options.run / "report"
+    if options.output is None and folder.is_symlink():
+        raise EnvironmentFault(f"{folder} is a link to another place: name a place with -o")
     findings = findings_of(run)
     print(findings.headline)
     for line in (*findings.reasons, *findings.gains):
@@ -63,7 +68,6 @@ def _report(options: argparse.Namespace) -> int:
     for line in run.missing:
         print(f"missing: {line}")
     figures = _figures(run)
-    folder = options.output or options.run / "report"
     text = report_page(run, findings, {t: (text, data) for t, text, data in figures.values()})
     files = {f"{name}.png": data for name, (_, _, data) in figures.items()}
     worlds = {f"world_{node}.html": page.encode() for node, page in world_pages(run).items()}
@@ -73,7 +77,11 @@ def _report(options: argparse.Namespace) -> int:
         panels = None
         print(f"missing: panels: {fault}")
     pages = {} if panels is None else {"panels.html": panels.encode()}
-    _write(folder, {**files, _PAGE: text.encode(), **worlds, **pages})
+    whole = {**files, _PAGE: text.encode(), **worlds, **pages}
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in whole.items():
+            write_whole(folder / name, data)
     print(f"{folder / _PAGE}: {len(figures)} figures")
     for name in worlds:
         print(f"{folder / name}: the world in 3-D")
@@ -106,7 +114,10 @@ def _compare(options: argparse.Namespace) -> int:
             for line in run.missing:
                 print(f"missing in {label}: {line}")
     if options.output is not None:
-        _write(options.output.parent, {options.output.name: _comparison(runs, header, rows)})
+        page = _comparison(runs, header, rows)
+        with _writing(options.output.parent):
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            options.output.write_bytes(page)
         if not is_json:
             print(options.output)
     for error in refused:
@@ -155,11 +166,10 @@ def _no_matplotlib(error: ModuleNotFoundError) -> EnvironmentFault:
     )
 
 
-def _write(folder: Path, files: dict[str, bytes]) -> None:
+@contextlib.contextmanager
+def _writing(folder: Path) -> Iterator[None]:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            (folder / name).write_bytes(data)
+        yield
     except OSError as error:
         raise EnvironmentFault(
             f"{folder} could not be written to ({error.strerror}): name another place with -o"

@@ -99,6 +99,30 @@ def test_a_page_that_cannot_be_written_is_a_fault_of_the_machine(
     assert "name another place with -o" in capsys.readouterr().err
 
 
+def test_a_run_folder_cannot_have_the_report_written_elsewhere(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "report.html").write_text("mine")
+    (run / "report").symlink_to(elsewhere)
+    assert main(["report", str(run)]) == 4
+    assert "report is a link to another place: name a place with -o" in capsys.readouterr().err
+    (run / "report").unlink()
+    (run / "report").mkdir()
+    (run / "report/report.html").symlink_to(elsewhere / "report.html")
+    assert main(["report", str(run)]) == 0
+    assert [file.read_text() for file in elsewhere.iterdir()] == ["mine"]
+    assert not (run / "report/report.html").is_symlink()
+
+
+def test_a_link_that_the_user_names_is_followed(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    assert main(["report", str(run), "-o", str(tmp_path / "link")]) == 0
+    assert (tmp_path / "elsewhere/report.html").is_file()
+
+
 def test_two_runs_are_shown_side_by_side_with_their_ratio(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
