@@ -23,9 +23,9 @@ def open_ordinary(path: Path) -> BinaryIO:
     return open(path, "rb", opener=lambda *_: descriptor_of(path))
 
 
-def descriptor_of(path: Path, more_flags: int = 0) -> int:
-    """As :func:`open_ordinary`, without a buffer."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | more_flags)
+def descriptor_of(path: Path, flags: int = 0) -> int:
+    """As :func:`open_ordinary`, without a buffer; ``flags``: more of those of ``os.open``."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
     if _is_ordinary(descriptor):
         return descriptor
     os.close(descriptor)

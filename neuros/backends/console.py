@@ -12,6 +12,7 @@ import math
 import os
 import re
 import select
+import stat
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TextIO
 
 from neuros.control import Report
+from neuros.files import descriptor_of
 
 LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
 """What ROS 2 prints unless ``RCUTILS_CONSOLE_OUTPUT_FORMAT`` says otherwise."""
@@ -159,7 +161,7 @@ class _GrowingFile:
         self._descriptor: int | None = None
         self._rest = b""
         self._last_time_ns = 0
-        self._is_closed = False
+        self._is_closed = self._is_refused = False
 
     def time_of(self, line: bytes) -> int:
         """Unix time of a line in ns, never before that of the lines above it in the file."""
@@ -211,13 +213,21 @@ class _GrowingFile:
             return b""
         if self._descriptor is None:
             try:
-                self._descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+                self._descriptor = descriptor_of(self._path, os.O_NOFOLLOW)
             except OSError:
-                return b""
+                return self._refusal()
             if self._last_bytes is not None:
                 size = os.fstat(self._descriptor).st_size
                 os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
         return os.read(self._descriptor, _READ_BYTES)
+
+    def _refusal(self) -> bytes:
+        """Once, the line that says that what is there is no file; else nothing."""
+        with contextlib.suppress(OSError):
+            if not self._is_refused and not stat.S_ISREG(os.lstat(self._path).st_mode):
+                self._is_refused = True
+                return f"({self._path} is not shown: it is not an ordinary file)\n".encode()
+        return b""
 
 
 class _Painter:

@@ -9,7 +9,7 @@ import io
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -66,6 +66,22 @@ def test_files_may_appear_later(screen: Screen) -> None:
     assert not screen.tail.poll()
     assert screen.shown == "[robot] hello\n"
     screen.tail.close()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)],
+    ids=["pipe", "folder", "link"],
+)
+def test_what_is_no_file_is_named_once_and_counts_as_absent(
+    screen: Screen, make: Callable[[Path], None]
+) -> None:
+    make(screen.files["robot"])
+    assert screen.tail.poll()
+    assert not screen.tail.poll()
+    said = f"[robot] ({screen.files['robot']} is not shown: it is not an ordinary file)\n"
+    assert screen.shown == said
+    assert screen.after("snn", b"hello\n") == f"{said}[snn] hello\n"
 
 
 def test_records_of_all_nodes_are_shown_in_the_order_of_their_times(screen: Screen) -> None:
