@@ -292,10 +292,9 @@ class NodeContext(Protocol):
         """Let observers look at a simulated world; see :mod:`neuros.simulators.mujoco.scene`."""
 
     def submit(self, packets: Mapping[str, Packet], cancelled: Callable[[], bool]) -> bool:
-        """Send from another thread, as if a hook with those outputs had returned them.
+        """Send from another thread, as if a hook had returned them; wait while one is blocked.
 
-        Waits while a reliable connection of one of the outputs is blocked; returns False, without
-        having sent, once ``cancelled()`` is true or the node ends.
+        Returns ``False``, without having sent, once ``cancelled()`` is true or the node ends.
         """
 
     def on_close(self, callback: Callable[[], None]) -> None:
@@ -427,10 +426,9 @@ class Reaper(Protocol):
     def clean_with(self, module: str, argument: str) -> None:
         """Have a module clean up what is no process of this machine: containers, jobs.
 
-        It needs the standard library only, and has two functions. ``resume(argument, run_id)``
-        lets paused nodes go on, so that they can end. ``remove(argument, run_id, settle_s=...,
-        give_up_s=...)`` ends and removes what is left, until there was nothing for ``settle_s``
-        seconds (a killed launcher may just have asked for more), or after ``give_up_s``.
+        It needs the standard library only. Its ``resume(argument, run_id)`` lets paused nodes go
+        on, to end. Its ``remove(argument, run_id, settle_s=..., give_up_s=...)`` removes what is
+        left, until nothing was for ``settle_s`` (more may be under way), or after ``give_up_s``.
         """
 
 
@@ -440,8 +438,7 @@ class NodeProgram:
 
     Attributes:
         options: of the program, as ``--debug``.
-        cores: the cores of nodes that ask for some, by name of the node.
-        pythons: the Python of nodes that do not run on this one, by name of the node.
+        cores, pythons: by name, of nodes that ask for some, or do not run on this Python.
         reaper: is told of all that is started; ``None`` where nothing is.
         environ: the environment of the launcher.
         is_isolated: whether the nodes are to have a network of their own.

@@ -21,7 +21,6 @@ import json
 import os
 import re
 import shutil
-import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,18 +33,18 @@ import yaml
 
 from neuros.api.part import parts_to_json
 from neuros.api.plan import named_peers, time_problems
-from neuros.api.request import ExportOptions, parse_duration
+from neuros.api.request import ExportOptions, check_names, parse_duration
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import PACKAGE, WORKSPACE
-from neuros.errors import Problem, ProjectError, UsageError
+from neuros.errors import ProjectError, UsageError
 from neuros.executors.executor import JobResources
 from neuros.executors.slurm import slurm_script
 from neuros.options import options_of
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
-from neuros.project.scanner import display_name
+from neuros.project.paths import NOT_COPIED, files_to_copy
 from neuros.project.split import split, translated
 from neuros.project.suggest import did_you_mean
 
@@ -62,16 +61,7 @@ _OF_SLURM = ("place", "spread")
 _STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
-_LABEL = "[a-z0-9](?:[a-z0-9-]*[a-z0-9])?"
-_CLAIM = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*")  # RFC 1123
-# https://github.com/distribution/reference: a host, or a part of the path, and further parts.
-_PART = r"[a-z0-9]+(?:(?:\.|__?|-+)[a-z0-9]+)*"
-_HOST = rf"(?:(?i:{_LABEL}(?:\.{_LABEL})*)|\[[0-9A-Fa-f:]+\])(?::[0-9]+)?"
-_REGISTRY = re.compile(rf"(?:{_HOST}|{_PART})(?:/{_PART})*/?")
 _MOST_MACHINES = 65_536  # no cluster has more
-_NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
-_MOST_LINKED = 100_000
-_INSTEAD = "put a copy in place of the link, or remove it"
 # What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
 
@@ -195,7 +185,9 @@ class Export:
         """
         form = FORMS[self.options.form]
         self._check(form)
-        found = files_to_copy(self.project.folder, self.folder)
+        found, problems = files_to_copy(self.project.folder, self.folder)
+        if problems:
+            raise _NotExported(problems)
         with _new(self.folder):
             self._make_folders()
             self._copy(found)
@@ -257,73 +249,15 @@ class Export:
         except shutil.Error as error:
             why = "\n".join(f"{path} cannot be copied: {text}" for path, _, text in error.args[0])
             raise UsageError(why) from error
-        shutil.copytree(PACKAGE, image / "lib/neuros", ignore=_NOT_COPIED)
+        shutil.copytree(PACKAGE, image / "lib/neuros", ignore=NOT_COPIED)
         if WORKSPACE.is_dir():
-            shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=_NOT_COPIED)
+            shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=NOT_COPIED)
         spec = find_spec(_VENDORED)
         for place in (spec.submodule_search_locations or ()) if spec else ():
-            shutil.copytree(place, image / "lib" / _VENDORED, ignore=_NOT_COPIED)
+            shutil.copytree(place, image / "lib" / _VENDORED, ignore=NOT_COPIED)
         for python in self._messages:
             folder = image / "messages" / python.parent.name
-            shutil.copytree(python.parent, folder, ignore=_NOT_COPIED)
-
-
-def files_to_copy(project: Path, output: Path) -> set[Path]:
-    """The files and folders of a project that go into its images, by paths that may have links.
-
-    ``output``, the folder to be written, is none of them, and neither is a link to nothing.
-
-    Raises:
-        ProjectError: naming every link out of the project or into a circle, and whatever is
-            neither a file nor a folder.
-    """
-    root, own = project.resolve(), output.resolve()
-    found: set[Path] = set()
-    wrong: dict[Path, tuple[Path, str]] = {}  # by where it lies, to which several paths may lead
-    linked = 0
-    # With the folders on the way to it, and whether that goes through a link.
-    folders: list[tuple[Path, tuple[Path, ...], bool]] = [(project, (root,), False)]
-    while folders:
-        folder, around, is_linked = folders.pop()
-        try:
-            names = os.listdir(around[-1])
-        except OSError as error:
-            wrong[around[-1]] = folder, f"cannot be read ({error.strerror}): allow it"
-            continue
-        for name in sorted({*names} - _NOT_COPIED(str(folder), names)):
-            path, place = folder / name, around[-1] / name
-            is_link = place.is_symlink()
-            target = Path(os.path.realpath(place)) if is_link else place
-            if own in (target, *target.parents):
-                continue
-            if root not in (target, *target.parents):
-                wrong[place] = path, f"leads out of the project's folder, to {target}: {_INSTEAD}"
-                continue
-            try:
-                mode = target.stat().st_mode
-            except OSError:  # the link leads to nothing
-                continue
-            through_link = is_linked or is_link
-            linked += through_link
-            if linked > _MOST_LINKED:
-                why = f"with it, links stand for more than {_MOST_LINKED:,} files: {_INSTEAD}"
-                wrong[place] = path, why
-                folders.clear()
-                break
-            if stat.S_ISDIR(mode):
-                if target in around:
-                    wrong[place] = path, f"leads back to a folder that it lies in: {_INSTEAD}"
-                    continue
-                folders.append((path, (*around, target), through_link))
-            elif not stat.S_ISREG(mode):
-                wrong[place] = path, "is neither a file nor a folder: remove it"
-                continue
-            found.add(path)
-    if wrong:
-        raise _NotExported(
-            [Problem(display_name(path), 0, 0, "", text) for path, text in wrong.values()]
-        )
-    return found
+            shutil.copytree(python.parent, folder, ignore=NOT_COPIED)
 
 
 class _NotExported(ProjectError):
@@ -363,16 +297,7 @@ def _check_options(project: Project, options: ExportOptions) -> None:
         valid_domain(str(options.domain_id), "-d/--domain-id")
     if options.peers is not None:
         named_peers(options.peers)
-    if options.registry and not _REGISTRY.fullmatch(options.registry):
-        raise UsageError(
-            f"--registry {options.registry!r}: no name of an image can begin so: give a registry"
-            " and a path in lower case, as in registry.lab:5000/robots"
-        )
-    if options.volume_claim and not _CLAIM.fullmatch(options.volume_claim):
-        raise UsageError(
-            f"--volume-claim {options.volume_claim!r}: is no name for Kubernetes: give lower case"
-            " letters, digits, - and ., at most 253, with a letter or digit at both ends"
-        )
+    check_names(options)
 
 
 @contextlib.contextmanager

@@ -329,6 +329,14 @@ class LaunchOptions(Request):
 FORMS = ("compose", "swarm", "kubernetes", "slurm")
 
 
+_LABEL = "[a-z0-9](?:[a-z0-9-]*[a-z0-9])?"
+_CLAIM = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*")  # RFC 1123
+# https://github.com/distribution/reference: a host, or a part of the path, and further parts.
+_PART = r"[a-z0-9]+(?:(?:\.|__?|-+)[a-z0-9]+)*"
+_HOST = rf"(?:(?i:{_LABEL}(?:\.{_LABEL})*)|\[[0-9A-Fa-f:]+\])(?::[0-9]+)?"
+_REGISTRY = re.compile(rf"(?:{_HOST}|{_PART})(?:/{_PART})*/?")
+
+
 def _placed(text: str) -> tuple[str, int]:
     node, _, number = text.rpartition("=")
     try:
@@ -490,3 +498,17 @@ class SweepOptions:
     on_row: OnRow | None = option(
         help="called with the number of a run, of how many, and its row", is_recorded=False
     )
+
+
+def check_names(options: ExportOptions) -> None:
+    """Raise ``UsageError`` for a registry or a claim that an engine would refuse later."""
+    if options.registry and not _REGISTRY.fullmatch(options.registry):
+        raise UsageError(
+            f"--registry {options.registry!r}: no name of an image can begin so: give a registry"
+            " and a path in lower case, as in registry.lab:5000/robots"
+        )
+    if options.volume_claim and not _CLAIM.fullmatch(options.volume_claim):
+        raise UsageError(
+            f"--volume-claim {options.volume_claim!r}: is no name for Kubernetes: give lower case"
+            " letters, digits, - and ., at most 253, with a letter or digit at both ends"
+        )
