@@ -21,6 +21,7 @@ from typing import Any
 
 from neuros.analysis.run_record import consumed_percent
 from neuros.api.live import LiveRun
+from neuros.api.plan import time_problems
 from neuros.api.project import Project, override_texts, value_text
 from neuros.api.request import Request, SweepOptions
 from neuros.api.run import Run, frame_of
@@ -28,7 +29,7 @@ from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 from neuros.executors.executor import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
-from neuros.recording.run_file import RUN_FILE
+from neuros.recording.run_file import RUN_FILE, read_object
 
 _PLAN_NAME = "sweep.json"
 _LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
@@ -102,10 +103,11 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     points = points_of(values, [int(seed) for seed in options.seeds], options.repeat)
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
-    resources = _check_all(project, points)
+    request = Request(backend=options.backend, duration=options.duration, record=options.record)
+    resources = _check_all(project, points, request)
     folder = _sweep_folder(project, options)
     with _locked_folder(folder):
-        return _Sweeping(project, points, folder, options).run(resources)
+        return _Sweeping(project, points, folder, options, request).run(resources)
 
 
 def _values(given: Mapping[str, Any] | Sequence[str] | None) -> dict[str, list[Any]]:
@@ -132,6 +134,7 @@ class _Sweeping:
         points: Sequence[Point],
         folder: Path,
         options: SweepOptions,
+        request: Request,
     ) -> None:
         names = short_names(list(points[0].settings))
         self._name = project.name
@@ -140,7 +143,6 @@ class _Sweeping:
         self._points = {point.folder_name(names): point for point in points}
         self._rows: dict[str, dict[str, Any]] = {}
         self._next_save_s = 0.0
-        request = Request(backend=options.backend, duration=options.duration, record=options.record)
         self._jobs = {
             name: SweepJob(
                 project,
@@ -244,7 +246,7 @@ def _as_list(given: Any) -> list[Any]:
     return [given] if is_one else list(given)
 
 
-def _check_all(project: Project, points: Sequence[Point]) -> JobResources:
+def _check_all(project: Project, points: Sequence[Point], request: Request) -> JobResources:
     """Check the project with every point; returns what is enough for each of its runs.
 
     Raises ``ProjectError`` with all problems.
@@ -253,7 +255,9 @@ def _check_all(project: Project, points: Sequence[Point]) -> JobResources:
     needs: set[JobResources] = set()
     for point in points:
         try:
-            needs.add(JobResources.of(project.check_with(point.settings, point.seed)))
+            checked = project.check_with(point.settings, point.seed)
+            problems += time_problems(checked, checked.nodes, request.end)
+            needs.add(JobResources.of(checked))
         except ProjectError as error:
             problems += error.problems
     if problems:
@@ -273,13 +277,13 @@ def _sweep_folder(project: Project, options: SweepOptions) -> Path:
     file = folder / _PLAN_NAME
     try:
         if file.exists():
-            _check_same(json.loads(file.read_text("utf-8")), plan, folder)
+            _check_same(read_object(file), plan, folder)
             return folder
         if folder.exists() and any(folder.iterdir()):
             raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
         folder.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(plan, indent=2) + "\n", "utf-8")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EnvironmentFault) as error:
         raise UsageError(f"{folder} cannot be used ({error}): name another one with -o") from error
     return folder
 
@@ -302,10 +306,10 @@ def _locked_folder(folder: Path) -> Iterator[None]:
 def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
     for name, value in now.items():
         if before.get(name) != value:
-            what = "the project's files" if name == "project_sha256" else f"its {name}"
+            is_text = name == "project_sha256"
+            what = "the project's files differ" if is_text else f"its {name} differs"
             raise UsageError(
-                f"{folder} holds a sweep that is not this one ({what} differ):"
-                " name another folder with -o"
+                f"{folder} holds a sweep that is not this one ({what}): name another folder with -o"
             )
 
 

@@ -101,6 +101,35 @@ def test_the_folder_of_another_sweep_is_refused(tmp_path: Path) -> None:
         neuros.sweep(project, output="full")
 
 
+@pytest.mark.parametrize("content", ["[]", "5", "{", "\udcff"])
+def test_a_folder_whose_plan_is_damaged_is_refused(tmp_path: Path, content: str) -> None:
+    project = dice(tmp_path)
+    Path("table").mkdir()
+    Path("table/sweep.json").write_text(content, "utf-8", "surrogateescape")
+    with pytest.raises(UsageError, match=r"sweep\.json is broken.* name another one with -o"):
+        neuros.sweep(project, output="table")
+
+
+def test_a_plan_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    project = dice(tmp_path)
+    Path("table").mkdir()
+    os.mkfifo("table/sweep.json")
+    with pytest.raises(UsageError, match="it is not an ordinary file"):
+        neuros.sweep(project, output="table")
+
+
+def test_a_duration_that_is_refused_leaves_no_folder(tmp_path: Path) -> None:
+    project = dice(tmp_path)
+    with pytest.raises(UsageError, match="--duration inf: give seconds"):
+        neuros.sweep(project, duration="inf", output="table")
+    with pytest.raises(ProjectError, match="exactly one node that owns time: none"):
+        neuros.sweep(project, duration="1sim", output="table")
+    assert not Path("table").exists()
+    assert neuros.sweep(project, duration=60, backend="in-process", output="table").rows
+    with pytest.raises(UsageError, match=r"is not this one \(its duration differs\): name another"):
+        neuros.sweep(project, duration=61, backend="in-process", output="table")
+
+
 def test_a_folder_is_that_of_one_sweep_at_a_time(tmp_path: Path) -> None:
     project = dice(tmp_path)
 
