@@ -5,9 +5,11 @@ A deployment stands apart from the project: an experiment does not know where it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from neuros.errors import Problem, ProjectError
 from neuros.project.model import Project
@@ -19,6 +21,7 @@ HERE = "here"
 """The machine of the launcher, which needs no entry."""
 TIMEOUT_S = 5.0
 _WAYS = ("ssh", "docker", "through")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
         known.add(name)
         if any(f"{each}/".startswith(f"{host.pointer}/") for each in wrong):
             continue
+        found += _control_characters(host)
         ways = [key for key in _WAYS if key in host.value]
         if name == HERE and ways:
             text = f"'{HERE}' is the launching machine, which needs no '{ways[0]}'"
@@ -122,6 +126,9 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
         elif host.value.get("docker") is not None and "neuros" in host.value:
             text = "has no effect with 'docker': NeuROS comes into the containers by itself"
             found.append(host.value["neuros"].key_problem(text, "leave it out"))
+        if (docker := host.value.get("docker")) is not None and (why := _unusable(docker.value)):
+            hint = "ssh://USER@HOST, tcp://HOST:PORT or unix:///PATH"
+            found.append(docker.problem(f"is no address of a Docker engine: {why}", hint))
     names = None if project is None else [node.name for node in project.nodes]
     for node, host in root.members("nodes").items():
         if isinstance(host.value, str) and host.value not in known:
@@ -131,3 +138,22 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
             text, hint = f"the project has no node '{node}'", did_you_mean(node, names)
             found.append(host.key_problem(text, hint))
     return found
+
+
+def _control_characters(host: Element) -> Iterator[Problem]:
+    """Texts of a host that no argument of a command can be, or that nobody would see."""
+    for key in host.value.values():
+        for each in key.value if isinstance(key.value, list) else [key]:
+            if strange := _CONTROL.search(each.value):
+                text = f"has the control character \\u{ord(strange[0]):04x}"
+                yield each.problem(text, "remove it")
+
+
+def _unusable(address: str) -> str:
+    """Why there can be no Docker engine at an address; empty if there can."""
+    try:
+        where = urlsplit(address)
+        port = where.port
+    except ValueError as error:
+        return str(error)
+    return "the port is missing" if where.scheme == "tcp" and port is None else ""

@@ -106,6 +106,41 @@ def test_mistakes_about_docker_engines_are_told(tmp_path: Path) -> None:
     ]
 
 
+def test_an_address_that_no_docker_engine_can_have_is_told(tmp_path: Path) -> None:
+    reasons = {
+        "tcp://[::": "Invalid IPv6 URL",
+        "tcp://box": "the port is missing",
+        "tcp://box:99999": "Port out of range 0-65535",
+        "ssh://box:x": "Port could not be cast to integer value as 'x'",
+    }
+    usable = ["tcp://[::1]:2375", "tcp://box:2375", "ssh://me@box:22/run/docker.sock", "unix:///s"]
+    for address in usable:
+        assert load(tmp_path, {"hosts": {"box": {"docker": address}}, "nodes": {}})
+    hosts = {f"box{number}": {"docker": address} for number, address in enumerate(reasons)}
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": {}}) == [
+        f"/hosts/box{number}/docker: is no address of a Docker engine: {why}"
+        for number, why in enumerate(reasons.values())
+    ]
+
+
+def test_control_characters_are_told_wherever_they_are(tmp_path: Path) -> None:
+    hosts = {
+        "robot": {"ssh": "pi@robot\0", "ssh_options": ["-p", "2\n"], "neuros": "\x7f"},
+        "cluster": {"through": ["srun", "\0"], "address": "a\tb"},
+        "box": {"docker": "ssh://box\n"},
+        "here": {"address": "10.0.0.1\x9b"},
+    }
+    assert problems_of(tmp_path, {"hosts": hosts, "nodes": {}}) == [
+        "/hosts/box/docker: has the control character \\u000a",
+        "/hosts/cluster/address: has the control character \\u0009",
+        "/hosts/cluster/through/1: has the control character \\u0000",
+        "/hosts/here/address: has the control character \\u009b",
+        "/hosts/robot/neuros: has the control character \\u007f",
+        "/hosts/robot/ssh: has the control character \\u0000",
+        "/hosts/robot/ssh_options/1: has the control character \\u000a",
+    ]
+
+
 def test_mistakes_are_told_with_problems_of_form(tmp_path: Path) -> None:
     hosts = {"neither": {}, "robot": {"ssh": 5}, "none": 3}
     nodes = {"eye": "robbot", "brian": "robot", "brain": 7}
