@@ -25,6 +25,7 @@ _INSTALLED = re.compile(r"@/*install/(?P<package>\w+)/*(?P<path>.*)", re.DOTALL)
 
 NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
 """What of a folder goes into no image, for ``shutil.copytree``."""
+_OF_ENVIRONMENTS = "pyvenv.cfg"  # PEP 405
 _MOST_LINKED = 100_000
 _INSTEAD = "put a copy in place of the link, or remove it"
 
@@ -187,7 +188,7 @@ def _specs(name: str) -> list[ModuleSpec | None]:
 def files_to_copy(project: Path, output: Path) -> tuple[set[Path], list[Problem]]:
     """The files and folders of a project that go into its images, by paths that may have links.
 
-    ``output``, the folder to be written, is none of them, and neither is a link to nothing.
+    ``output``, the folder to be written, is none of them; neither is a virtual environment, or a link to nothing.
     Problems are every link out of the project or into a circle, and whatever is neither a file nor
     a folder.
     """
@@ -225,6 +226,8 @@ def files_to_copy(project: Path, output: Path) -> tuple[set[Path], list[Problem]
                 folders.clear()
                 break
             if stat.S_ISDIR(mode):
+                if (target / _OF_ENVIRONMENTS).is_file():
+                    continue
                 if target in around:
                     wrong[place] = path, f"leads back to a folder that it lies in: {_INSTEAD}"
                     continue

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -261,6 +262,15 @@ def test_a_link_within_the_project_stands_for_a_copy_and_one_to_nothing_is_left_
         assert (copy / name).read_text() == "kept by a tool"
         assert not (copy / name).is_symlink()
     assert {path.name for path in copy.iterdir()}.isdisjoint({"old_data", ".kept"})
+
+
+def test_a_virtual_environment_in_the_project_is_left_out(project: Project) -> None:
+    place = project.folder / "venv" / "bin"
+    place.mkdir(parents=True)
+    (place.parent / "pyvenv.cfg").touch()
+    (place / "python").symlink_to(sys.executable)
+    assert services(project, "compose")
+    assert not (project.folder.parent / "compose/image/project/venv").exists()
 
 
 def test_links_out_of_the_project_or_in_a_circle_and_devices_are_all_named_before_it_is_written(

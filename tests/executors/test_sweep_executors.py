@@ -134,7 +134,8 @@ OPENED: Counter[str] = Counter()
 
 
 def _count(event: str, arguments: tuple[Any, ...]) -> None:
-    if event == "open" and isinstance(arguments[0], str | os.PathLike):
+    # What open() opens by a function of its own, that tells, too, without a mode.
+    if event == "open" and isinstance(arguments[0], str | os.PathLike) and arguments[1]:
         OPENED[os.fspath(arguments[0])] += 1
 
 
