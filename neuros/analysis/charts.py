@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from neuros.analysis.packets import Numbers
 from neuros.analysis.run_record import PastRun
 from neuros.engine.metrics import TimeBudget
 from neuros.project.graph import Place, guarantee, lay_out, port_names
+from neuros.project.scanner import read_bytes
 from neuros.recording.system_load import FILE_NAME
 
 # Okabe and Ito, Color Universal Design (2008).
@@ -213,17 +215,30 @@ def load_figure(run: PastRun) -> Any | None:
     return figure
 
 
-def read_load(file: Path) -> dict[str, list[float]]:
+def read_load(
+    file: Path, complain: Callable[[str], object] = lambda _: None
+) -> dict[str, list[float]]:
     """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
 
     The last row of a run that was cut off may be broken, and is left out.
+
+    Args:
+        complain: told if it is damaged; what comes before the damage is returned.
     """
+    rows: list[list[str]] = []
     try:
-        with open(file, encoding="utf-8", newline="") as lines:
-            header, *rows = csv.reader(lines)
-    except (OSError, ValueError):
+        text = read_bytes(file).decode("utf-8", "replace")
+        rows.extend(csv.reader(io.StringIO(text, newline="")))
+    except FileNotFoundError:
         return {}
+    except (OSError, csv.Error):
+        complain(f"the rest of {file}: the file is damaged")
+    header = rows.pop(0) if rows else []
     series: dict[str, list[float]] = {name: [] for name in header}
+    memory = {name.replace(".cpu_percent", ".memory_bytes") for name in header}
+    if len(series) < len(header) or not memory <= {*header}:
+        complain(f"the figures in {file}: the file is damaged")
+        return {}
     for row in rows:
         try:
             numbers = [float(cell) if cell else float("nan") for cell in row]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import re
 import shlex
 import zlib
@@ -30,6 +31,7 @@ from neuros.bag import RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
 from neuros.project.dashboard import ARRAYS, SPIKES
+from neuros.project.scanner import read_bytes
 from neuros.recording.columns import has_simulated_time
 from neuros.registry import back_end_of
 
@@ -310,15 +312,23 @@ def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str
 
 
 def _packed(numbers: npt.NDArray[Any]) -> str:
-    return base64.b64encode(zlib.compress(numbers.tobytes())).decode()
+    return _compressed(numbers.tobytes())
 
 
-def world_pages(run: PastRun) -> dict[str, str]:
-    """Pages by node, of those whose world was recorded."""
+def _compressed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data)).decode()
+
+
+def world_pages(run: PastRun, complain: Callable[[str], object] = lambda _: None) -> dict[str, str]:
+    """Pages by node, of those whose world was recorded.
+
+    Args:
+        complain: told of each file that is damaged; what comes before the damage is shown.
+    """
     scripts = {key: (_STATIC / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
     found = {}
     for name in run.nodes:
-        scenes = list(_scenes(run.folder / name / WORLD_LOG))
+        scenes = list(_scenes(run.folder / name / WORLD_LOG, complain))
         if scenes:
             title = f"World of {name} in {run.name}"
             content = _in_script(scenes)
@@ -326,38 +336,64 @@ def world_pages(run: PastRun) -> dict[str, str]:
     return found
 
 
-def _scenes(file: Path) -> Iterator[dict[str, Any]]:
-    """Each geometry, with the times and poses of its frames; what stood still is left out.
-
-    Where the simulation was reset, time goes on.
-    """
-    scenes: list[tuple[str, list[tuple[float, str]]]] = []
-    before_s, last_s = 0.0, -1.0
-    for line in _lines(file):
-        if "geometry" in line:
-            scenes.append((line["geometry"], []))
-        for _, sim_s, poses in line["frames"]:
-            if before_s + sim_s < last_s:
-                before_s = last_s
-            if before_s + sim_s > last_s or not scenes[-1][1]:
-                last_s = before_s + sim_s
-                scenes[-1][1].append((last_s, poses))
-    stride = -(-sum(len(frames) for _, frames in scenes) // MOST_FRAMES)
-    for geometry, frames in scenes:
+def _scenes(file: Path, complain: Callable[[str], object]) -> Iterator[dict[str, Any]]:
+    """Each geometry, with the times and poses of its frames; what stood still is left out."""
+    world = _World()
+    try:
+        for line in read_bytes(file).splitlines():
+            world.add(line)
+    except FileNotFoundError:
+        return
+    except (OSError, *_DAMAGE):
+        complain(f"the rest of {file}: the file is damaged")
+    stride = -(-sum(len(frames) for _, frames in world.scenes) // MOST_FRAMES)
+    for geometry, frames in world.scenes:
         if kept := frames[::stride]:
-            poses = b"".join(base64.b64decode(poses) for _, poses in kept)
             yield {
-                "geometry": json.loads(geometry),
+                "geometry": geometry,
                 "times_s": [time_s for time_s, _ in kept],
-                "poses": base64.b64encode(zlib.compress(poses)).decode(),
+                "poses": _compressed(b"".join(poses for _, poses in kept)),
             }
 
 
-def _lines(file: Path) -> Iterator[dict[str, Any]]:
-    """Whole lines of the file; a node that was killed may have left half of one."""
-    if file.is_file():
-        for line in file.read_text("utf-8").splitlines():
-            try:
-                yield json.loads(line)
-            except ValueError:
-                return
+# What comes of values of another type or length than a line should have.
+_DAMAGE = (ValueError, TypeError, LookupError, OverflowError, RecursionError)
+
+
+class _World:
+    """A recorded world, from the lines of its file.
+
+    Attributes:
+        scenes: each geometry, with times in seconds and poses; where the simulation was reset, time
+            goes on.
+    """
+
+    def __init__(self) -> None:
+        self.scenes: list[tuple[dict[str, Any], list[tuple[float, bytes]]]] = []
+        self._before_s, self._last_s = 0.0, -1.0
+
+    def add(self, line: bytes) -> None:
+        """Add what a line has. Raises one of ``_DAMAGE`` where that is not what a node writes."""
+        content = json.loads(line)
+        if "geometry" in content:
+            geometry = json.loads(content["geometry"])
+            # Else the page could not be written, or not be read by JavaScript (NaN).
+            json.dumps([[[geometry]]], allow_nan=False)
+            if not isinstance(geometry, dict):
+                raise TypeError("a geometry is an object")
+            self.scenes.append((geometry, []))
+        for _, sim_s, poses in content["frames"]:
+            self._add_frame(sim_s, base64.b64decode(poses, validate=True))
+
+    def _add_frame(self, sim_s: float, poses: bytes) -> None:
+        frames = self.scenes[-1][1]
+        if len(poses) % 4 or (frames and len(poses) != len(frames[0][1])):
+            raise ValueError("poses are 32-bit numbers, of the same bodies in all frames")
+        if self._before_s + sim_s < self._last_s:
+            self._before_s = self._last_s
+        time_s = self._before_s + sim_s
+        if not math.isfinite(time_s):
+            raise ValueError("times are finite")
+        if time_s > self._last_s or not frames:
+            self._last_s = time_s
+            frames.append((time_s, poses))

@@ -385,14 +385,16 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _missing_lists(run: PastRun) -> list[str]:
+    from neuros.analysis.charts import read_load
     from neuros.recording.system_load import FILE_NAME
 
-    missing = []
+    missing: list[str] = []
     silent = [name for name, node in run.nodes.items() if not node.get("accounting")]
     if silent and len(silent) < len(run.nodes):
         missing.append(f"what {', '.join(silent)} did with its time: it never reported")
     if not (run.folder / FILE_NAME).is_file():
         missing.append("processor and memory: the run was made without -m")
+    read_load(run.folder / FILE_NAME, missing.append)
     if not any(len(packets.sent_ns) for packets in run.packets.values()) and run.connections:
         missing.append("times of single packets: no node has listed any")
     if not run.traces and run.nodes:

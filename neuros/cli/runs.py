@@ -70,7 +70,8 @@ def _report(options: argparse.Namespace) -> int:
     figures = _figures(run)
     text = report_page(run, findings, {t: (text, data) for t, text, data in figures.values()})
     files = {f"{name}.png": data for name, (_, _, data) in figures.items()}
-    worlds = {f"world_{node}.html": page.encode() for node, page in world_pages(run).items()}
+    found = world_pages(run, lambda text: print(f"missing: {text}"))
+    worlds = {f"world_{node}.html": page.encode() for node, page in found.items()}
     try:
         panels = panels_page(run)
     except EnvironmentFault as fault:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import pytest
 from neuros.analysis import run_pages
 from neuros.analysis.run_record import PastRun
 from neuros.node.logs import WORLD_LOG, WorldLog
+
+POSE = base64.b64encode(bytes(28))
 
 
 class World:
@@ -56,9 +59,13 @@ def log(run: PastRun) -> WorldLog:
     return WorldLog(run.folder / "robot", Logger())  # type: ignore[arg-type]
 
 
-def scenes(run: PastRun) -> list[dict[str, Any]]:
+def fail(complaint: str) -> None:
+    raise AssertionError(complaint)
+
+
+def scenes(run: PastRun, complain: Callable[[str], object] = fail) -> list[dict[str, Any]]:
     """What the page of the robot holds."""
-    found = run_pages.world_pages(run)
+    found = run_pages.world_pages(run, complain)
     assert [*found] == ["robot"]
     text = found["robot"].partition('<script type="application/json" id="scenes">')[2]
     found: list[dict[str, Any]] = json.loads(text.partition("</script>")[0])
@@ -116,13 +123,55 @@ def test_of_a_long_recording_every_kth_frame_is_shown(
     assert scenes(run)[0]["x"] == [0, 3, 6, 9]
 
 
-def test_half_a_line_of_a_node_that_was_killed_is_left_out(run: PastRun, log: WorldLog) -> None:
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"version": "1", "fra',
+        b'{"version": "\xc3',
+        b"5",
+        b"[1]",
+        b'{"geometry": "{}"}',
+        b'{"geometry": "x", "frames": []}',
+        b'{"geometry": "[]", "frames": []}',
+        b'{"geometry": "{\\"size\\": NaN}", "frames": []}',
+        b'{"geometry": 5, "frames": []}',
+        b'{"frames": 5}',
+        b'{"frames": [[0, 1.0]]}',
+        b'{"frames": [[0, 1.0, "A"]]}',
+        b'{"frames": [[0, 1.0, "AAAA"]]}',
+        b'{"frames": [[0, "1", "%s"]]}' % POSE,
+        b'{"frames": [[0, NaN, "%s"]]}' % POSE,
+        b'{"frames": [[0, 1%s, "%s"]]}' % (b"0" * 400, POSE),
+        b"[" * 200_000,
+        b'{"geometry": "%s", "frames": []}' % (b"[" * 200_000),
+    ],
+    ids=lambda line: line[:40].decode("ascii", "replace"),
+)
+def test_what_comes_before_a_damage_is_shown_and_the_damage_is_named(
+    run: PastRun, log: WorldLog, line: bytes
+) -> None:
     world = World()
     world.at(0, 0)
     log.write(world.look)
-    with (run.folder / "robot" / WORLD_LOG).open("a") as file:
-        file.write('{"version": "1", "fra')
-    assert scenes(run)[0]["x"] == [0]
+    with (run.folder / "robot" / WORLD_LOG).open("ab") as file:
+        file.write(line)
+    complaints: list[str] = []
+    assert scenes(run, complaints.append)[0]["x"] == [0]
+    assert complaints == [f"the rest of {run.folder / 'robot' / WORLD_LOG}: the file is damaged"]
+
+
+def test_frames_without_a_geometry_are_no_world(run: PastRun) -> None:
+    complaints: list[str] = []
+    (run.folder / "robot" / WORLD_LOG).write_text('{"frames": [[0, 1.0, "AAAA"]]}')
+    assert run_pages.world_pages(run, complaints.append) == {}
+    assert len(complaints) == 1
+
+
+def test_a_world_is_a_file_and_no_pipe(run: PastRun) -> None:
+    complaints: list[str] = []
+    os.mkfifo(run.folder / "robot" / WORLD_LOG)
+    assert run_pages.world_pages(run, complaints.append) == {}
+    assert len(complaints) == 1
 
 
 def test_a_world_that_cannot_be_recorded_is_told_once_and_ends_no_run(tmp_path: Path) -> None:

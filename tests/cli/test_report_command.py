@@ -73,6 +73,25 @@ def test_load_timeline_and_ticks_are_drawn_where_they_were_kept(tmp_path: Path) 
     assert {"real_time", "ticks", "system_load"} <= names
 
 
+@pytest.mark.parametrize(
+    ("load", "has_figure"),
+    [
+        (f"{LOAD}{'9' * 200_000}\n", True),
+        ("time_s,time_s\n1,2\n", False),
+        ("time_s,a.cpu_percent\n1,2\n", False),
+    ],
+    ids=["long field", "column twice", "half of a node"],
+)
+def test_of_a_damaged_load_what_can_be_read_is_shown(
+    run: Path, capsys: pytest.CaptureFixture[str], load: str, has_figure: bool
+) -> None:
+    (run / "system_load.csv").write_text(load)
+    assert main(["report", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"missing: the \w+ (of|in) .*system_load\.csv: the file is damaged", said)
+    assert (run / "report/system_load.png").exists() == has_figure
+
+
 def test_a_run_without_anything_is_no_failure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

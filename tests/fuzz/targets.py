@@ -17,6 +17,7 @@ import struct
 import tempfile
 import warnings
 from array import array
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -26,10 +27,11 @@ from zlib import crc32
 
 import neuros.bag
 from neuros import control
+from neuros.analysis.charts import load_figure
 from neuros.analysis.comparison import RecordedPackets, compare, comparison_rows
 from neuros.analysis.findings import findings_of
 from neuros.analysis.recorded_node import RecordedNode, recorded_node
-from neuros.analysis.run_pages import figures_of, report_page
+from neuros.analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
 from neuros.analysis.run_record import open_for_review, open_run
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, encode, kind_of
@@ -313,8 +315,11 @@ def review(run: Path, data: bytes) -> None:
         opened = open_for_review(run)
         report_page(opened, findings_of(opened), {})
         comparison_rows([opened])
+        world_pages(opened)
         if crc32(data) % 32 == 0:  # they take seconds
             figures_of(opened)
+    with allowed(NeurosError):
+        panels_page(open_run(run))
     with allowed(NeurosError):
         compare(open_run(run), open_run(a_run()[1]), RecordedPackets())
 
@@ -365,6 +370,40 @@ def packet_lists(data: bytes, folder: Path) -> None:
     run = run_with(f"{node}/packets/{name}", data, folder)
     review(run, data)
     replay(run)
+
+
+POSE = b64encode(bytes(28)).decode()
+WORLD = b"".join(
+    json.dumps(line).encode() + b"\n"
+    for line in (
+        {"version": "1", "frames": [[0.0, 0.0, POSE]], "geometry": '{"bodies": []}'},
+        {"version": "1", "frames": [[0.5, 1.0, POSE], [0.7, 1.5, POSE]]},
+    )
+)
+
+
+@target(lambda: [WORLD, *WORLD.splitlines()], change_json, change_bytes, change_text)
+def world_log(data: bytes, folder: Path) -> None:
+    run = run_with("a/world.jsonl", data, folder)
+    for page in world_pages(open_for_review(run)).values():
+        _, _, text = page.partition('id="scenes">')
+        json.loads(text.partition("</script>")[0], parse_constant=lambda name: 1 / 0)
+
+
+LOAD = b"""\
+time_s,unix_time_s,core0_percent,memory_used_bytes,a.cpu_percent,a.memory_bytes,a.threads
+1.0,1700000001,50.0,1000000,40.0,500000,3
+2.0,1700000002,60.0,1000000,,,
+"""
+
+
+@target(lambda: [LOAD], change_text, change_bytes)
+def system_load(data: bytes, folder: Path) -> None:
+    run = run_with("system_load.csv", data, folder)
+    review(run, data)
+    figure = load_figure(open_for_review(run))
+    if figure is not None and crc32(data) % 8 == 0:  # it takes half a second
+        png(figure)
 
 
 @target(seed_of("bag/bag.mcap"), change_bytes)
