@@ -189,8 +189,8 @@ def files_to_copy(project: Path, output: Path) -> tuple[set[Path], list[Problem]
     """The files and folders of a project that go into its images, by paths that may have links.
 
     ``output``, the folder to be written, is none of them; neither is a virtual environment, or a
-    link to nothing. Problems are every link out of the project or into a circle, and whatever is neither a file nor
-    a folder.
+    link to nothing. Problems are every link out of the project or into a circle, and whatever is
+    neither a file nor a folder.
     """
     root, own = project.resolve(), output.resolve()
     found: set[Path] = set()
