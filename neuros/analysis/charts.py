@@ -29,6 +29,7 @@ _DPI, _WIDTH_IN = 110, 9.5
 _POINTS = 500
 _MOST_TICKS = 12
 _DOTTED = (0, (2, 2))
+_MOST = 2.0**63  # of what is measured; a figure cannot have axes of any length
 
 
 def colour(index: int) -> str:
@@ -220,7 +221,7 @@ def read_load(
 ) -> dict[str, list[float]]:
     """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
 
-    The last row of a run that was cut off may be broken, and is left out.
+    Rows with what is no number are left out, as the last one of a run that was cut off.
 
     Args:
         complain: told if it is damaged; what comes before the damage is returned.
@@ -244,7 +245,7 @@ def read_load(
             numbers = [float(cell) if cell else float("nan") for cell in row]
         except ValueError:
             continue
-        if len(numbers) == len(header):
+        if len(numbers) == len(header) and not any(abs(each) > _MOST for each in numbers):
             for name, number in zip(header, numbers, strict=True):
                 series[name].append(number)
     return series

@@ -348,7 +348,8 @@ def _scenes(file: Path, complain: Callable[[str], object]) -> Iterator[dict[str,
         complain(f"the rest of {file}: the file is damaged")
     stride = -(-sum(len(frames) for _, frames in world.scenes) // MOST_FRAMES)
     for geometry, frames in world.scenes:
-        if kept := frames[::stride]:
+        if frames:
+            kept = frames[::stride]
             yield {
                 "geometry": geometry,
                 "times_s": [time_s for time_s, _ in kept],

@@ -160,6 +160,11 @@ def test_what_comes_before_a_damage_is_shown_and_the_damage_is_named(
     assert complaints == [f"the rest of {run.folder / 'robot' / WORLD_LOG}: the file is damaged"]
 
 
+def test_a_world_without_frames_has_no_page(run: PastRun) -> None:
+    (run.folder / "robot" / WORLD_LOG).write_text('{"geometry": "{}", "frames": []}')
+    assert run_pages.world_pages(run, fail) == {}
+
+
 def test_frames_without_a_geometry_are_no_world(run: PastRun) -> None:
     complaints: list[str] = []
     (run.folder / "robot" / WORLD_LOG).write_text('{"frames": [[0, 1.0, "AAAA"]]}')

@@ -73,6 +73,12 @@ def test_load_timeline_and_ticks_are_drawn_where_they_were_kept(tmp_path: Path) 
     assert {"real_time", "ticks", "system_load"} <= names
 
 
+def test_a_load_with_a_time_without_bounds_is_drawn_without_it(run: Path) -> None:
+    (run / "system_load.csv").write_text(f"{LOAD}\n1e308,1,2,3,4,5,6\n")
+    assert main(["report", str(run)]) == 0
+    assert (run / "report/system_load.png").exists()
+
+
 @pytest.mark.parametrize(
     ("load", "has_figure"),
     [
