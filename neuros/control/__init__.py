@@ -137,7 +137,7 @@ class Report(Message):
         running_since_s: since when the node has been initialised, on the monotonic clock.
         metrics: ``None`` before the node has begun.
         stack: where the plugin stands, if its hook runs for long.
-        faults: what cannot be recorded.
+        fault: what cannot be recorded.
         foreign: by connection, messages from others than its two nodes.
         compressed: by connection on which the node compresses, bytes before and after.
         is_driving: whether some hook starts with no packet for it.
@@ -152,7 +152,7 @@ class Report(Message):
     running_since_s: float | None = None
     metrics: Metrics | None = None
     stack: Stack | None = None
-    faults: tuple[str, ...] = ()
+    fault: str | None = None
     foreign: Mapping[str, int] = field(default_factory=dict)
     compressed: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     is_driving: bool = False

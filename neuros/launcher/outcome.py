@@ -129,7 +129,8 @@ class Outcome:
         name = report.node
         if not self.has_final_report(name):
             self.reports[name] = report
-            self.faults += [each for each in report.faults if each not in self.faults]
+            if report.fault and report.fault not in self.faults:
+                self.faults.append(report.fault)
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -92,18 +92,21 @@ class NodeReports:
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
             "stack": self._stack(metrics),
-            "faults": tuple(self._faults()),
+            "fault": self._fault,
             "foreign": {name: n for name, n in self._transport.foreign.items() if n},
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
         }
 
-    def _faults(self) -> Iterator[str]:
+    @property
+    def _fault(self) -> str | None:
+        """What cannot be recorded: where a disk is full, one sentence of each node is enough."""
         if self._packet_log is not None and self._packet_log.failure is not None:
-            yield self._packet_log.failure
+            return self._packet_log.failure
         for part in (self._recorder, self._world_log):
             if part is not None and part.failure is not None:
-                yield f"node '{self._file.node.name}': {part.failure}"
+                return f"node '{self._file.node.name}': {part.failure}"
+        return None
 
     def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
         """The stack of the plugin, if its hook runs for long, or the node is to end."""
