@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from neuros.analysis.packets import Numbers
-from neuros.analysis.run_record import PastRun
+from neuros.analysis.run_record import PastRun, read_load
 from neuros.engine.metrics import TimeBudget
 from neuros.project.graph import Place, guarantee, lay_out, port_names
-from neuros.project.scanner import read_bytes
 from neuros.recording.system_load import FILE_NAME
 
 # Okabe and Ito, Color Universal Design (2008).
@@ -29,7 +25,6 @@ _DPI, _WIDTH_IN = 110, 9.5
 _POINTS = 500
 _MOST_TICKS = 12
 _DOTTED = (0, (2, 2))
-_MOST = 2.0**63  # of what is measured; a figure cannot have axes of any length
 
 
 def colour(index: int) -> str:
@@ -214,41 +209,6 @@ def load_figure(run: PastRun) -> Any | None:
     right.set(xlabel="wall time / s", ylabel="resident memory / MB", ylim=(0, None))
     add_legend(figure, 5)
     return figure
-
-
-def read_load(
-    file: Path, complain: Callable[[str], object] = lambda _: None
-) -> dict[str, list[float]]:
-    """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
-
-    Rows with what is no number are left out, as the last one of a run that was cut off.
-
-    Args:
-        complain: told if it is damaged; what comes before the damage is returned.
-    """
-    rows: list[list[str]] = []
-    try:
-        text = read_bytes(file).decode("utf-8", "replace")
-        rows.extend(csv.reader(io.StringIO(text, newline="")))
-    except FileNotFoundError:
-        return {}
-    except (OSError, csv.Error):
-        complain(f"the rest of {file}: the file is damaged")
-    header = rows.pop(0) if rows else []
-    series: dict[str, list[float]] = {name: [] for name in header}
-    memory = {name.replace(".cpu_percent", ".memory_bytes") for name in header}
-    if len(series) < len(header) or not memory <= {*header}:
-        complain(f"the figures in {file}: the file is damaged")
-        return {}
-    for row in rows:
-        try:
-            numbers = [float(cell) if cell else float("nan") for cell in row]
-        except ValueError:
-            continue
-        if len(numbers) == len(header) and not any(abs(each) > _MOST for each in numbers):
-            for name, number in zip(header, numbers, strict=True):
-                series[name].append(number)
-    return series
 
 
 _COLUMN_IN, _ROW_IN = 2.45, 1.12

@@ -7,7 +7,9 @@ run that was cut off or of an older version, too, and says what is missing. :fun
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from neuros.engine.metrics import TimeBudget, in_flight_and_lost, time_budget_of
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Budgets, Connection, NodeFile, Project
+from neuros.project.scanner import read_bytes
 from neuros.project.split import project_to_json
 from neuros.recording.run_file import FORMAT, RUN_FILE, check_record, read_object, read_run_file
 from neuros.registry import ran_in_one_process
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
     from neuros.launcher.outcome import Outcome
 
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
+_MOST = 2.0**63  # of what is measured; a figure cannot have axes of any length
 _STATES = ("executing", "waiting", "blocked", "idle")
 
 
@@ -385,7 +389,6 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _missing_lists(run: PastRun) -> list[str]:
-    from neuros.analysis.charts import read_load
     from neuros.recording.system_load import FILE_NAME
 
     missing: list[str] = []
@@ -510,3 +513,38 @@ def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool
 def _is_known(node: Mapping[str, Any]) -> bool:
     """Whether the figures of a node are those of its end."""
     return bool(node.get("report") == "final")
+
+
+def read_load(
+    file: Path, complain: Callable[[str], object] = lambda _: None
+) -> dict[str, list[float]]:
+    """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
+
+    Rows with what is no number are left out, as the last one of a run that was cut off.
+
+    Args:
+        complain: told if it is damaged; what comes before the damage is returned.
+    """
+    rows: list[list[str]] = []
+    try:
+        text = read_bytes(file).decode("utf-8", "replace")
+        rows.extend(csv.reader(io.StringIO(text, newline="")))
+    except FileNotFoundError:
+        return {}
+    except (OSError, csv.Error):
+        complain(f"the rest of {file}: the file is damaged")
+    header = rows.pop(0) if rows else []
+    series: dict[str, list[float]] = {name: [] for name in header}
+    memory = {name.replace(".cpu_percent", ".memory_bytes") for name in header}
+    if len(series) < len(header) or not memory <= {*header}:
+        complain(f"the figures in {file}: the file is damaged")
+        return {}
+    for row in rows:
+        try:
+            numbers = [float(cell) if cell else float("nan") for cell in row]
+        except ValueError:
+            continue
+        if len(numbers) == len(header) and not any(abs(each) > _MOST for each in numbers):
+            for name, number in zip(header, numbers, strict=True):
+                series[name].append(number)
+    return series
