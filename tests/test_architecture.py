@@ -43,7 +43,7 @@ PACKAGES = (
     Package(1, ("hooks", "time")),
     Package(1, ("project",)),
     Package(1, ("installation",)),
-    Package(0, ("files",)),
+    Package(0, ("ordinary_files",)),
     Package(1, ("caching",)),
     Package(2, ("engine",)),
     Package(3, ("ports", "control", "stacks", "options", "registry")),

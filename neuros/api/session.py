@@ -362,11 +362,11 @@ class Session:
             yield from (None for _ in range(rounds))
 
     def _run_sim(self, duration_s: float) -> bool:
-        """Grant many rounds at once, but so few that none begins after the end.
+        """Grant many rounds at once, but none that is to begin after the end.
 
-        Nodes that are stepped without the supervisor know the end, too. For the others: rounds may
-        gain different times, so they are taken to gain up to twice the most of so far on average,
-        and what is left is halved again and again.
+        In one process the nodes know the end, too. Elsewhere a round is taken to gain twice as much
+        as the largest average so far, so a grant covers half of what is left, or less. Where rounds
+        suddenly gain several times as much, some may begin after it.
         """
         end_s = self._sim_now() + duration_s
         count, at_rest, most_s = 1, 0, 0.0

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TextIO
 
 from neuros.control import Report
-from neuros.files import descriptor_of
+from neuros.ordinary_files import descriptor_of
 
 LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
 """What ROS 2 prints unless ``RCUTILS_CONSOLE_OUTPUT_FORMAT`` says otherwise."""

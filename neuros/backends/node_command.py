@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.files import open_ordinary
+from neuros.ordinary_files import open_ordinary
 from neuros.ports import NodeProgram
 from neuros.project.model import Node, NodeFile
 

@@ -24,7 +24,7 @@ from neuros.backends.node_command import (
     signal_in_words,
 )
 from neuros.errors import EnvironmentFault
-from neuros.files import open_log
+from neuros.ordinary_files import open_log
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of

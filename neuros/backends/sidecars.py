@@ -15,7 +15,7 @@ from pathlib import Path
 
 from neuros.backends.node_command import process_environment, with_libraries
 from neuros.errors import EnvironmentFault
-from neuros.files import open_log
+from neuros.ordinary_files import open_log
 
 END = b"end\n"
 """What the recorder is told when nothing more will come."""

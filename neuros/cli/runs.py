@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
-from neuros.files import write_whole
+from neuros.ordinary_files import write_whole
 from neuros.project.suggest import counted
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from neuros.errors import Problem
-from neuros.files import open_ordinary
+from neuros.ordinary_files import open_ordinary
 
 _MAX_DEPTH = 100
 _MOST_BYTES = 4 << 20

@@ -29,7 +29,7 @@ from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
-from neuros.files import write_whole
+from neuros.ordinary_files import write_whole
 from neuros.project.message_types import message_folder
 from neuros.recording.recording_plan import Topic
 

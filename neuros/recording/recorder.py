@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.files import open_ordinary
+from neuros.ordinary_files import open_ordinary
 from neuros.project.scanner import read_bytes
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recording_plan import (

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.files import write_whole
+from neuros.ordinary_files import write_whole
 from neuros.project.scanner import read_bytes
 from neuros.project.validate import mistake
 

@@ -22,7 +22,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
-from neuros.files import descriptor_of, make_folder, open_ordinary, write_whole
+from neuros.ordinary_files import descriptor_of, make_folder, open_ordinary, write_whole
 from neuros.ports import Way
 from neuros.project.scanner import read_bytes
 from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic

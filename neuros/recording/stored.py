@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault
-from neuros.files import open_ordinary
+from neuros.ordinary_files import open_ordinary
 from neuros.recording.bag_files import (
     CHANNEL,
     CHUNK,

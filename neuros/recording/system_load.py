@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from neuros.files import open_new
+from neuros.ordinary_files import open_new
 
 FILE_NAME = "system_load.csv"
 

@@ -13,7 +13,7 @@ from typing import Any
 from neuros.backends.docker.launcher import ToolContainer, find_tool_image
 from neuros.backends.sidecars import start_sidecar
 from neuros.errors import EnvironmentFault
-from neuros.files import write_whole
+from neuros.ordinary_files import write_whole
 from neuros.ports import BackEnd, Reaper
 from neuros.project.model import Port, Project
 from neuros.viewers.viewer import Shown, Viewer

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.node_command import last_line
-from neuros.files import make_folder, open_log, open_new, open_ordinary, write_whole
+from neuros.ordinary_files import make_folder, open_log, open_new, open_ordinary, write_whole
 from neuros.recording.recorder import counts_of
 from neuros.recording.recording_plan import Topic
 from neuros.recording.run_file import write_run_file
