@@ -10,9 +10,11 @@ import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _APPEND = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
 # What opening says of a file that is not there, of a link, and of a pipe that nobody reads.
 _NO_FILE = (errno.ENOENT, errno.ELOOP, errno.ENXIO)
@@ -71,11 +73,35 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder where there is none. Raises ``OSError``: also for a link to a folder."""
-    path.mkdir(exist_ok=True)
-    if path.is_symlink():
-        raise OSError(errno.ELOOP, "it is a link to another folder", str(path))
+@contextlib.contextmanager
+def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
+    """A path to the folder ``names`` below ``root``, for use within the block.
+
+    It leads to the same folder there, also if another takes its name meanwhile. ``root`` itself is
+    one that nobody else can replace.
+
+    Args:
+        makes: make folders that are missing.
+
+    Raises:
+        OSError: also if one of the names is that of a link.
+    """
+    descriptor = os.open(root, _FOLDER)
+    try:
+        for number, name in enumerate(names, 1):
+            if makes:
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(name, dir_fd=descriptor)
+            try:
+                below = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
+            except OSError as error:
+                path = root.joinpath(*names[:number])
+                raise OSError(error.errno, error.strerror, str(path)) from error
+            os.close(descriptor)
+            descriptor = below
+        yield Path(f"/proc/self/fd/{descriptor}")
+    finally:
+        os.close(descriptor)
 
 
 def _is_ordinary(descriptor: int) -> bool:

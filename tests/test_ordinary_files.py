@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.node_command import last_line
-from neuros.ordinary_files import make_folder, open_log, open_new, open_ordinary, write_whole
+from neuros.ordinary_files import folder_in, open_log, open_new, open_ordinary, write_whole
+from neuros.recording.bag_files import BagWriter
 from neuros.recording.recorder import counts_of
-from neuros.recording.recording_plan import Topic
+from neuros.recording.recording_plan import Stream, Topic
 from neuros.recording.run_file import write_run_file
-from neuros.recording.spool import ListenedSpool, SpoolReader
+from neuros.recording.spool import ListenedSpool, SpoolReader, SpoolWriter
 
 
 @pytest.fixture
@@ -97,12 +98,38 @@ def test_a_log_goes_on(run: Path) -> None:
     assert (run / "x").read_text() == "oursours"
 
 
-def test_a_folder_is_not_made_through_a_link(run: Path, tmp_path: Path) -> None:
-    make_folder(run / "own")
-    make_folder(run / "own")
-    (run / "link").symlink_to(tmp_path)
-    with pytest.raises(OSError, match="it is a link to another folder"):
-        make_folder(run / "link")
+def test_a_folder_is_found_and_made(run: Path) -> None:
+    with folder_in(run, "a", "b", makes=True) as folder:
+        (folder / "x").touch()
+    with folder_in(run, "a") as folder:
+        assert [*os.listdir(folder / "b")] == ["x"]
+    with pytest.raises(FileNotFoundError, match="c"), folder_in(run, "a", "c"):
+        pass
+
+
+@pytest.mark.parametrize("names", [("link",), ("link", "below"), ("own", "link")])
+def test_no_folder_is_found_or_made_through_a_link(
+    run: Path, tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (run / "own").mkdir()
+    (run / "link").symlink_to(elsewhere)
+    (run / "own/link").symlink_to(elsewhere)
+    with pytest.raises(NotADirectoryError, match="link"), folder_in(run, *names, makes=True):
+        pass
+    assert not [*elsewhere.iterdir()]
+
+
+def test_a_folder_stays_the_same_whatever_takes_its_name(run: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with folder_in(run, "own", makes=True) as folder:
+        (run / "own").rename(run / "former")
+        (run / "own").symlink_to(elsewhere)
+        through_whole(folder / "x")
+    assert (run / "former/x").read_text() == "ours"
+    assert not [*elsewhere.iterdir()]
 
 
 @pytest.mark.parametrize(
@@ -138,13 +165,66 @@ def test_a_node_cannot_have_the_list_of_topics_written_elsewhere(run: Path, vict
     assert victim.read_text() == "mine"
 
 
-def test_a_node_cannot_have_topics_listed_in_another_folder(run: Path, tmp_path: Path) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (run / ".listener").symlink_to(elsewhere)
-    with pytest.raises(OSError, match="it is a link to another folder"):
-        ListenedSpool(run).add(Topic("/x", "std_msgs/msg/String"))
-    assert not [*elsewhere.iterdir()]
+def linked(folder: Path, elsewhere: Path) -> None:
+    """Put a link to another folder in the place of a folder."""
+    if folder.exists():
+        folder.rename(folder.with_name("former"))
+    folder.symlink_to(elsewhere)
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    """A folder that has to stay as it is."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "00000000").write_text("mine")
+    return folder
+
+
+def is_as_it_was(elsewhere: Path) -> bool:
+    return [(path.name, path.read_text()) for path in elsewhere.iterdir()] == [("00000000", "mine")]
+
+
+@pytest.mark.parametrize("name", [".listener", ".listener/spool"])
+def test_a_node_cannot_have_packets_kept_in_another_folder(
+    run: Path, elsewhere: Path, name: str
+) -> None:
+    (run / name).parent.mkdir(exist_ok=True)
+    linked(run / name, elsewhere)
+    spool = ListenedSpool(run)
+    with pytest.raises(NotADirectoryError, match=name):
+        spool.keep(spool.add(Topic("/x", "std_msgs/msg/String")), 0, b"")
+    assert is_as_it_was(elsewhere)
+
+
+def test_a_node_cannot_have_the_bag_written_elsewhere(run: Path, elsewhere: Path) -> None:
+    bag = BagWriter(run / "bag", "mcap", {})
+    linked(run / "bag", elsewhere)
+    with pytest.raises(NotADirectoryError, match="bag"):
+        bag.checkpoint()
+    bag.shut()
+    assert is_as_it_was(elsewhere)
+
+
+@pytest.mark.parametrize("name", ["node", "node/spool"])
+def test_a_node_cannot_have_files_removed_elsewhere(run: Path, elsewhere: Path, name: str) -> None:
+    (elsewhere / "spool").symlink_to(elsewhere)
+    spool = SpoolWriter(run / "node", [Stream("sent", "x", (0,))])
+    spool.keep(0, b"", None)
+    spool.close()
+    reader = SpoolReader(run / "node")
+    assert reader.read(1000)[0]
+    linked(run / name, elsewhere)
+    reader.close(remove=True)
+    (elsewhere / "spool").unlink()
+    assert is_as_it_was(elsewhere)
+
+
+def test_a_node_cannot_have_files_read_elsewhere(run: Path, victim: Path) -> None:
+    (run / "node/spool").mkdir(parents=True)
+    (run / "node/spool/00000000").symlink_to(victim)
+    with pytest.raises(OSError, match="symbolic link"):
+        SpoolReader(run / "node").read(1)
 
 
 def test_nobody_waits_for_a_pipe_that_a_node_has_left(run: Path) -> None:

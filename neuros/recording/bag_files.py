@@ -19,6 +19,7 @@ import sqlite3
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from struct import Struct, pack
 from typing import Any
@@ -29,7 +30,7 @@ from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import write_whole
+from neuros.ordinary_files import folder_in, write_whole
 from neuros.project.message_types import message_folder
 from neuros.recording.recording_plan import Topic
 
@@ -107,8 +108,14 @@ class BagWriter:
         except FileExistsError as error:
             raise OSError(errno.EEXIST, f"{path} exists already") from error
         self.counts: dict[int, int] = {}
-        self._folder, self._storage, self._custom = path, storage, dict(custom)
-        self._file = _McapFile(path) if storage == "mcap" else _SqliteFile(path)
+        self._path, self._storage, self._custom = path, storage, dict(custom)
+        with self._folder() as folder:
+            self._file = (
+                _McapFile(folder / f"{path.name}.mcap")
+                if storage == "mcap"
+                # SQLite makes and removes a journal beside it, by the name of its folder.
+                else _SqliteFile(path / f"{path.name}.db3")
+            )
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._topics: list[dict[str, Any]] = []
         self._first_ns, self._last_ns = _LAST_NS, 0
@@ -155,7 +162,8 @@ class BagWriter:
         information = self._information()
         self._file.checkpoint(_yaml(information))
         text = _yaml({"rosbag2_bagfile_information": information})
-        write_whole(self._folder / "metadata.yaml", f"{text}\n".encode())
+        with self._folder() as folder:
+            write_whole(folder / "metadata.yaml", f"{text}\n".encode())
 
     def close(self) -> None:
         """Make it complete, and write nothing any more. Raises ``OSError``."""
@@ -167,6 +175,9 @@ class BagWriter:
     def shut(self) -> None:
         """Leave it as the last checkpoint has made it."""
         self._file.shut()
+
+    def _folder(self) -> AbstractContextManager[Path]:
+        return folder_in(self._path.parent, self._path.name)
 
     def _information(self) -> dict[str, Any]:
         content = {
@@ -216,8 +227,8 @@ def _qos_profiles(topic: Topic) -> list[dict[str, Any]]:
 class _McapFile:
     """An MCAP file: chunks with the messages, then the summary, which the next chunk replaces."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / f"{folder.name}.mcap"
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         self._safe_bytes = 0  # without the summary, that of the last checkpoint
         self._summary = b""
@@ -375,8 +386,8 @@ def _text(content: str | bytes) -> bytes:
 class _SqliteFile:
     """An SQLite file of rosbag2."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / f"{folder.name}.db3"
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.pending_bytes = 0
         self._connection = sqlite3.connect(self.path)
         self._types: set[str] = set()

@@ -100,6 +100,7 @@ class Recorder:
         self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
         self._sources.append(self._listener)
         self._held: list[_Kept] = []
+        self._complaints: set[str] = set()
         self._wall_clock = ForwardClock()
         self._sim_ns = 0
         self.bag.checkpoint()
@@ -115,6 +116,15 @@ class Recorder:
                 self.topics[topic] = None
                 self._complain(f"{topic.name} is not recorded: {error}")
         return self.topics[topic]
+
+    def listened(self) -> list[Topic]:
+        """The topics that have been heard so far, in the order of their numbers."""
+        try:
+            return listened_topics(self._run)
+        except OSError as error:
+            what = error.strerror or error
+            self._complain_once(f"topics that no node has are not recorded: {what}")
+            return []
 
     def poll(self) -> bool:
         """Move what there is; returns whether there is more right now. Raises ``OSError``."""
@@ -174,11 +184,9 @@ class Recorder:
         for source in self._sources:
             records, is_capped = source.reader.read(_MOST_BYTES)
             if source is self._listener and records:
-                self._listener.topics = [
-                    self._numbers([topic]) for topic in listened_topics(self._run)
-                ]
+                self._listener.topics = [self._numbers([topic]) for topic in self.listened()]
             self._held += [
-                (wall_ns, sim_ns, source.topics[stream], data, source.owns_time)
+                (wall_ns, sim_ns, self._topics_of(source, stream), data, source.owns_time)
                 for wall_ns, sim_ns, stream, data in records
             ]
             if is_capped and records:
@@ -195,6 +203,17 @@ class Recorder:
         del self._held[:written]
         self._written += written
         return has_more
+
+    def _topics_of(self, source: _SpoolSource, stream: int) -> tuple[int, ...]:
+        if stream < len(source.topics):
+            return source.topics[stream]
+        self._complain_once(f"packets in {source.reader} are not recorded: of no known topic")
+        return ()
+
+    def _complain_once(self, text: str) -> None:
+        if text not in self._complaints:
+            self._complaints.add(text)
+            self._complain(text)
 
     def _write(
         self, wall_ns: int, sim_ns: int, topics: tuple[int, ...], data: bytes, owns_time: bool
@@ -349,7 +368,6 @@ def _rebuild(
             bag.rename(damaged)
     elif bag.exists():  # a repair that did not come to its end
         shutil.rmtree(bag)
-    topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     present: set[tuple[int, int]] = set()
     faults: list[str] = []
     changed = 0
@@ -359,6 +377,7 @@ def _rebuild(
         complain(fault)
 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
+    topics = {topic.name: topic for topic in (*plan.topics, *recorder.listened())}
     try:
         for message in stored_messages(damaged, note):
             if message.may_have_changed:

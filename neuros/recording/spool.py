@@ -18,11 +18,14 @@ import os
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
-from neuros.ordinary_files import descriptor_of, make_folder, open_ordinary, write_whole
+from neuros.control.link import read_as
+from neuros.errors import ControlError
+from neuros.ordinary_files import descriptor_of, folder_in, write_whole
 from neuros.ports import Way
 from neuros.project.scanner import read_bytes
 from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
@@ -73,7 +76,7 @@ class SpoolWriter:
         file_bytes: int = FILE_BYTES,
         clock: Callable[[], int] | None = None,
     ) -> None:
-        self._folder = folder / _FOLDER
+        self._folder = folder
         self._numbers: Mapping[tuple[Way, str], int] = {
             (Way(stream.way), stream.name): number for number, stream in enumerate(streams)
         }
@@ -117,9 +120,9 @@ class SpoolWriter:
 
     def _begin_file(self) -> None:
         self.close()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        path = self._folder / f"{self._files:08d}"
-        self._descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND, 0o644)
+        flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND
+        with folder_in(self._folder.parent, self._folder.name, _FOLDER, makes=True) as folder:
+            self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
         fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until the writer closes it or ends
         self._files += 1
         self._size = 0
@@ -134,12 +137,12 @@ class SpoolReader:
     """Reads a spool behind its writer, or after its end."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder / _FOLDER
+        self._folder = folder
         self._file: int | None = None
         self._descriptor = -1
         self._rest = b""
         self._last_ns = 0
-        self._done: list[tuple[Path, int]] = []
+        self._done: list[tuple[int, int]] = []
 
     def read(self, most_bytes: int) -> tuple[list[Record], bool]:
         """The next complete records, and whether there is more now."""
@@ -157,24 +160,29 @@ class SpoolReader:
                 return records, False
         return records, True
 
+    def __str__(self) -> str:
+        return str(self._folder / _FOLDER)
+
     @property
     def is_fed(self) -> bool:
         """Whether its writer has a file open now."""
         numbers = self._numbers()
         if not numbers:
             return False
-        with open_ordinary(self._path(numbers[-1])) as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                return True
+        descriptor = self._open(numbers[-1])
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+        finally:
+            os.close(descriptor)
         return False
 
     def remove_up_to(self, wall_ns: int) -> None:
         """Remove the files that were read to their end and have nothing later than that."""
         while self._done and self._done[0][1] <= wall_ns:
-            with contextlib.suppress(OSError):
-                self._done[0][0].unlink()
+            with contextlib.suppress(OSError), self._spool() as spool:
+                _path(spool, self._done[0][0]).unlink()
             del self._done[0]
 
     def close(self, *, remove: bool) -> None:
@@ -182,25 +190,33 @@ class SpoolReader:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
-            self._done.append((self._path(self._file or 0), self._last_ns))
+            self._done.append((self._file or 0, self._last_ns))
         if remove:
             self.remove_up_to(self._last_ns)
-            with contextlib.suppress(OSError):
-                self._folder.rmdir()
+            with contextlib.suppress(OSError), folder_in(self._root, self._folder.name) as folder:
+                (folder / _FOLDER).rmdir()
 
-    def _path(self, number: int) -> Path:
-        return self._folder / f"{number:08d}"
+    @property
+    def _root(self) -> Path:
+        return self._folder.parent
+
+    def _spool(self) -> AbstractContextManager[Path]:
+        return folder_in(self._root, self._folder.name, _FOLDER)
+
+    def _open(self, number: int) -> int:
+        with self._spool() as spool:
+            return descriptor_of(_path(spool, number), os.O_NOFOLLOW)
 
     def _numbers(self) -> list[int]:
-        with contextlib.suppress(OSError):
-            return sorted(int(name) for name in os.listdir(self._folder) if name.isdigit())
+        with contextlib.suppress(OSError), self._spool() as spool:
+            return sorted(int(name) for name in os.listdir(spool) if name.isdigit())
         return []
 
     def _open_next(self) -> bool:
         numbers = [n for n in self._numbers() if self._file is None or n > self._file]
         if not numbers:
             return False
-        self._descriptor = descriptor_of(self._path(numbers[0]))
+        self._descriptor = self._open(numbers[0])
         self._file = numbers[0]
         self._rest = b""
         return True
@@ -208,15 +224,19 @@ class SpoolReader:
     def _leave_file(self) -> bool:
         """Whether the writer has gone on to another file, so that this one will not grow."""
         assert self._file is not None
-        if not self._path(self._file + 1).exists():
+        if not _path(self._folder / _FOLDER, self._file + 1).exists():
             return False
         # It may have grown between the look at its end and the look for the next.
         if os.fstat(self._descriptor).st_size > os.lseek(self._descriptor, 0, os.SEEK_CUR):
             return True
         os.close(self._descriptor)
         self._descriptor = -1
-        self._done.append((self._path(self._file), self._last_ns))
+        self._done.append((self._file, self._last_ns))
         return True
+
+
+def _path(spool: Path, number: int) -> Path:
+    return spool / f"{number:08d}"
 
 
 def _split(data: bytes, records: list[Record]) -> bytes:
@@ -244,16 +264,16 @@ class ListenedSpool:
     """
 
     def __init__(self, run: Path) -> None:
-        self._folder = run / LISTENER
+        self._run = run
         self._topics: list[Topic] = []
-        self._spool = SpoolWriter(self._folder, ())
+        self._spool = SpoolWriter(run / LISTENER, ())
 
     def add(self, topic: Topic) -> int:
         """The number of a new topic. Raises ``OSError``."""
         self._topics.append(topic)
-        make_folder(self._folder)
         text = json.dumps([asdict(each) for each in self._topics])
-        write_whole(self._folder / _LIST, text.encode())
+        with folder_in(self._run, LISTENER, makes=True) as folder:
+            write_whole(folder / _LIST, text.encode())
         return len(self._topics) - 1
 
     def keep(self, number: int, wall_ns: int, data: bytes) -> None:
@@ -266,16 +286,24 @@ class ListenedSpool:
 
 
 def listened_topics(run: Path) -> list[Topic]:
-    """The topics that have been heard so far, in the order of their numbers."""
+    """The topics that have been heard so far, in the order of their numbers.
+
+    Raises:
+        OSError: if the list cannot be read.
+    """
+    path = run / LISTENER / _LIST
     try:
-        return [Topic(**each) for each in json.loads(read_bytes(run / LISTENER / _LIST))]
+        return [read_as(Topic, each) for each in json.loads(read_bytes(path))]
     except FileNotFoundError:
         return []
+    except (ControlError, RecursionError, TypeError, ValueError) as error:
+        raise OSError(errno.EIO, f"{path} is damaged: {error}") from error
 
 
 def forget_listened(run: Path) -> None:
-    """Remove the list; its spool must have been removed before."""
-    for name in (_LIST, f".{_LIST}"):
-        (run / LISTENER / name).unlink(missing_ok=True)
-    if (run / LISTENER).is_dir():
+    """Remove the list; its spool must have been removed before. Raises ``OSError``."""
+    with contextlib.suppress(FileNotFoundError):
+        with folder_in(run, LISTENER) as folder:
+            for name in (_LIST, f".{_LIST}"):
+                (folder / name).unlink(missing_ok=True)
         (run / LISTENER).rmdir()

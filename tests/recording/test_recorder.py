@@ -27,7 +27,7 @@ from neuros.recording import recorder as recording
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recorder import Recorder, repair
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
-from neuros.recording.spool import NO_TIME, SpoolWriter
+from neuros.recording.spool import NO_TIME, ListenedSpool, SpoolWriter
 from neuros.recording.stored import Stored, stored_messages
 
 
@@ -377,3 +377,30 @@ def test_a_bag_larger_than_memory_can_be_repaired(
 def test_a_plan_survives_its_file(tmp_path: Path) -> None:
     plan(time_owner="a").save(tmp_path)
     assert load_plan(tmp_path) == plan(time_owner="a")
+
+
+def test_packets_of_a_stream_that_nobody_planned_are_left_out_and_told_once(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    strange = SpoolWriter(tmp_path / "b", ())
+    for wall_ns in (20, 30):
+        strange.append(wall_ns, NO_TIME, 1000, b"")
+    strange.close()
+    told: list[str] = []
+    recorder = Recorder(plan(), tmp_path, told.append)
+    recorder.complete()
+    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
+    assert told == [f"packets in {tmp_path}/b/spool are not recorded: of no known topic"]
+
+
+@pytest.mark.parametrize("text", ["", "[", "null", "[1]", '[{"name": 1}]', "[" * 100_000])
+def test_a_damaged_list_of_topics_costs_these_topics_only(tmp_path: Path, text: str) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    listened = ListenedSpool(tmp_path)
+    listened.keep(listened.add(Topic("/heard", NUMBER)), 20, number(8))
+    listened.close()
+    (tmp_path / ".listener/topics.json").write_text(text)
+    told: list[str] = []
+    recorder = Recorder(plan(), tmp_path, told.append)
+    recorder.complete()
+    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
+    assert "topics.json is damaged" in told[0]

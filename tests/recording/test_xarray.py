@@ -156,6 +156,8 @@ def test_images_have_rows_columns_and_channels(
 
 def test_images_of_other_pixels_or_several_sizes_stay_bytes(tmp_path: Path) -> None:
     square, wide = np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8)
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
     unknown = dataset(tmp_path / "one", [image(square, "yuv422")])
     assert unknown["data"].dims == ("time", "data_0")
     several = dataset(tmp_path / "two", [image(square, "mono8"), image(wide, "mono8")])
