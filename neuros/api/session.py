@@ -44,6 +44,7 @@ from neuros.project.model import Node, Port
 from neuros.transport.messages import RosPackets, checked
 
 _CONNECT_S = 0.01
+_READ_S = 1.0
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
@@ -132,7 +133,8 @@ class Session:
         Raises:
             RunError: if it has failed, or had ended before.
             TimeoutError: if it takes longer; what goes on is waited for by the next step, but not
-                by :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`.
+                by :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`. The
+                first look at an output waits for a second, then raises this error, too.
             UsageError: for ``sim_s`` where no node owns simulated time, and for a length that is
                 negative or not finite.
         """
@@ -434,7 +436,12 @@ class Session:
             if output not in self._newest:
                 self._check_running()
                 self._newest[output] = (0, b"")
-                self._advance(0)
+                try:
+                    # A round that was given up may go on for ever.
+                    self._advance(0, time.monotonic() + _READ_S if self._link.is_behind else None)
+                except TimeoutError:
+                    del self._newest[output]
+                    raise
             return self._newest[output]
 
     def _end(self) -> None:

@@ -82,6 +82,7 @@ class NodeProcess:
         self._early_lock = threading.Lock()
         self._has_failed = False
         self._asked: control.Settle | None = None
+        self._is_paused = False
         self._step: Advance | None = None
         self._is_settling = False
         self._has_begun = self._is_draining = self._has_been_reset = False
@@ -152,7 +153,10 @@ class NodeProcess:
             self._reset(message.variables)
             return
         self._is_draining = self._is_draining or isinstance(message, control.Drain)
-        if isinstance(message, control.Resume):
+        if isinstance(message, control.Pause):
+            self._is_paused = True
+        elif isinstance(message, control.Resume):
+            self._is_paused = False
             self._give_up_settling()
         for node in self._nodes:
             match message:
@@ -217,8 +221,12 @@ class NodeProcess:
             if name not in self._by_name:
                 raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
             self._by_name[name].deliver(input_name, content)
-        self._begin_rounds(step)
-        self._begin_settling()
+        if self._is_paused:
+            self._begin_rounds(step)
+            self._begin_settling()
+        else:  # given up, and the run was let go on before it arrived here
+            self._step = step
+            self._give_up_settling()
 
     def _begin_rounds(self, step: Advance) -> None:
         """Begin those of a step, or the next one where it ends at a time."""

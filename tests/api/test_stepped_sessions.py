@@ -29,8 +29,9 @@ import neuros
 from containers import require_containers, wait_until
 from neuros.api.session import Session
 from neuros.cli.main import main
-from neuros.control import AtRest, Deliver, Message, Settle, StepAll
+from neuros.control import AtRest, Deliver, Message, Resume, Settle, StepAll
 from neuros.control.link import ControlLink
+from neuros.control.steps import Advance
 from neuros.errors import ProjectError, RunError, UsageError
 from neuros.launcher.supervisor import Supervisor
 
@@ -91,6 +92,14 @@ def look(node):
     image = node.make_packet("image")
     image.data = bytes(4_000_000)
     return image
+"""
+ALARM = """
+from neuros.hooks import neuros_tick
+
+@neuros_tick(seconds=0.05)
+def look(node):
+    with open(node.run_dir / "looks", "a") as looks:
+        looks.write("x")
 """
 SEER = """
 from neuros.hooks import Optional, neuros_function
@@ -587,8 +596,27 @@ def test_a_round_that_never_ends_hinders_nothing_but_steps(tmp_path: Path, back_
         assert s["left.ball"].count > before
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.2)
+        for _ in range(2):
+            with pytest.raises(TimeoutError, match="has not come to rest in time"):
+                _ = s["right.ball"].count
         s.reset()
         assert s["left.ball"].count == 1
+
+
+def test_a_step_that_arrives_once_the_run_goes_freely_does_not_hold_it(tmp_path: Path) -> None:
+    alarm = {"name": "eye", "plugin": "eye.py", "container": "neuros_python"}
+    (tmp_path / "eye.py").write_text(ALARM)
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [alarm]}))
+    with neuros.Project.from_file(tmp_path).session(backend="in-process") as s:
+        nodes = s._link._nodes
+        assert nodes is not None
+        s._link.send(Resume())
+        looks = s.folder / "eye" / "looks"
+        wait_until(looks.exists)
+        nodes.send(Advance(10_000, 1, {}, ()))
+        assert select.select([nodes], [], [], DEADLINE_S)[0]
+        before = looks.stat().st_size
+        wait_until(lambda: looks.stat().st_size > before + 3)
 
 
 @pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
