@@ -25,6 +25,11 @@ def open_ordinary(path: Path) -> BinaryIO:
     return open(path, "rb", opener=lambda *_: descriptor_of(path))
 
 
+def open_itself(path: Path) -> BinaryIO:
+    """As :func:`open_ordinary`. Raises ``OSError``: also if it is a link."""
+    return open(path, "rb", opener=lambda *_: descriptor_of(path, os.O_NOFOLLOW))
+
+
 def descriptor_of(path: Path, flags: int = 0) -> int:
     """As :func:`open_ordinary`, without a buffer; ``flags``: more of those of ``os.open``."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
@@ -95,8 +100,9 @@ def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
             try:
                 below = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
             except OSError as error:
-                path = root.joinpath(*names[:number])
-                raise OSError(error.errno, error.strerror, str(path)) from error
+                is_link = error.errno == errno.ENOTDIR
+                why = "it is a link, or no folder" if is_link else error.strerror
+                raise OSError(error.errno, why, str(root.joinpath(*names[:number]))) from error
             os.close(descriptor)
             descriptor = below
         yield Path(f"/proc/self/fd/{descriptor}")

@@ -15,10 +15,8 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.scanner import read_bytes
-from neuros.project.split import node_file_from_json
-from neuros.project.validate import mistake
 from neuros.recording.recording_plan import RecordingPlan, load_plan
-from neuros.recording.run_file import read_object
+from neuros.recording.run_file import read_node_file
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 
@@ -41,17 +39,12 @@ def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
             f"replay: {run_folder} does not tell in which order '{name}' received its packets:"
             f" {_RECORD}"
         )
-    file = run_folder / name / "node.json"
     try:
-        content = read_object(file)
-        if wrong := mistake(content, "node", "#/$defs/node_file"):
-            raise EnvironmentFault(f"replay: {file} is damaged: {wrong}")
-        told = node_file_from_json(content)
-        if told.node.name != name:
-            raise EnvironmentFault(f"replay: {file} is damaged: it is of a node '{told.node.name}'")
-        return run, told
-    except (OSError, ValueError, TypeError, OverflowError) as error:
-        raise EnvironmentFault(f"replay: {file} cannot be read ({error})") from error
+        return run, read_node_file(run_folder / name)
+    except OSError as error:
+        raise EnvironmentFault(
+            f"replay: {error.filename} cannot be read ({error.strerror})"
+        ) from error
 
 
 class RecordedNode:

@@ -30,6 +30,7 @@ from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, 
 from neuros.executors.executor import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
 from neuros.recording.run_file import RUN_FILE, read_object
+from neuros.registry import AUTO, BACK_ENDS
 
 _PLAN_NAME = "sweep.json"
 _LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
@@ -95,7 +96,7 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
         ProjectError: if the project is not valid with all values; nothing has been run then.
         UsageError: for arguments that make no sense, or if ``output`` holds another sweep, or one
             that goes on.
-        EnvironmentFault: if the table cannot be written.
+        EnvironmentFault: if the table cannot be written, or the back end cannot be loaded.
     """
     if not isinstance(project, Project):
         project = Project.from_file(project)
@@ -104,6 +105,8 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
     request = Request(backend=options.backend, duration=options.duration, record=options.record)
+    if (back_end := request.backend or AUTO) != AUTO:
+        BACK_ENDS.load(back_end)  # else each run would be refused, in a folder that names it
     resources = _check_all(project, points, request)
     folder = _sweep_folder(project, options)
     with _locked_folder(folder):

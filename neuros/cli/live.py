@@ -372,16 +372,10 @@ def _run(name: str) -> Session:
 
 
 def _topics(session: Session) -> list[_Topic]:
-    """The topics of a run, in the order of its nodes."""
-    from neuros.project.split import node_file_from_json
-
-    files: list[NodeFile] = []
-    for name in session.nodes:
-        text = Path(session.folder, name, "node.json").read_text("utf-8")
-        files.append(node_file_from_json(json.loads(text)))
+    """The topics of a run, in the order of its nodes. Raises ``EnvironmentFault``."""
     found: dict[str, _Topic] = {}
-    for file in files:
-        for topic in _topics_of(file):
+    for name in session.nodes:
+        for topic in _topics_of(Path(session.folder, name)):
             if topic.node:
                 found[topic.name] = topic
             else:
@@ -389,7 +383,26 @@ def _topics(session: Session) -> list[_Topic]:
     return [*found.values()]
 
 
-def _topics_of(file: NodeFile) -> Iterator[_Topic]:
+def _topics_of(folder: Path) -> list[_Topic]:
+    """Those of the node that has this folder, in which it may have left anything."""
+    from neuros.recording.run_file import read_node_file
+
+    again = "`neuros topic` needs it: launch the project again"
+    try:
+        return [*_topics_in(read_node_file(folder))]
+    except OSError as error:
+        raise EnvironmentFault(
+            f"{error.filename} is not there: the run is ending, or somebody has removed its files"
+        ) from error
+    except EnvironmentFault as fault:
+        raise EnvironmentFault(f"{fault}; {again}") from fault
+    except KeyError as error:
+        raise EnvironmentFault(
+            f"{folder / 'node.json'} is broken: it has no port {error}; {again}"
+        ) from error
+
+
+def _topics_in(file: NodeFile) -> Iterator[_Topic]:
     node = file.node
     for c in file.connections:
         name = f"{c.topic}/data"

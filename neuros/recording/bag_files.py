@@ -31,7 +31,7 @@ from rosbags.typesys.store import Typestore
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
 from neuros.ordinary_files import folder_in, write_whole
-from neuros.project.message_types import message_folder
+from neuros.project.message_types import message_folder, normalised
 from neuros.recording.recording_plan import Topic
 
 _CHUNK_BYTES = 1 << 20
@@ -56,7 +56,8 @@ def _define(type_name: str, store: Typestore) -> None:
     """
     if type_name in store.fielddefs:
         return
-    folder = message_folder(type_name.split("/")[0])
+    is_type = normalised(type_name) == type_name
+    folder = message_folder(type_name.split("/")[0]) if is_type else None
     # The share folder is some folders above.
     shares = (above / "share" / f"{type_name}.msg" for above in folder.parents) if folder else ()
     path = next(filter(Path.is_file, shares), None)

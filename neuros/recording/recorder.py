@@ -33,6 +33,7 @@ from neuros.recording.run_file import read_run_file
 from neuros.recording.spool import (
     NO_TIME,
     ForwardClock,
+    Record,
     SpoolReader,
     forget_listened,
     listened_topics,
@@ -186,8 +187,9 @@ class Recorder:
             if source is self._listener and records:
                 self._listener.topics = [self._numbers([topic]) for topic in self.listened()]
             self._held += [
-                (wall_ns, sim_ns, self._topics_of(source, stream), data, source.owns_time)
-                for wall_ns, sim_ns, stream, data in records
+                (record.wall_ns, record.sim_ns, topics, record.data, source.owns_time)
+                for record in records
+                if (topics := self._topics_of(record, source)) is not None
             ]
             if is_capped and records:
                 has_more = True
@@ -204,11 +206,12 @@ class Recorder:
         self._written += written
         return has_more
 
-    def _topics_of(self, source: _SpoolSource, stream: int) -> tuple[int, ...]:
-        if stream < len(source.topics):
-            return source.topics[stream]
-        self._complain_once(f"packets in {source.reader} are not recorded: of no known topic")
-        return ()
+    def _topics_of(self, record: Record, source: _SpoolSource) -> tuple[int, ...] | None:
+        """The numbers of its topics; ``None`` if no node of NeuROS can have written it."""
+        if record.stream < len(source.topics) and record.wall_ns >= 0 and record.sim_ns >= NO_TIME:
+            return source.topics[record.stream]
+        self._complain_once(f"packets in {source.reader} are not recorded: it is damaged")
+        return None
 
     def _complain_once(self, text: str) -> None:
         if text not in self._complaints:

@@ -9,7 +9,9 @@ from typing import Any
 
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ordinary_files import write_whole
+from neuros.project.model import NodeFile
 from neuros.project.scanner import read_bytes
+from neuros.project.split import node_file_from_json
 from neuros.project.validate import mistake
 
 RUN_FILE = "run.json"
@@ -52,6 +54,26 @@ def check_record(record: Mapping[str, Any], file: Path) -> None:
     """Raise ``EnvironmentFault`` for a record, of a file, that does not describe a run."""
     if wrong := mistake(record, "run"):
         raise EnvironmentFault(f"{file} is broken: {wrong}")
+
+
+def read_node_file(folder: Path) -> NodeFile:
+    """What the node was told that has this folder in that of its run.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: if there is no such file.
+        EnvironmentFault: if it cannot be read, or holds anything else.
+    """
+    file = folder / "node.json"
+    content = read_object(file)
+    try:
+        if wrong := mistake(content, "node", "#/$defs/node_file"):
+            raise EnvironmentFault(f"{file} is broken: {wrong}")
+        told = node_file_from_json(content)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise EnvironmentFault(f"{file} is broken ({error})") from error
+    if told.node.name != folder.name:
+        raise EnvironmentFault(f"{file} is broken: it is of a node '{told.node.name}'")
+    return told
 
 
 def read_object(file: Path) -> dict[str, Any]:

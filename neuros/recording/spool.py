@@ -293,7 +293,9 @@ def listened_topics(run: Path) -> list[Topic]:
     """
     path = run / LISTENER / _LIST
     try:
-        return [read_as(Topic, each) for each in json.loads(read_bytes(path))]
+        content = json.loads(read_bytes(path))
+        json.dumps(content, ensure_ascii=False).encode()  # as it will be in the bag
+        return [read_as(Topic, each) for each in content]
     except FileNotFoundError:
         return []
     except (ControlError, RecursionError, TypeError, ValueError) as error:

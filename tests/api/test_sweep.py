@@ -130,6 +130,19 @@ def test_a_duration_that_is_refused_leaves_no_folder(tmp_path: Path) -> None:
         neuros.sweep(project, duration=61, backend="in-process", output="table")
 
 
+def test_a_back_end_that_is_refused_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = dice(tmp_path)
+    sentence = "back end 'nonsense': choose one of auto, docker, process"
+    with pytest.raises(UsageError, match=sentence):
+        neuros.sweep(project, backend="nonsense", output="table")
+    for command in (["launch", "dice"], ["sweep", "dice", "-o", "table"]):
+        assert main([*command, "--backend", "nonsense"]) == 2
+        assert sentence in capsys.readouterr().err
+    assert not Path("table").exists()
+
+
 def test_a_folder_is_that_of_one_sweep_at_a_time(tmp_path: Path) -> None:
     project = dice(tmp_path)
 

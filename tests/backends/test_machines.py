@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.control_sockets import UnixListener, connect
+from neuros.backends.machines.deployment import _texts
 from neuros.backends.machines.files import RECEIVED, RUNS, Follower, TreeStore, scan, write_chunk
-from neuros.backends.machines.machine import ClockOffset, agent_command
+from neuros.backends.machines.machine import ClockOffset, Machine, agent_command
 from neuros.backends.machines.pump import Pump
 from neuros.cli.agent import Agent, remove_old_runs
 from neuros.control import LiveCounters, Message, NodeStatus, Report
@@ -27,10 +28,15 @@ from neuros.control.machines import (
     Pong,
     Tree,
 )
+from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 
 _SOON_S = 30.0
+
+
+def damaged(path: Path) -> None:
+    path.write_bytes(b"\xff")
 
 
 class TestTrees:
@@ -245,6 +251,53 @@ class TestMirror:
         with pytest.raises(OSError, match="outside of the run folder"):
             write_chunk(tmp_path / "run", Chunk("../elsewhere", 0, ""))
 
+    @pytest.mark.parametrize(
+        ("path", "data"), [("eye/\0", ""), ("\0/eye", ""), ("\ud800", ""), ("eye/x", "é")]
+    )
+    def test_what_is_no_part_of_a_file_is_refused(
+        self, tmp_path: Path, path: str, data: str
+    ) -> None:
+        with pytest.raises(OSError, match=r"null byte|can't encode|base64|ASCII"):
+            write_chunk(tmp_path / "run", Chunk(path, 0, data))
+
+    def test_nothing_is_written_through_a_link_to_a_folder(
+        self, there: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run/eye").symlink_to(there)
+        for path in ("eye/node.log", "eye/new/figure.png"):
+            with pytest.raises(OSError, match=r"it is a link, or no folder: .*run/eye"):
+                write_chunk(tmp_path / "run", Chunk(path, 0, ""))
+        assert [path.name for path in there.iterdir()] == ["eye"]
+
+    def test_a_link_or_a_pipe_in_the_place_of_a_file_is_replaced(
+        self, there: Path, tmp_path: Path
+    ) -> None:
+        here, victim = tmp_path / "here", tmp_path / "elsewhere.txt"
+        victim.write_text("mine")
+        (here / "eye").mkdir(parents=True)
+        (here / "eye/figure.png").symlink_to(victim)
+        os.mkfifo(here / "eye/node.log")
+        for name in ("figure.png", "node.log"):
+            (there / "eye" / name).write_text("of the eye")
+        self.write(Follower(there, ["eye"], "robot", ()).rest(), here)
+        assert victim.read_text() == "mine"
+        for name in ("figure.png", "node.log"):
+            assert (here / "eye" / name).read_text() == "of the eye"
+
+    def test_what_links_and_pipes_there_lead_to_does_not_come(
+        self, there: Path, tmp_path: Path
+    ) -> None:
+        here, follower = tmp_path / "here", Follower(there, ["eye", "ear"], "robot", ())
+        (tmp_path / "secret").mkdir()
+        (tmp_path / "secret/key").write_text("mine")
+        (there / "eye/node.log").symlink_to(tmp_path / "secret/key")
+        os.mkfifo(there / "eye/spool/00000000")
+        (there / "ear").mkdir()
+        (there / "ear/spool").symlink_to(tmp_path / "secret")
+        for chunks in (follower.grown("eye"), follower.grown("ear"), follower.rest()):
+            assert self.write(chunks, here) == []
+
 
 class TestClock:
     """Times of a machine whose monotonic clock is 1000 s ahead."""
@@ -284,6 +337,27 @@ class TestClock:
         clock.log_here(tmp_path)
         moved = array("q", (tmp_path / "0.sent_ns").read_bytes())
         assert [1e-9 * each for each in moved] == pytest.approx(here, abs=0.005)
+
+    def test_nothing_elsewhere_is_moved_through_a_link(
+        self, clock: ClockOffset, tmp_path: Path
+    ) -> None:
+        (tmp_path / "elsewhere").write_bytes(array("q", [5]).tobytes())
+        (tmp_path / "packets").mkdir()
+        (tmp_path / "packets/0.sent_ns").symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(OSError, match="symbolic link"):
+            clock.log_here(tmp_path / "packets")
+        assert array("q", (tmp_path / "elsewhere").read_bytes()) == array("q", [5])
+
+    def test_nor_through_a_link_to_a_folder(self, clock: ClockOffset, tmp_path: Path) -> None:
+        machine = Machine.__new__(Machine)  # a new one starts an agent
+        machine._run, machine.clock, machine.fault = tmp_path, clock, ""
+        (tmp_path / "eye/packets").mkdir(parents=True)
+        log = tmp_path / "eye/packets/0.sent_ns"
+        log.write_bytes(array("q", [1001 * 10**9]).tobytes())
+        (tmp_path / "ear").symlink_to("eye")
+        machine.move_times(["eye", "nose", "ear"])
+        assert array("q", log.read_bytes()) == array("q", [10**9]), "it was moved twice"
+        assert machine.fault == "the packet log of ear cannot be moved: it is a link, or no folder"
 
     def test_processes_of_one_machine_have_one_clock(self) -> None:
         clock = ClockOffset()
@@ -441,6 +515,25 @@ def wait_for(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.01)
+
+
+class TestGiven:
+    """What a machine is told before its nodes start."""
+
+    def test_it_has_the_texts_of_the_run_folder(self, tmp_path: Path) -> None:
+        (tmp_path / "project.json").write_text("{}")
+        assert _texts(tmp_path) == {"project.json": "{}"}
+
+    @pytest.mark.parametrize(
+        "leave", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname"), os.mkdir, damaged]
+    )
+    def test_no_link_is_followed_and_no_pipe_is_waited_for(
+        self, tmp_path: Path, leave: Callable[[Path], None]
+    ) -> None:
+        leave(tmp_path / "plan.json")
+        said = r"plan\.json cannot be read, and other machines need it: ['\w]"
+        with pytest.raises(EnvironmentFault, match=said):
+            _texts(tmp_path)
 
 
 class TestCommand:

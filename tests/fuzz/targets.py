@@ -19,7 +19,7 @@ import warnings
 from array import array
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ from neuros.project.graph import graph_mermaid, graph_svg, graph_text
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
+from neuros.recording.recorder import Recorder
 from neuros.transport.codecs import WrongBytes, cdr, message_codec
 from neuros.transport.envelope import DataTags, Positions, signed, verified
 from neuros.transport.large_packets import LargeInput, LargeOutput
@@ -422,6 +423,47 @@ def check_bag(name: str, data: bytes, folder: Path) -> None:
             for topic in bag.topics.values():
                 topic.array()
     command("bag", "repair", str(run), codes=(0, 4))
+
+
+def record_spools(run: Path) -> None:
+    """Move what lies in the spools of a run into its bag, as its recorder does."""
+    said: list[str] = []
+    recorder = Recorder(plan(), run, said.append)
+    try:
+        recorder.complete()
+        recorder.clean_up()
+    finally:
+        recorder.abandon()
+    assert all(said)
+    with neuros.bag.open(run / "bag") as bag:
+        assert bag.topics.keys() >= {topic.name for topic in plan().topics}
+
+
+@cache
+def spool_seed() -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        run = Path(name)
+        spool(run, "a", [(value, value, number(value)) for value in range(1, 5)])
+        return (run / "a/spool/00000000").read_bytes()
+
+
+@target(lambda: [spool_seed()], change_bytes)
+def spool_file(data: bytes, folder: Path) -> None:
+    """What a node writes for the recorder."""
+    (folder / "a/spool").mkdir(parents=True)
+    (folder / "a/spool/00000000").write_bytes(data)
+    record_spools(folder)
+
+
+HEARD = [asdict(replace(NUMBER, name=f"/heard{place}")) for place in range(2)]
+
+
+@target(lambda: [as_bytes(HEARD)], change_json, change_bytes)
+def listened_topics(data: bytes, folder: Path) -> None:
+    """The recorder's own list, where a node has changed it."""
+    spool(folder, ".listener", [(1, None, number(1))])
+    (folder / ".listener/topics.json").write_bytes(data)
+    record_spools(folder)
 
 
 # ---------------------------------------------------------------------- other programs

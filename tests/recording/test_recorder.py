@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import time
 from dataclasses import replace
@@ -29,6 +30,8 @@ from neuros.recording.recorder import Recorder, repair
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
 from neuros.recording.spool import NO_TIME, ListenedSpool, SpoolWriter
 from neuros.recording.stored import Stored, stored_messages
+
+UNWRITABLE = json.dumps([{"name": "/\ud800", "type": "std_msgs/msg/Int32"}])
 
 
 def bag_file(run: Path) -> Path:
@@ -379,20 +382,22 @@ def test_a_plan_survives_its_file(tmp_path: Path) -> None:
     assert load_plan(tmp_path) == plan(time_owner="a")
 
 
-def test_packets_of_a_stream_that_nobody_planned_are_left_out_and_told_once(tmp_path: Path) -> None:
+def test_packets_that_no_node_can_have_kept_are_left_out_and_told_once(tmp_path: Path) -> None:
     spool(tmp_path, "a", [(10, None, number(7))])
     strange = SpoolWriter(tmp_path / "b", ())
-    for wall_ns in (20, 30):
-        strange.append(wall_ns, NO_TIME, 1000, b"")
+    for wall_ns, sim_ns, stream in ((20, NO_TIME, 1000), (-1, NO_TIME, 0), (20, -2, 0)):
+        strange.append(wall_ns, sim_ns, stream, b"")
     strange.close()
     told: list[str] = []
     recorder = Recorder(plan(), tmp_path, told.append)
     recorder.complete()
     assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
-    assert told == [f"packets in {tmp_path}/b/spool are not recorded: of no known topic"]
+    assert told == [f"packets in {tmp_path}/b/spool are not recorded: it is damaged"]
 
 
-@pytest.mark.parametrize("text", ["", "[", "null", "[1]", '[{"name": 1}]', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text", ["", "[", "null", "[1]", '[{"name": 1}]', "[" * 100_000, UNWRITABLE]
+)
 def test_a_damaged_list_of_topics_costs_these_topics_only(tmp_path: Path, text: str) -> None:
     spool(tmp_path, "a", [(10, None, number(7))])
     listened = ListenedSpool(tmp_path)
@@ -404,3 +409,15 @@ def test_a_damaged_list_of_topics_costs_these_topics_only(tmp_path: Path, text: 
     recorder.complete()
     assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
     assert "topics.json is damaged" in told[0]
+
+
+@pytest.mark.parametrize("name", ["std_msgs//msg/Int32", "std_msgs/msg/../msg/Int32", "/", ""])
+def test_a_name_that_is_no_type_s_is_no_topic_of_the_bag(tmp_path: Path, name: str) -> None:
+    told: list[str] = []
+    recorder = Recorder(plan(), tmp_path, told.append)
+    assert recorder.number_of(Topic("/heard", name)) is None
+    recorder.complete()
+    assert told == [
+        f"/heard is not recorded: message type {name} cannot be recorded: its definition"
+        f" (share/{name}.msg) is not installed here"
+    ]

@@ -23,6 +23,7 @@ from neuros.control import CONTROL_VARIABLE
 from neuros.control.machines import Finished, Ready, Start
 from neuros.distribution import WORKSPACE
 from neuros.errors import EnvironmentFault, results_of
+from neuros.ordinary_files import open_itself
 from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
 from neuros.project.deployment import DeploymentFile, Host
 from neuros.project.model import Folders, NodeFile, Project
@@ -351,8 +352,22 @@ def _renamed(text: str, there: str, here: str) -> str:
 
 
 def _texts(run: Path) -> dict[str, str]:
-    """What lies in a run folder before the nodes start: the project, the plan of the recording."""
-    return {path.name: path.read_text("utf-8") for path in run.glob("*.json")}
+    """What lies in a run folder before the nodes start: the project, the plan of the recording.
+
+    Raises:
+        EnvironmentFault: if something there cannot be read, or is a link.
+    """
+    found = {}
+    for path in run.glob("*.json"):
+        try:
+            with open_itself(path) as file:
+                found[path.name] = file.read().decode("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise EnvironmentFault(
+                f"{path} cannot be read, and other machines need it: {why}"
+            ) from error
+    return found
 
 
 def _package(python: Path) -> str:

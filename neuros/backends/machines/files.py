@@ -16,7 +16,7 @@ has been changed in a tree there is put right before it is used, and what has co
 
 What nodes write there appears in the run folder of the launcher. Logs and recorded packets do while
 they are written, so that the console and the recorder find them as ever; everything else once the
-nodes have ended.
+nodes have ended. Nodes can put links into both run folders: none is followed.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from pathlib import Path
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.control.machines import Chunk, Tree, TreeFile
 from neuros.errors import EnvironmentFault
+from neuros.ordinary_files import folder_in, open_itself, open_log
 
 RECEIVED, RUNS = "received", "runs"
 """Folders of agents beside the trees, whose names end with a key."""
@@ -238,17 +239,20 @@ class Follower:
         for parent, _, names in os.walk(self._run):
             for name in names:
                 path = Path(parent, name)
-                is_new = path.relative_to(self._run).as_posix() not in self._known
-                if is_new and path.is_file() and not path.is_symlink():
+                if path.relative_to(self._run).as_posix() not in self._known:
                     yield from self._news(path)
 
     def _news(self, path: Path) -> Iterator[Chunk]:
-        """What a file has beyond what was sent of it; it may have become shorter."""
+        """What an ordinary file has beyond what was sent of it; it may have become shorter."""
         relative = path.relative_to(self._run)
         name = relative.as_posix()
         if relative.parts[0] not in self._nodes:
             name = f"{MACHINES}/{self._machine}/{name}"
-        with contextlib.suppress(OSError), open(path, "rb") as file:
+        with (
+            contextlib.suppress(OSError),
+            folder_in(self._run, *relative.parent.parts) as folder,
+            open_itself(folder / path.name) as file,
+        ):
             size = os.fstat(file.fileno()).st_size
             sent = self._sent.get(name, 0)
             if name not in self._sent or size < sent:
@@ -262,16 +266,23 @@ class Follower:
 
 
 def write_chunk(run: Path, chunk: Chunk) -> int:
-    """Write a part of a file into a run folder; returns its length. Raises ``OSError``."""
+    """Write a part of a file into a run folder; returns its length. Raises ``OSError``.
+
+    A link or a pipe in the place of the file is replaced by a file.
+    """
     path = Path(os.path.normpath(run / chunk.path))
     if not path.is_relative_to(run):
         raise OSError(f"{chunk.path} is outside of the run folder")
-    data = b64decode(chunk.data)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    with open(descriptor, "wb") as file:
-        if chunk.offset < os.fstat(descriptor).st_size:
-            file.truncate(chunk.offset)
-        file.seek(chunk.offset)
-        file.write(data)
+    folders = path.relative_to(run).parent.parts
+    try:
+        data = b64decode(chunk.data)
+        run.mkdir(parents=True, exist_ok=True)
+        with (
+            folder_in(run, *folders, makes=True) as folder,
+            open_log(folder / path.name) as file,
+        ):
+            file.truncate(chunk.offset)  # what is written goes to the end
+            file.write(data)
+    except ValueError as error:  # neither a path nor base64
+        raise OSError(str(error)) from error
     return len(data)

@@ -27,6 +27,7 @@ from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
+from neuros.ordinary_files import folder_in, open_itself, write_whole
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 from neuros.project.model import Folders
@@ -215,9 +216,13 @@ class Machine:
             return
         for node in nodes:
             try:
-                self.clock.log_here(self._run / node / _PACKET_LOG)
+                with folder_in(self._run, node, _PACKET_LOG) as folder:
+                    self.clock.log_here(folder)
+            except FileNotFoundError:  # it has no packet log
+                continue
             except OSError as error:
-                self.fault = self.fault or f"the packet log of {node} cannot be moved: {error}"
+                why = f"the packet log of {node} cannot be moved: {_why(error)}"
+                self.fault = self.fault or why
 
     def close(self) -> None:
         """Hang up; the agent ends what is left. Any thread."""
@@ -266,7 +271,7 @@ class Machine:
         except OSError as error:
             size = len(chunk.data)
             if not self.fault:
-                self.fault = f"{chunk.path} of {self.host.name} cannot be written: {error}"
+                self.fault = f"{chunk.path} of {self.host.name} cannot be written: {_why(error)}"
         self._pump.send(agent.Took(size))
 
     def _lose(self, reason: str) -> None:
@@ -335,6 +340,11 @@ class Machine:
                     data = following
         except OSError as error:
             raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _why(error: OSError) -> str:
+    """What went wrong, without the path, which for a folder that is held is that in /proc."""
+    return error.strerror or str(error)
 
 
 def agent_command(host: Host) -> list[str]:
@@ -491,9 +501,11 @@ class ClockOffset:
         for file in sorted(folder.glob("*")):
             width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
             if columns:
-                entries = np.fromfile(file, np.int64)
+                with open_itself(file) as written:
+                    data = written.read()
+                entries = np.frombuffer(data[: len(data) // 8 * 8], np.int64).copy()
                 for column in columns:
                     times = entries[column::width]
                     # On a straight line between two answers.
                     times -= np.rint(1e9 * np.interp(1e-9 * times, at_s, ahead_s)).astype(np.int64)
-                entries.tofile(file)
+                write_whole(file, entries.tobytes())
