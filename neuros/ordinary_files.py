@@ -38,7 +38,7 @@ def descriptor_of(path: Path, flags: int = 0) -> int:
     os.close(descriptor)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    raise OSError("it is not an ordinary file")
+    raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))
 
 
 def open_new(path: Path) -> BinaryIO:
@@ -91,23 +91,37 @@ def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
     Raises:
         OSError: also if one of the names is that of a link.
     """
-    descriptor = os.open(root, _FOLDER)
+    descriptor, folder = os.open(root, _FOLDER), root
     try:
-        for number, name in enumerate(names, 1):
-            if makes:
-                with contextlib.suppress(FileExistsError):
-                    os.mkdir(name, dir_fd=descriptor)
+        for name in names:
+            folder /= name
             try:
+                if makes:
+                    with contextlib.suppress(FileExistsError):
+                        os.mkdir(name, dir_fd=descriptor)
                 below = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
             except OSError as error:
                 is_link = error.errno == errno.ENOTDIR
                 why = "it is a link, or no folder" if is_link else error.strerror
-                raise OSError(error.errno, why, str(root.joinpath(*names[:number]))) from error
+                raise OSError(error.errno, why, str(folder)) from error
             os.close(descriptor)
             descriptor = below
-        yield Path(f"/proc/self/fd/{descriptor}")
+        held = f"/proc/self/fd/{descriptor}"
+        try:
+            yield Path(held)
+        except OSError as error:
+            if not str(error.filename).startswith(held):
+                raise
+            path = str(folder) + error.filename.removeprefix(held)
+            raise OSError(error.errno, error.strerror, path) from error
     finally:
         os.close(descriptor)
+
+
+def reason_of(error: OSError) -> str:
+    """What went wrong, and with which file if that is known."""
+    reason = error.strerror or str(error)
+    return f"{error.filename}: {reason}" if error.filename else reason
 
 
 def _is_ordinary(descriptor: int) -> bool:

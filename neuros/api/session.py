@@ -142,6 +142,8 @@ class Session:
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         with self._lock:
             self._check_running()
+            if until is not None and self._link.is_behind and not self._advance(0, end_s):
+                return False
             for _ in self._rounds(rounds, sim_s, until):
                 if not self._advance(1, end_s):
                     return False
@@ -430,15 +432,21 @@ class Session:
         self._end()
         return False
 
-    def _newest_of(self, output: str) -> tuple[int, bytes]:
-        """The newest packet of an output; number 0: there is none yet."""
+    def _newest_of(self, output: str, wait_s: float | None = _READ_S) -> tuple[int, bytes]:
+        """The newest packet of an output; number 0: there is none yet.
+
+        Args:
+            wait_s: for so long at most, if a round was given up: it may go on for ever.
+        """
         with self._lock:
             if output not in self._newest:
                 self._check_running()
                 self._newest[output] = (0, b"")
+                end_s = None
+                if self._link.is_behind and wait_s is not None:
+                    end_s = time.monotonic() + wait_s
                 try:
-                    # A round that was given up may go on for ever.
-                    self._advance(0, time.monotonic() + _READ_S if self._link.is_behind else None)
+                    self._advance(0, end_s)
                 except TimeoutError:
                     del self._newest[output]
                     raise
@@ -491,8 +499,9 @@ class SessionOutput:
             TimeoutError: if none comes in so many wall seconds.
             RunError: if the run ends before.
         """
-        before, session = self.count, self._session
+        session = self._session
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        before = session._newest_of(self.name, timeout_s)[0]
 
         def is_there(_: Session) -> bool:
             if self.count == before and end_s is not None and time.monotonic() >= end_s:
@@ -504,7 +513,11 @@ class SessionOutput:
         return self.packet
 
     def __repr__(self) -> str:
-        return f"<{self.name}: {self.count} packets of {self._port.type}>"
+        try:
+            count = str(self.count)
+        except TimeoutError:
+            count = "an unknown number of"
+        return f"<{self.name}: {count} packets of {self._port.type}>"
 
 
 def check_length(rounds: int, sim_s: float | None) -> None:

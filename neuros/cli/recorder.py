@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.sidecars import END
 from neuros.errors import NeurosError
+from neuros.ordinary_files import reason_of
 from neuros.recording.recorder import Recorder, counts_of, repair, the_only_recorder
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, Topic, load_plan
 from neuros.recording.spool import ListenedSpool
@@ -47,7 +48,7 @@ def _run_recorder(options: argparse.Namespace) -> int:
         else:
             counts = _record(run, load_plan(run), problems.add)
     except (NeurosError, OSError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        reason = reason_of(error) if isinstance(error, OSError) else str(error)
         problems.add(
             f"the recording has stopped: {reason}; the bag can be read, and neuros bag repair"
             f" {run} adds the packets that it lacks"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
+from neuros.ordinary_files import reason_of
 from neuros.ports import Logger, PacketRecorder, Way
 from neuros.project.model import Connection, Port
 
@@ -112,9 +113,9 @@ class NodeRecorder:
             self._recorder.keep(stream, data or self._encode(packet), self._sim_time_s())
         except OSError as error:
             self.close()
-            self.failure = f"its packets are not recorded to the end: {error.strerror}"
+            self.failure = f"its packets are not recorded to the end: {reason_of(error)}"
             self._logger.error(
-                f"its packets are not recorded from now on: {error.strerror}; the run goes on"
+                f"its packets are not recorded from now on: {reason_of(error)}; the run goes on"
             )
 
     def close(self) -> None:

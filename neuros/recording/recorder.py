@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.ordinary_files import open_ordinary
+from neuros.ordinary_files import open_ordinary, reason_of
 from neuros.project.scanner import read_bytes
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recording_plan import (
@@ -101,7 +101,6 @@ class Recorder:
         self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
         self._sources.append(self._listener)
         self._held: list[_Kept] = []
-        self._complaints: set[str] = set()
         self._wall_clock = ForwardClock()
         self._sim_ns = 0
         self.bag.checkpoint()
@@ -117,15 +116,6 @@ class Recorder:
                 self.topics[topic] = None
                 self._complain(f"{topic.name} is not recorded: {error}")
         return self.topics[topic]
-
-    def listened(self) -> list[Topic]:
-        """The topics that have been heard so far, in the order of their numbers."""
-        try:
-            return listened_topics(self._run)
-        except OSError as error:
-            what = error.strerror or error
-            self._complain_once(f"topics that no node has are not recorded: {what}")
-            return []
 
     def poll(self) -> bool:
         """Move what there is; returns whether there is more right now. Raises ``OSError``."""
@@ -160,7 +150,7 @@ class Recorder:
     def clean_up(self) -> None:
         """Remove the spools, whose packets are in the bag."""
         for source in self._sources:
-            source.reader.close(remove=True)
+            source.reader.close(remove=not source.is_damaged)
         forget_listened(self._run)
 
     def abandon(self) -> None:
@@ -183,9 +173,7 @@ class Recorder:
         """Write what is not later than ``horizon_ns``; returns whether a spool has more."""
         has_more = False
         for source in self._sources:
-            records, is_capped = source.reader.read(_MOST_BYTES)
-            if source is self._listener and records:
-                self._listener.topics = [self._numbers([topic]) for topic in self.listened()]
+            records, is_capped = self._read(source)
             self._held += [
                 (record.wall_ns, record.sim_ns, topics, record.data, source.owns_time)
                 for record in records
@@ -206,17 +194,33 @@ class Recorder:
         self._written += written
         return has_more
 
+    def _read(self, source: _SpoolSource) -> tuple[list[Record], bool]:
+        """As the reader of the source; nothing more once it has failed."""
+        if source.has_failed:
+            return [], False
+        try:
+            records, is_capped = source.reader.read(_MOST_BYTES)
+            if source is self._listener and records:
+                heard = listened_topics(self._run)
+                self._listener.topics = [self._numbers([topic]) for topic in heard]
+            return records, is_capped
+        except OSError as error:
+            source.has_failed = source.is_damaged = True
+            self._complain(
+                f"{reason_of(error)}: packets in {source.reader} are not recorded, and it is kept"
+            )
+            return [], False
+
     def _topics_of(self, record: Record, source: _SpoolSource) -> tuple[int, ...] | None:
         """The numbers of its topics; ``None`` if no node of NeuROS can have written it."""
         if record.stream < len(source.topics) and record.wall_ns >= 0 and record.sim_ns >= NO_TIME:
             return source.topics[record.stream]
-        self._complain_once(f"packets in {source.reader} are not recorded: it is damaged")
+        if not source.is_damaged:
+            source.is_damaged = True
+            self._complain(
+                f"{source.reader} is damaged: packets in it are not recorded, and it is kept"
+            )
         return None
-
-    def _complain_once(self, text: str) -> None:
-        if text not in self._complaints:
-            self._complaints.add(text)
-            self._complain(text)
 
     def _write(
         self, wall_ns: int, sim_ns: int, topics: tuple[int, ...], data: bytes, owns_time: bool
@@ -246,7 +250,8 @@ class Recorder:
         # Whatever was read and is not held is in the bag.
         safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
         for source in self._sources:
-            source.reader.remove_up_to(safe_ns)
+            if not source.is_damaged:
+                source.reader.remove_up_to(safe_ns)
 
     def _numbers(self, topics: Iterable[Topic]) -> tuple[int, ...]:
         numbers = (self.number_of(topic) for topic in topics)
@@ -255,11 +260,18 @@ class Recorder:
 
 @dataclass
 class _SpoolSource:
-    """A spool, and the numbers of the topics of each of its streams."""
+    """A spool, and the numbers of the topics of each of its streams.
+
+    Attributes:
+        is_damaged: whether something in it was not recorded, so that it has to stay.
+        has_failed: whether it can be read no more.
+    """
 
     reader: SpoolReader
     topics: list[tuple[int, ...]]
     owns_time: bool
+    is_damaged: bool = False
+    has_failed: bool = False
 
 
 @contextlib.contextmanager
@@ -278,7 +290,10 @@ def needs_repair(run: Path, plan: RecordingPlan) -> bool:
     """Whether the bag of a run that has ended is not complete."""
     if (run / DAMAGED_NAME).exists() or not is_whole(run / BAG_NAME):
         return True
-    return any(any((run / name / "spool").glob("*")) for name in (*plan.streams, LISTENER))
+    try:
+        return any(SpoolReader(run / name).has_files for name in (*plan.streams, LISTENER))
+    except OSError:
+        return True  # a repair tells what is wrong
 
 
 @dataclass(frozen=True)
@@ -319,8 +334,8 @@ def repair(
             return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:
         raise EnvironmentFault(
-            f"the bag of {run} cannot be completed: {error.strerror or error}; what is there was"
-            " left as it is"
+            f"the bag of {run} cannot be completed: {reason_of(error)}; what is there was left as"
+            " it is"
         ) from error
 
 
@@ -365,6 +380,7 @@ def _is_fed(run: Path, plan: RecordingPlan) -> bool:
 def _rebuild(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object], *, keeps_changed: bool
 ) -> Repaired:
+    topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     bag, damaged, recorded = run / BAG_NAME, run / DAMAGED_NAME, recorded_counts(run)
     if not damaged.exists():
         if bag.exists():
@@ -380,7 +396,6 @@ def _rebuild(
         complain(fault)
 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
-    topics = {topic.name: topic for topic in (*plan.topics, *recorder.listened())}
     try:
         for message in stored_messages(damaged, note):
             if message.may_have_changed:

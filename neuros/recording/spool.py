@@ -15,6 +15,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +35,7 @@ FILE_BYTES = 8 << 20
 NO_TIME = -1
 
 _FOLDER = "spool"
+_NAME = re.compile("[0-9]{8}")
 _HEADER = struct.Struct("<IIqq")
 _SMALL_BYTES = 4096  # up to here a copy costs less than a write in two parts
 
@@ -164,12 +166,20 @@ class SpoolReader:
         return str(self._folder / _FOLDER)
 
     @property
+    def has_files(self) -> bool:
+        """Whether there is something to read. Raises ``OSError``."""
+        return bool(self._numbers())
+
+    @property
     def is_fed(self) -> bool:
         """Whether its writer has a file open now."""
-        numbers = self._numbers()
-        if not numbers:
+        try:
+            numbers = self._numbers()
+            if not numbers:
+                return False
+            descriptor = self._open(numbers[-1])
+        except OSError:
             return False
-        descriptor = self._open(numbers[-1])
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -208,8 +218,8 @@ class SpoolReader:
             return descriptor_of(_path(spool, number), os.O_NOFOLLOW)
 
     def _numbers(self) -> list[int]:
-        with contextlib.suppress(OSError), self._spool() as spool:
-            return sorted(int(name) for name in os.listdir(spool) if name.isdigit())
+        with contextlib.suppress(FileNotFoundError), self._spool() as spool:
+            return sorted(int(name) for name in os.listdir(spool) if _NAME.fullmatch(name))
         return []
 
     def _open_next(self) -> bool:
@@ -299,12 +309,17 @@ def listened_topics(run: Path) -> list[Topic]:
     except FileNotFoundError:
         return []
     except (ControlError, RecursionError, TypeError, ValueError) as error:
-        raise OSError(errno.EIO, f"{path} is damaged: {error}") from error
+        raise OSError(
+            errno.EIO,
+            f"it is damaged ({error}); without {path.parent}, neuros bag repair completes the bag"
+            " except for topics that no node has",
+            str(path),
+        ) from error
 
 
 def forget_listened(run: Path) -> None:
-    """Remove the list; its spool must have been removed before. Raises ``OSError``."""
-    with contextlib.suppress(FileNotFoundError):
+    """Remove the list, if it can be; its spool must have been removed before."""
+    with contextlib.suppress(OSError):
         with folder_in(run, LISTENER) as folder:
             for name in (_LIST, f".{_LIST}"):
                 (folder / name).unlink(missing_ok=True)

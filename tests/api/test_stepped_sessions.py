@@ -599,6 +599,7 @@ def test_a_round_that_never_ends_hinders_nothing_but_steps(tmp_path: Path, back_
         for _ in range(2):
             with pytest.raises(TimeoutError, match="has not come to rest in time"):
                 _ = s["right.ball"].count
+        assert repr(s["right.ball"]).startswith("<right.ball: an unknown number of packets of")
         s.reset()
         assert s["left.ball"].count == 1
 
@@ -617,6 +618,38 @@ def test_a_step_that_arrives_once_the_run_goes_freely_does_not_hold_it(tmp_path:
         assert select.select([nodes], [], [], DEADLINE_S)[0]
         before = looks.stat().st_size
         wait_until(lambda: looks.stat().st_size > before + 3)
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda s: s.step(until=lambda _: s["brain.command"].count > 0),
+        lambda s: s["brain.command"].wait(),
+        lambda s: s["brain.command"].wait(timeout_s=DEADLINE_S),
+    ],
+)
+def test_after_a_step_that_took_too_long_who_waits_for_an_output_waits_for_the_round(
+    tmp_path: Path, look: Callable[[Session], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it takes, unlike who only looks."""
+    monkeypatch.setattr("neuros.api.session._READ_S", 0.0)
+    project = cart(tmp_path)
+    waits = """
+    while not (node.run_dir / "go").exists():
+        time.sleep(0.05)
+"""
+    head = "def decide(node, pose):\n"
+    brain = BRAIN.replace(head, head + waits.lstrip("\n"))
+    (project / "brain.py").write_text(f"import time\n{brain}")
+    with neuros.Project.from_file(project).session(backend="in-process") as s:
+        with pytest.raises(TimeoutError):
+            s.step(timeout_s=0.1)
+        with pytest.raises(TimeoutError):
+            _ = s["brain.command"].packet
+        timer = threading.Timer(0.5, (s.folder / "brain" / "go").touch)
+        timer.start()
+        assert look(s)
+        timer.join()
 
 
 @pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")

@@ -24,6 +24,7 @@ from recording.recordings import ANSWER, NUMBER, answer, fail, number, plan, rec
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from neuros.errors import EnvironmentFault
 from neuros.recording import recorder as recording
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recorder import Recorder, repair
@@ -382,7 +383,9 @@ def test_a_plan_survives_its_file(tmp_path: Path) -> None:
     assert load_plan(tmp_path) == plan(time_owner="a")
 
 
-def test_packets_that_no_node_can_have_kept_are_left_out_and_told_once(tmp_path: Path) -> None:
+def test_packets_that_no_node_can_have_kept_are_told_once_and_stay_in_the_spool(
+    tmp_path: Path,
+) -> None:
     spool(tmp_path, "a", [(10, None, number(7))])
     strange = SpoolWriter(tmp_path / "b", ())
     for wall_ns, sim_ns, stream in ((20, NO_TIME, 1000), (-1, NO_TIME, 0), (20, -2, 0)):
@@ -391,24 +394,43 @@ def test_packets_that_no_node_can_have_kept_are_left_out_and_told_once(tmp_path:
     told: list[str] = []
     recorder = Recorder(plan(), tmp_path, told.append)
     recorder.complete()
+    recorder.clean_up()
     assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
-    assert told == [f"packets in {tmp_path}/b/spool are not recorded: it is damaged"]
+    assert told == [
+        f"{tmp_path}/b/spool is damaged: packets in it are not recorded, and it is kept"
+    ]
+    assert [path.name for path in (tmp_path / "b/spool").iterdir()] == ["00000000"]
+    assert not (tmp_path / "a/spool").exists()
 
 
 @pytest.mark.parametrize(
     "text", ["", "[", "null", "[1]", '[{"name": 1}]', "[" * 100_000, UNWRITABLE]
 )
-def test_a_damaged_list_of_topics_costs_these_topics_only(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("kept_before", [False, True])
+def test_a_damaged_list_of_topics_costs_nothing(
+    tmp_path: Path, text: str, kept_before: bool
+) -> None:
+    heard = Topic("/heard", NUMBER.type)
+    plan().save(tmp_path)
+    recorder = Recorder(plan(), tmp_path, fail)
+    recorder.copy(heard, Stored("/heard", 5, 5, number(5)))
+    recorder.bag.checkpoint()
+    recorder.abandon()
     spool(tmp_path, "a", [(10, None, number(7))])
     listened = ListenedSpool(tmp_path)
-    listened.keep(listened.add(Topic("/heard", NUMBER)), 20, number(8))
+    listened.keep(listened.add(heard), 20, number(8))
     listened.close()
-    (tmp_path / ".listener/topics.json").write_text(text)
-    told: list[str] = []
-    recorder = Recorder(plan(), tmp_path, told.append)
-    recorder.complete()
-    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
-    assert "topics.json is damaged" in told[0]
+    file = tmp_path / ".listener/topics.json"
+    whole = file.read_text()
+    file.write_text(text)
+    if kept_before:
+        (tmp_path / "bag.before_repair").mkdir()
+    with pytest.raises(EnvironmentFault, match=r"topics\.json: it is damaged .* left as it is"):
+        repair(tmp_path, fail)
+    file.write_text(whole)
+    counts = counts_after_repair(tmp_path)
+    assert counts["/heard"] == 2
+    assert counts["/neuros/a/number/b/number/data"] == 1
 
 
 @pytest.mark.parametrize("name", ["std_msgs//msg/Int32", "std_msgs/msg/../msg/Int32", "/", ""])
@@ -421,3 +443,57 @@ def test_a_name_that_is_no_type_s_is_no_topic_of_the_bag(tmp_path: Path, name: s
         f"/heard is not recorded: message type {name} cannot be recorded: its definition"
         f" (share/{name}.msg) is not installed here"
     ]
+
+
+@pytest.mark.parametrize("name", ["²", "1", "000000001", "x"])
+def test_other_files_in_a_spool_are_left_alone(tmp_path: Path, name: str) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    (tmp_path / "a/spool" / name).write_text("strange")
+    recorder = record(tmp_path, plan())
+    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
+    assert [path.name for path in (tmp_path / "a/spool").iterdir()] == [name]
+    assert repair(tmp_path, fail) is None
+
+
+@pytest.mark.parametrize("name", ["a", "a/spool", "a/spool/00000001"])
+def test_a_link_in_the_place_of_a_spool_is_named_and_costs_nothing(
+    tmp_path: Path, name: str
+) -> None:
+    plan().save(tmp_path)
+    spool(tmp_path, "a", [(10, None, number(7))])
+    spool(tmp_path, "b", [(20, None, answer())])
+    link, former = tmp_path / name, tmp_path / "former"
+    if link.exists():
+        link.rename(former)
+    link.symlink_to(tmp_path)
+    told: list[str] = []
+    repaired = repair(tmp_path, told.append)
+    assert repaired is not None
+    assert repaired.counts["/answer"] == 1
+    (text,) = told
+    assert text.startswith(f"{link}: ")
+    assert text.endswith(f": packets in {tmp_path}/a/spool are not recorded, and it is kept")
+    link.unlink()
+    if former.exists():
+        former.rename(link)
+    counts = counts_after_repair(tmp_path)
+    assert (counts["/neuros/a/number/b/number/data"], counts["/answer"]) == (1, 1)
+
+
+def test_a_list_of_topics_that_is_damaged_in_a_run_costs_nothing(tmp_path: Path) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    listened = ListenedSpool(tmp_path)
+    listened.keep(listened.add(Topic("/heard", NUMBER.type)), 20, number(8))
+    listened.close()
+    file = tmp_path / ".listener/topics.json"
+    whole = file.read_text()
+    file.write_text("[")
+    told: list[str] = []
+    plan().save(tmp_path)
+    recorder = Recorder(plan(), tmp_path, told.append)
+    recorder.complete()
+    recorder.clean_up()
+    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
+    assert [text.partition(" (")[0] for text in told] == [f"{file}: it is damaged"]
+    file.write_text(whole)
+    assert counts_after_repair(tmp_path)["/heard"] == 1

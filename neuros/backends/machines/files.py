@@ -271,7 +271,7 @@ def write_chunk(run: Path, chunk: Chunk) -> int:
     A link or a pipe in the place of the file is replaced by a file.
     """
     path = Path(os.path.normpath(run / chunk.path))
-    if not path.is_relative_to(run):
+    if path == run or not path.is_relative_to(run):
         raise OSError(f"{chunk.path} is outside of the run folder")
     folders = path.relative_to(run).parent.parts
     try:
@@ -283,6 +283,6 @@ def write_chunk(run: Path, chunk: Chunk) -> int:
         ):
             file.truncate(chunk.offset)  # what is written goes to the end
             file.write(data)
-    except ValueError as error:  # neither a path nor base64
+    except (ValueError, OverflowError) as error:  # neither a path nor base64 nor an offset
         raise OSError(str(error)) from error
     return len(data)

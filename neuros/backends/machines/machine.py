@@ -27,7 +27,7 @@ from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
-from neuros.ordinary_files import folder_in, open_itself, write_whole
+from neuros.ordinary_files import folder_in, open_itself, reason_of, write_whole
 from neuros.ports import ControlStream
 from neuros.project.deployment import Host
 from neuros.project.model import Folders
@@ -221,7 +221,7 @@ class Machine:
             except FileNotFoundError:  # it has no packet log
                 continue
             except OSError as error:
-                why = f"the packet log of {node} cannot be moved: {_why(error)}"
+                why = f"the packet log of {node} cannot be moved: {reason_of(error)}"
                 self.fault = self.fault or why
 
     def close(self) -> None:
@@ -271,7 +271,8 @@ class Machine:
         except OSError as error:
             size = len(chunk.data)
             if not self.fault:
-                self.fault = f"{chunk.path} of {self.host.name} cannot be written: {_why(error)}"
+                what = f"{chunk.path} of {self.host.name}"
+                self.fault = f"{what} cannot be written: {reason_of(error)}"
         self._pump.send(agent.Took(size))
 
     def _lose(self, reason: str) -> None:
@@ -340,11 +341,6 @@ class Machine:
                     data = following
         except OSError as error:
             raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
-
-
-def _why(error: OSError) -> str:
-    """What went wrong, without the path, which for a folder that is held is that in /proc."""
-    return error.strerror or str(error)
 
 
 def agent_command(host: Host) -> list[str]:
