@@ -202,9 +202,10 @@ def load_figure(run: PastRun) -> Any | None:
         memory_mb = np.divide(series[f"{name}.memory_bytes"], 1e6)
         right.plot(series["time_s"], memory_mb, color=colour(place), label=name, **marker)
     cores = [name for name in series if name.startswith("core")]
-    whole = np.sum([series[core] for core in cores], axis=0)
-    label = f"whole machine, {len(cores)} core{'' if len(cores) == 1 else 's'}"
-    left.plot(series["time_s"], whole, color=GREY, linestyle="--", label=label)
+    if cores:  # else the file is damaged
+        whole = np.sum([series[core] for core in cores], axis=0)
+        label = f"whole machine, {len(cores)} core{'' if len(cores) == 1 else 's'}"
+        left.plot(series["time_s"], whole, color=GREY, linestyle="--", label=label)
     left.set(xlabel="wall time / s", ylabel="processor time / % of one core", ylim=(0, None))
     right.set(xlabel="wall time / s", ylabel="resident memory / MB", ylim=(0, None))
     add_legend(figure, 5)
