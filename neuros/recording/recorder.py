@@ -151,7 +151,8 @@ class Recorder:
         """Remove the spools, whose packets are in the bag."""
         for source in self._sources:
             source.reader.close(remove=not source.is_damaged)
-        forget_listened(self._run)
+        if not self._listener.is_damaged:
+            forget_listened(self._run)
 
     def abandon(self) -> None:
         """Stop, and leave bag and spools unfinished."""

@@ -495,5 +495,6 @@ def test_a_list_of_topics_that_is_damaged_in_a_run_costs_nothing(tmp_path: Path)
     recorder.clean_up()
     assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
     assert [text.partition(" (")[0] for text in told] == [f"{file}: it is damaged"]
+    assert file.read_text() == "["
     file.write_text(whole)
     assert counts_after_repair(tmp_path)["/heard"] == 1
