@@ -383,6 +383,10 @@ def _rebuild(
 ) -> Repaired:
     topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
     bag, damaged, recorded = run / BAG_NAME, run / DAMAGED_NAME, recorded_counts(run)
+    for folder in (bag, damaged):
+        if folder.is_symlink():
+            what = "it is a link: put the folder itself in its place, or remove it"
+            raise OSError(errno.ENOTDIR, what, str(folder))
     if not damaged.exists():
         if bag.exists():
             bag.rename(damaged)

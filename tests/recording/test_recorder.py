@@ -498,3 +498,19 @@ def test_a_list_of_topics_that_is_damaged_in_a_run_costs_nothing(tmp_path: Path)
     assert file.read_text() == "["
     file.write_text(whole)
     assert counts_after_repair(tmp_path)["/heard"] == 1
+
+
+@pytest.mark.parametrize("name", ["bag", "bag.damaged"])
+def test_no_bag_is_repaired_through_a_link(tmp_path: Path, name: str) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    run.mkdir()
+    plan().save(run)
+    spool(run, "a", [(10, None, number(7))])
+    (run / name).symlink_to(elsewhere)
+    with pytest.raises(EnvironmentFault, match=f"run/{name}: it is a link: .* left as it is"):
+        repair(run, fail)
+    assert (run / name).is_symlink()
+    (run / name).unlink()
+    assert counts_after_repair(run)["/neuros/a/number/b/number/data"] == 1
+    assert not [*elsewhere.iterdir()]
