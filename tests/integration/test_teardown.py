@@ -94,8 +94,9 @@ def test_processes_that_end_together_do_not_hang() -> None:
         try:
             for _ in range(rounds):
                 for process in processes:
+                    # Fast DDS may have printed there that another has removed a file of its.
                     assert process.stdout is not None
-                    assert process.stdout.readline() == "ready\n", "one has hung, and ended itself"
+                    assert "ready\n" in process.stdout, "one has hung, and ended itself"
                 for process in processes:
                     assert process.stdin is not None
                     process.stdin.write("end\n")
