@@ -38,7 +38,7 @@ def descriptor_of(path: Path, flags: int = 0) -> int:
     os.close(descriptor)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))
+    raise OSError("it is not an ordinary file")
 
 
 def open_new(path: Path) -> BinaryIO:
