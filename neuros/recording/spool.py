@@ -203,15 +203,14 @@ class SpoolReader:
             self._done.append((self._file or 0, self._last_ns))
         if remove:
             self.remove_up_to(self._last_ns)
-            with contextlib.suppress(OSError), folder_in(self._root, self._folder.name) as folder:
+            with (
+                contextlib.suppress(OSError),
+                folder_in(self._folder.parent, self._folder.name) as folder,
+            ):
                 (folder / _FOLDER).rmdir()
 
-    @property
-    def _root(self) -> Path:
-        return self._folder.parent
-
     def _spool(self) -> AbstractContextManager[Path]:
-        return folder_in(self._root, self._folder.name, _FOLDER)
+        return folder_in(self._folder.parent, self._folder.name, _FOLDER)
 
     def _open(self, number: int) -> int:
         with self._spool() as spool:

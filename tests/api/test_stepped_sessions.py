@@ -198,6 +198,19 @@ def cart(folder: Path) -> Path:
     return made
 
 
+def pondering_cart(folder: Path) -> Path:
+    """The cart with a brain that decides nothing until there is a file ``go`` in its folder."""
+    made = cart(folder)
+    waits = """
+    while not (node.run_dir / "go").exists():
+        time.sleep(0.05)
+"""
+    head = "def decide(node, pose):\n"
+    brain = BRAIN.replace(head, head + waits.lstrip("\n"))
+    (made / "brain.py").write_text(f"import time\n{brain}")
+    return made
+
+
 def eye(folder: Path, plugin: str) -> Path:
     """A node that has the time of a simulator."""
     clock = [port("clock", "rosgraph_msgs/msg/Clock")]
@@ -537,15 +550,7 @@ def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> 
 def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_from_being_heard(
     tmp_path: Path,
 ) -> None:
-    project = cart(tmp_path)
-    waits = """
-    while not (node.run_dir / "go").exists():
-        time.sleep(0.05)
-"""
-    head = "def decide(node, pose):\n"
-    brain = BRAIN.replace(head, head + waits.lstrip("\n"))
-    (project / "brain.py").write_text(f"import time\n{brain}")
-    with neuros.Project.from_file(project).session(backend="in-process") as s:
+    with neuros.Project.from_file(pondering_cart(tmp_path)).session(backend="in-process") as s:
         assert s["robot.pose"].count == 0
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.5)
@@ -633,15 +638,7 @@ def test_after_a_step_that_took_too_long_who_waits_for_an_output_waits_for_the_r
 ) -> None:
     """However long it takes, unlike who only looks."""
     monkeypatch.setattr("neuros.api.session._READ_S", 0.0)
-    project = cart(tmp_path)
-    waits = """
-    while not (node.run_dir / "go").exists():
-        time.sleep(0.05)
-"""
-    head = "def decide(node, pose):\n"
-    brain = BRAIN.replace(head, head + waits.lstrip("\n"))
-    (project / "brain.py").write_text(f"import time\n{brain}")
-    with neuros.Project.from_file(project).session(backend="in-process") as s:
+    with neuros.Project.from_file(pondering_cart(tmp_path)).session(backend="in-process") as s:
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.1)
         with pytest.raises(TimeoutError):
