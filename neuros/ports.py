@@ -288,6 +288,9 @@ class NodeContext(Protocol):
     def note_simulated_time(self) -> bool:
         """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
 
+    def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
+        """Wait, in a thread, for time 0 of the run; False if ``cancelled()`` or the node ends."""
+
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at a simulated world; see :mod:`neuros.simulators.mujoco.scene`."""
 

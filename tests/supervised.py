@@ -21,7 +21,7 @@ from neuros.project.model import Connection, Folders, Node, NodeFile
 
 HOST = [sys.executable, "-S", str(Path(__file__).parent / "launcher" / "stand_in_host.py")]
 WELL_BEHAVED = "host.up(); host.serve()"
-SHUTS_DOWN = "host.up_last(); host.tell('shutdown', reason='enough', drain_s=5); host.serve()"
+SHUTS_DOWN = "host.up(); host.tell('shutdown', reason='enough', drain_s=5); host.serve()"
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
 
 Act = Callable[[], object]
@@ -70,6 +70,7 @@ class Run:
         connections: tuple[Connection, ...] = (),
         in_process: bool = False,
         duration_s: float | None = None,
+        finalise_s: float | None = None,
         elsewhere: tuple[str, ...] = (),
         on_stop: Act = lambda: None,
         **acts: str,
@@ -86,6 +87,7 @@ class Run:
             self.signals,
             listener=self.listener(self.folder),
             duration_s=duration_s,
+            finalise_s=finalise_s,
             peers=Peers("this run", elsewhere, files),
             on_stop=on_stop,
         )

@@ -68,6 +68,7 @@ class Surroundings:
         return True
 
     def give_way(self) -> None: ...
+    def note_ready(self) -> None: ...
 
     def copy_to_itself(self, connection: Any, packet: Any) -> Any:
         return packet

@@ -315,6 +315,7 @@ class Execution:
             listener=self._listener,
             wishes=self._wishes,
             duration_s=self._plan.request.end.wall_s,
+            finalise_s=self._plan.request.finalise_s,
             peers=Peers(
                 self._run_id,
                 self._plan.elsewhere,

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
@@ -58,7 +59,7 @@ _RUN = "${RUN:-run}"
 _MOST_PIDS = 4096
 _OF_CONTAINERS = ("peers", "peer_timeout", "host_network", "registry", "volume_claim")
 _OF_SLURM = ("place", "spread")
-_STOP_S = 20  # finalise hooks have 5 s, and peers say what they have counted
+_STOP_S = 15  # besides what finalise hooks have: peers say what they have counted
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
 _MOST_MACHINES = 65_536  # no cluster has more
@@ -400,9 +401,14 @@ def _service(part: Part) -> dict[str, Any]:
         "init": True,
         "read_only": True,
         "cap_drop": ["ALL"],
-        "stop_grace_period": f"{_STOP_S}s",
+        "stop_grace_period": f"{_stop_s(part)}s",
         "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
     }
+
+
+def _stop_s(part: Part) -> int:
+    """How long a container may take to end, in seconds; the orchestrator knows no progress."""
+    return _STOP_S + math.ceil(part.node.finalise_s)
 
 
 def _is_up(part: Part, dollar: str = "$") -> list[str]:
@@ -471,7 +477,7 @@ def _job(export: Export, part: Part, app: Mapping[str, str]) -> dict[str, Any]:
     pod = {
         "subdomain": export.name,
         "restartPolicy": "Never",
-        "terminationGracePeriodSeconds": _STOP_S,
+        "terminationGracePeriodSeconds": _stop_s(part),
         "securityContext": {
             "runAsNonRoot": True,
             "runAsUser": 1000,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neuros.errors import UsageError
-from neuros.options import like, option, options_of, positive_number
+from neuros.options import like, option, options_of, positive_number, positive_seconds
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -167,6 +167,14 @@ class Request(ProjectOptions):
         default_help="runs/<project>/<utc time> in the current folder",
         is_recorded=False,
         help="write the run into this folder, which must be new or empty",
+    )
+    finalise_s: float | None = option(
+        "--finalise-s",
+        parse=positive_seconds,
+        metavar="SECONDS",
+        default_help="the project's; 5",
+        page="plugins.md#finalising",
+        help="kill a node only if it has made no progress with its finalise hooks for this long",
     )
     placement: bool = option(
         "--no-placement",

@@ -179,7 +179,14 @@ class Probed(Report):
 
 @dataclass
 class Loaded(Message):
-    """All plugins of a process are loaded; no hook starts before the answer, ``begin``."""
+    """All plugins of a process are loaded; no hook starts before ``begin``."""
+
+
+@dataclass
+class Ready(Message):
+    """A node has initialised as far as it can alone; its other hooks wait for ``activate``."""
+
+    node: str
 
 
 @dataclass
@@ -192,18 +199,19 @@ class Hooks(Message):
 
 
 @dataclass
-class FirstHook(Message):
-    """A node starts its first hook."""
-
-    node: str
-
-
-@dataclass
 class Finalising(Message):
     """A node starts a finalise hook; ``""``: it closes its resources; ``None``: they are closed."""
 
     node: str
     hook: str | None
+
+
+@dataclass
+class Progress(Message):
+    """A plugin tells how far it has come; a node that finalises has time again."""
+
+    node: str
+    text: str
 
 
 @dataclass
@@ -263,7 +271,7 @@ class AtRest(Message):
     """No event waits in a node process, and no hook may start: answer to ``settle``.
 
     Attributes:
-        has_begun: whether each node has found its receivers, so that its hooks may run.
+        is_active: whether each node has found its receivers, and may start all its hooks.
         sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
         received: by connection from another process, likewise.
         sim_times: of nodes that own simulated time, in seconds.
@@ -272,7 +280,7 @@ class AtRest(Message):
 
     nodes: tuple[str, ...]
     number: int
-    has_begun: bool
+    is_active: bool
     sent: Mapping[str, tuple[int, int]]
     received: Mapping[str, tuple[int, int]]
     sim_times: Mapping[str, float]
@@ -310,7 +318,12 @@ class Drain(Message):
 
 @dataclass
 class Begin(Message):
-    """Start hooks from now on; not sent once the run is ending."""
+    """Initialise: every node of the project is loaded; not sent once the run is stopping."""
+
+
+@dataclass
+class Activate(Message):
+    """Start tick and function hooks: every node of the project is ready."""
 
 
 @dataclass
@@ -462,11 +475,11 @@ class Ended(Message):
 
 
 FROM_NODES: Sequence[type[Message]] = (
-    *(Hello, Loaded, Report, Probed, Hooks, FirstHook, Finalising, Shutdown, Failed, Explanation),
-    *(Heard, NodeStatus, AtRest, WasReset),
+    *(Hello, Loaded, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
+    *(Explanation, Heard, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
-    *(Begin, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+    *(Begin, Activate, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
     *(Settle, Deliver, Reset),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (

@@ -50,6 +50,9 @@ class Effects(Links, Protocol):
     def post_loop_back(self, event: Callable[[], None]) -> None:
         """Have the loop-back handled after all events that already wait, outside ones too."""
 
+    def note_ready(self) -> None:
+        """The node has initialised as far as it can alone, and awaits :meth:`Engine.activate`."""
+
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
         """A copy for a connection of the node to itself; it shares nothing with this packet."""
 
@@ -118,10 +121,20 @@ class Engine:
 
     # ------------------------------------------------------------------ events
 
-    def start(self) -> None:
-        """Begin: run hooks from now on, as soon as every receiver is there."""
+    def start(self, *, awaits_others: bool = False) -> None:
+        """Begin: initialise as soon as every receiver is there, then run the other hooks.
+
+        Args:
+            awaits_others: whether the other hooks wait for :meth:`activate` besides.
+        """
         self._wake()
-        self._lifecycle.start()
+        self._lifecycle.start(awaits_others=awaits_others)
+        self._pass()
+
+    def activate(self) -> None:
+        """Every node of the project is ready: tick and function hooks may start."""
+        self._wake()
+        self._lifecycle.activate()
         self._pass()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
@@ -233,6 +246,11 @@ class Engine:
         return self._lifecycle.has_begun
 
     @property
+    def is_active(self) -> bool:
+        """Whether it has begun, and need not wait for other nodes to become ready."""
+        return self._lifecycle.has_begun and self._lifecycle.is_active
+
+    @property
     def is_running(self) -> bool:
         """Whether every initialise hook has run."""
         return self._lifecycle.is_running
@@ -281,12 +299,14 @@ class Engine:
     def is_wakeable(self) -> bool:
         """Whether a hook is ready, or something other than its connections could make one so.
 
-        That is a receiver that has still to appear, a timer, or an external topic. A thread that
-        may offer packets is known to the runtime only.
+        That is a receiver or a node that has still to appear, a timer, or an external topic. A
+        thread that may offer packets is known to the runtime only.
         """
         if self.is_stopped:
             return False
-        return not self._lifecycle.has_begun or self._schedule.is_wakeable()
+        lifecycle = self._lifecycle
+        is_starting = not (lifecycle.has_begun and lifecycle.is_active)
+        return is_starting or self._schedule.is_wakeable()
 
     def hooks(self) -> Sequence[Hook]:
         """The hooks that may still run, least recently executed first."""
@@ -306,7 +326,7 @@ class Engine:
         executing = self.executing  # read once: other threads ask, too
         if executing is not None:
             return Rest(State.EXECUTING, executing.name)
-        if not self._lifecycle.has_begun:
+        if not self._lifecycle.has_begun or self._lifecycle.awaits_others:
             return REGISTERING
         if self._pause.is_on:
             return PAUSED
@@ -355,9 +375,19 @@ class Engine:
             self._cause = pause.cause_of_rest(self._schedule.candidates)
         else:
             self._cause = self._schedule.cause_of_rest()
+        if not lifecycle.is_active and self._cause is not SCHEDULING and not self._to_itself:
+            self._await_others()
         if self._cause is SCHEDULING and not (self._has_posted_loop_back or lifecycle.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
+
+    def _await_others(self) -> None:
+        """No initialise hook could start: each has run, or needs something of another node."""
+        if not self._lifecycle.is_ready:
+            self._lifecycle.is_ready = True
+            self._effects.note_ready()
+        if self._lifecycle.awaits_others:
+            self._cause = REGISTERING
 
     def _run(self, hook: Hook) -> None:
         """Start a hook: move it to the end of the order, take its packets, send what it returns."""

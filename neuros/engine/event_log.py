@@ -28,7 +28,7 @@ class EventKind(IntEnum):
     """The kinds of entries; ``place`` and ``position`` where they have one."""
 
     BEGIN = 0  # never written: what comes before the first event
-    START = 1
+    START = 1  # place: 1 if the node waits until all others are ready
     PACKET = 2  # place: index of the connection
     HEARD = 3  # place: of the input, bound to an external topic, among the inputs of the node
     ACKNOWLEDGEMENT = 4  # place: index of the connection; position
@@ -44,6 +44,7 @@ class EventKind(IntEnum):
     STEP = 14  # place: 1 if some node of the project drives it; position: how many
     DEFERRED = 15  # the pass ended, for what had arrived; position: how many hooks it had started
     LAST_ROUND = 16  # place: of a hook that starts at most once more when the node drains: next
+    ACTIVATE = 17
 
 
 class Event(NamedTuple):
@@ -92,9 +93,13 @@ class LoggedEngine(Engine):
             for connection in connections
         }
 
-    def start(self) -> None:
-        self._note(_entry(EventKind.START))
-        super().start()
+    def start(self, *, awaits_others: bool = False) -> None:
+        self._note(_entry(EventKind.START, int(awaits_others)))
+        super().start(awaits_others=awaits_others)
+
+    def activate(self) -> None:
+        self._note(_entry(EventKind.ACTIVATE))
+        super().activate()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
         self._note(self._packet_entries[key])
@@ -258,7 +263,8 @@ class Source(Protocol):
 class Inbox(Protocol):
     """The node that takes the events to its engine."""
 
-    def start(self) -> None: ...
+    def start(self, *, awaits_others: bool = False) -> None: ...
+    def activate(self) -> None: ...
     def on_packet(self, connection: Connection, packet: Any) -> None: ...
     def on_external_packet(self, port: Any, packet: Any) -> None: ...
     def on_acknowledgement(self, connection: Connection, position: int) -> None: ...
@@ -402,6 +408,8 @@ class Player:
                 loop_back()
         elif kind is EventKind.OFFER:
             self._source.offer()
+        elif kind is EventKind.START:
+            self._inbox.start(awaits_others=bool(event.place))
         elif kind is EventKind.STEP:
             self._inbox.step(event.position, is_driven=bool(event.place))
         elif kind is EventKind.LAST_ROUND:
@@ -411,7 +419,7 @@ class Player:
             self._inbox.drain(self._last_round)
         else:
             {
-                EventKind.START: self._inbox.start,
+                EventKind.ACTIVATE: self._inbox.activate,
                 EventKind.TIMER: self._inbox.on_timer,
                 EventKind.PAUSE: self._inbox.pause,
                 EventKind.RESUME: self._inbox.resume,

@@ -6,8 +6,9 @@ that are enabled, due and have all inputs (each keeps itself in there), and comp
 so it costs the same beside 2 or 200 resting hooks.
 
 Phases: registering (until every receiver is there), initialising (until each initialise hook has
-run), running, draining (without the hooks that send unasked; those that would go on for ever start
-once more at most), stopped. Each enables some hooks; a pause lets them start in steps only.
+run, and every node of the project is ready), running, draining (without the hooks that send
+unasked; those that would go on for ever start once more at most), stopped. Each enables some hooks;
+a pause lets them start in steps only.
 """
 
 from __future__ import annotations
@@ -158,9 +159,11 @@ class Lifecycle:
 
     Attributes:
         has_begun: whether the node was started and every receiver has been found.
-        is_running: whether every initialise hook has run.
+        is_ready: whether it has told that it is ready.
+        is_active: whether every node of the project is ready.
+        is_running: whether it is active, and every initialise hook has run.
         last_round: while draining, the hooks that may start once more and no more.
-        tick_start_ns: the end of initialisation, on the clock; ticks are counted from then.
+        tick_start_ns: since when it is running, on the clock; ticks are counted from then.
     """
 
     def __init__(
@@ -173,16 +176,29 @@ class Lifecycle:
         self._initialisers = {h for h in schedule.order if h.spec.kind is HookKind.INITIALISE}
         self.is_started = False
         self.has_begun = False
+        self.is_ready = False
+        self.is_active = False
         self.is_running = False
         self.is_draining = False
         self.is_stopped = False
         self.last_round: set[Hook] = set()
         self.tick_start_ns = 0
 
-    def start(self) -> None:
-        """Run hooks from now on, as soon as every receiver is there."""
+    @property
+    def awaits_others(self) -> bool:
+        """Whether it has initialised, and some other node is not ready."""
+        return self.has_begun and not self.is_active and not self._initialisers
+
+    def start(self, *, awaits_others: bool) -> None:
+        """Initialise as soon as every receiver is there."""
         self.is_started = True
+        self.is_active = not awaits_others
         self._begin_if_registered()
+
+    def activate(self) -> None:
+        """Every node of the project is ready."""
+        self.is_active = True
+        self._run_if_initialised()
 
     def register(self, connection: Connection) -> None:
         """The receiver of one of the outputs' connections is there."""
@@ -197,8 +213,7 @@ class Lifecycle:
         hook.is_enabled = False
         self._schedule.remove(hook)
         self._initialisers.remove(hook)
-        if not self._initialisers:
-            self._begin_running()
+        self._run_if_initialised()
 
     def drain(self, last_round: Iterable[Hook]) -> None:
         """Stop the hooks that send unasked; the others go on, ``last_round`` for one start each."""
@@ -224,10 +239,11 @@ class Lifecycle:
         self.has_begun = True
         for hook in self._initialisers:
             hook.is_enabled = self._goes_on(hook)
-        if not self._initialisers:
-            self._begin_running()
+        self._run_if_initialised()
 
-    def _begin_running(self) -> None:
+    def _run_if_initialised(self) -> None:
+        if not (self.has_begun and self.is_active) or self._initialisers or self.is_running:
+            return
         self.is_running = True
         self.tick_start_ns = self._clock()
         for hook in self._schedule.order:

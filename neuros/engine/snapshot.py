@@ -182,6 +182,8 @@ def _explain(engine: Engine, now_ns: int) -> list[str]:
         reason for hook in engine.hooks() if hook.is_enabled for reason in _reasons(hook, now_ns)
     ]
     # Two hooks may have one reason; that is said once.
+    if not reasons and not engine.is_active:
+        return ["waits until every node of the project is ready"]
     return list(dict.fromkeys(reasons)) or ["has no hook that could run any more"]
 
 

@@ -387,7 +387,7 @@ Counts: TypeAlias = Mapping[str, tuple[int, int]]
 
 
 class Settling:
-    """Answers ``settle`` of a session: once all nodes have begun, and nothing moves.
+    """Answers ``settle`` of a session: once all nodes are active, and nothing moves.
 
     The run is paused: this is the end of a step. Each node process answers when no event waits in
     it, and none starts anything unasked. They answer at different instants, but with counters by
@@ -464,7 +464,7 @@ class Settling:
 
     def _judge(self, asker: ControlLink) -> None:
         answers = self._answers.values()
-        if not all(answer.has_begun for answer in answers) or self._is_under_way():
+        if not all(answer.is_active for answer in answers) or self._is_under_way():
             self._ask_later()
         else:
             self._answer(asker)

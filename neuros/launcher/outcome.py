@@ -52,10 +52,10 @@ class Outcome:
         report_times_s: when that was, on the monotonic clock.
         timelines: by node, points of simulated against wall time; each report brings further ones.
         elsewhere: what nodes that other launchers started counted on connections to here.
-        started_s: when the first hook started, ``None`` if none did.
+        started_s: time 0 of the run, when every node was ready; ``None`` if that never came.
         ending_s: when the end was asked for first: what comes after is draining and finalising. A
             run that is stopped while it stands still has ended when that pause began.
-        paused_s: how long it has stood still since the first hook.
+        paused_s: how long it has stood still since time 0.
         is_paused: whether it stands still now.
         stacks: where nodes that were killed stood in their plugins, by name.
         has_drained: whether packets in flight were waited for. After a signal or a failure they are
@@ -142,6 +142,10 @@ class Outcome:
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
         return name in self.reports and self.reports[name].is_final
+
+    def final_report_s(self, name: str) -> float:
+        """When a node came to its end, on the monotonic clock; 0 if it has not."""
+        return self.report_times_s[name] if self.has_final_report(name) else 0.0
 
     def end_by_force(self, exit_code: int, name: str) -> None:
         """The user has had killed what was left of a run, by a signal of this name."""

@@ -12,6 +12,7 @@ import math
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 from neuros.control import Report
@@ -32,6 +33,14 @@ _GRACE_S = 0.3
 _PATIENCE_S = 2.0
 
 
+class Stage(IntEnum):
+    """How far the start of a launcher's nodes has come."""
+
+    LOADING = 0
+    LOADED = 1
+    READY = 2
+
+
 @dataclass(frozen=True)
 class PeerState:
     """State that one launcher publishes to its peers: all of it, so that a missed one is no loss.
@@ -40,6 +49,7 @@ class PeerState:
         run: which run it is.
         machine: its name.
         number: a later state has a higher one.
+        stage: a :class:`Stage`, of the start there.
         phase: of the run there.
         exit_code, reason: how it ends, from when it is to end on.
         origin: the machine on which the cause of that lies.
@@ -50,6 +60,7 @@ class PeerState:
     run: str
     machine: str
     number: int = 0
+    stage: int = Stage.LOADING
     phase: str = RUNNING
     exit_code: int = 0
     reason: str = ""
@@ -136,8 +147,7 @@ class Peers:
             {c for file in files for c in file.connections if not _ends(c) <= here},
             key=lambda connection: connection.index,
         )
-        neighbours = {name for connection in self._crossing for name in _ends(connection)}
-        self._missing = neighbours - here
+        self._missing = set(elsewhere)
         self._found: list[str] = []
         self._say: Callable[[str], object] = lambda _: None
         self._own = PeerState(run, socket.gethostname())
@@ -164,6 +174,15 @@ class Peers:
         """The newest state of this launcher, for nodes that have just come."""
         return self._own.to_text()
 
+    def reach(self, stage: Stage) -> None:
+        """The nodes here have come so far in their start."""
+        if self._own.stage < stage:
+            self._utter(stage=stage)
+
+    def have_reached(self, stage: Stage) -> bool:
+        """Whether every node elsewhere has come so far."""
+        return not self._behind(stage)
+
     def drain(self, reason: str, drain_s: float) -> None:
         """The run here drains."""
         self._utter(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
@@ -189,7 +208,7 @@ class Peers:
         self._utter(phase=STOPPING, **self._because(reason, exit_code))
 
     def finish(self, reports: Mapping[str, Report], now_s: float) -> bool:
-        """All nodes here have made their final report; returns whether they may go."""
+        """No node here runs hooks any more; returns whether they may go."""
         if self._over_s is None:
             self._over_s = now_s
             self._utter(phase=OVER, counters=counters_of(reports, self._crossing))
@@ -251,6 +270,9 @@ class Peers:
         if self._missing and now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
             yield "INFO", f"still waiting for nodes elsewhere: {self._names()}{self._hint}"
+        elif now_s >= self._next_remark_s and (behind := self._behind(self._own.stage)):
+            self._next_remark_s = now_s + _NEXT_REMARK_S
+            yield "INFO", f"nodes elsewhere are still starting: {', '.join(behind)}"
 
     def overdue(self, now_s: float) -> str:
         """Which nodes elsewhere were waited for too long, in a sentence; empty: none."""
@@ -264,6 +286,11 @@ class Peers:
         )
 
     # ------------------------------------------------------------------ inside
+
+    def _behind(self, stage: int) -> list[str]:
+        """The nodes elsewhere that have not come so far."""
+        found = {name: self._others[run].stage for name, run in self._run_of.items()}
+        return [name for name in self._elsewhere if found.get(name, -1) < stage]
 
     def _names(self) -> str:
         return ", ".join(sorted(self._missing))

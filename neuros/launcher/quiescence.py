@@ -334,41 +334,14 @@ class Declarations:
             if port.external_topic is not None
         }
         self._hooks: dict[str, list[DeclaredHook]] = {}
-        self._finalisers: dict[str, list[str]] = {}
-        self._finalising: dict[str, str | None] = {}
 
     def take(self, message: Hooks) -> None:
         """Take the declarations of a node."""
         node = message.node
-        self._finalisers[node] = list(message.finalise)
         self._hooks[node] = [
             DeclaredHook(hook.kind, hook.inputs, hook.outputs, node, place)
             for place, hook in enumerate(message.hooks)
         ]
-
-    def note_finalising(self, node: str, hook: str | None) -> None:
-        """A node has started this finalise hook; ``""``: to close what it holds; ``None``: done."""
-        self._finalising[node] = hook
-        if hook and hook in self._finalisers.get(node, ()):
-            self._finalisers[node].remove(hook)
-
-    def is_finalising(self, node: str) -> bool:
-        """Whether a node has come as far as its finalise hooks."""
-        return node in self._finalising
-
-    def unfinished(self, node: str) -> list[str]:
-        """Clauses about the finalise hooks of a node that has not made its final report."""
-        clauses = []
-        hook = self._finalising.get(node)
-        if hook:
-            clauses.append(f"finalise hook '{hook}' of '{node}' did not finish")
-        elif hook is not None:
-            clauses.append(f"what '{node}' has registered with node.on_close did not end")
-        if names := self._finalisers.get(node):
-            hooks = " and ".join(f"'{name}'" for name in names)
-            noun = "hook" if len(names) == 1 else "hooks"
-            clauses.append(f"finalise {noun} {hooks} of '{node}' did not run")
-        return clauses
 
     def last_round(self, stopped: str) -> dict[str, tuple[int, ...]]:
         """By node, the places of the hooks that may start once more only, for the end to come.

@@ -1,6 +1,7 @@
 """Shutdown of a run: its phases, and the events that end each of them.
 
-Running, then perhaps draining, then stopping, and at worst killed; never back.
+Running, then perhaps draining, then stopping, and at worst killed; never back. A drained end that
+is asked for while the run starts waits until every node is ready.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 
 from neuros.control import Drain, Leave, Stop
 from neuros.launcher.channels import Channels
+from neuros.launcher.finalising import LEAVE_S, Finalising
 from neuros.launcher.outcome import (
     EXIT_CODES,
     SIGNAL_NAMES,
@@ -26,16 +28,21 @@ from neuros.launcher.outcome import (
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict
 from neuros.launcher.stall_detector import SILENT_S, StallDetector
+from neuros.launcher.start import Start
 from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import RunningNode
 
-STOP_S = 5.0
-"""What a node has for its finalise hooks and for flushing, in all."""
+DRAIN_S = 5.0
+"""How long packets under way have to arrive, unless a plugin says otherwise."""
 
 # Reading where nodes stand begins so long before they are killed, and may hold that up for so long.
 _READ_EARLY_S, _READ_S = 1.0, 0.5
-# What closing a node that peers have heard may take, before it would be killed.
+# What closing a node that peers have heard may take, before it is killed.
 _CLOSING_S = 1.0
+# How long a process may take to vanish once it is killed.
+_KILLED_S = 5.0
+# A plugin may tell its progress more often than a user can read it.
+_TELL_S = 1.0
 
 
 @dataclass
@@ -45,6 +52,9 @@ class Shutdown:
     Args:
         _signals: numbers of the signals that have arrived, appended to by a signal handler.
         _on_stop: called once nodes have been told to end.
+
+    Attributes:
+        is_hopeless: whether something outlasts even SIGKILL; the reaper will try on for a while.
     """
 
     _channels: Channels
@@ -52,6 +62,8 @@ class Shutdown:
     _detector: StallDetector
     _reader: ThreadReader
     _declarations: Declarations
+    _start: Start
+    _finalising: Finalising
     _probing: Probing
     _peers: Peers
     _outcome: Outcome
@@ -60,24 +72,26 @@ class Shutdown:
     _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
-    _begun: set[str] = field(default_factory=set)
+    _asked: tuple[str, float, str] | None = None  # a drained end, while the run starts
     _kill_early_s: float = math.inf
-
-    @property
-    def is_hopeless(self) -> bool:
-        """Whether something outlasts even SIGKILL; the reaper will try on for a while."""
-        return self.phase is Phase.KILLED and time.monotonic() >= self._deadline_s
+    is_hopeless: bool = False
+    _told_s: dict[str, float] = field(default_factory=dict)
 
     def excuse(self, still_s: float) -> None:
         """The run stood still for so long: what nodes have for their end begins where it was."""
         self._deadline_s += still_s
+        self._finalising.excuse(still_s)
 
     def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
         """Let packets under way arrive, and then end; only a run that is not ending already.
 
         ``stopped`` is the node that asks for it, and starts no further hook.
         """
-        if self.phase is not Phase.RUNNING:
+        if self.phase is not Phase.RUNNING or self._asked is not None:
+            return
+        if not self._start.is_over:
+            self._asked = reason, drain_s, stopped
+            self._output.log("INFO", f"{reason}; the end comes once every node has initialised")
             return
         self.phase = Phase.DRAINING
         now_s = time.monotonic()
@@ -86,24 +100,26 @@ class Shutdown:
         self._deadline_s = now_s + drain_s
         self._output.log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._kill_not_begun()
         self._channels.send(Drain(self._declarations.last_round(stopped)))
         self._probing.drain(self._processes.killed, now_s)
 
-    def let_begin(self, names: Sequence[str]) -> bool:
-        """The nodes of a process are loaded; returns whether they may start hooks."""
-        if self.phase is Phase.RUNNING:
-            self._begun.update(names)
-        return self.phase is Phase.RUNNING
+    def end_of_start(self) -> None:
+        """Time 0 of the run: where its end has been asked for, that comes now."""
+        if self._asked is not None:
+            asked, self._asked = self._asked, None
+            self.drain(*asked)
 
     def note_finalising(self, node: str, hook: str | None) -> None:
-        """A node finalises; one that shares its process has its time from when its turn comes."""
-        is_next = not self._declarations.is_finalising(node)
-        self._declarations.note_finalising(node, hook)
-        process = self._processes.with_node(node)
-        is_beside_others = process is not None and len(process.names) > 1
-        if self.phase is Phase.STOPPING and is_next and is_beside_others:
-            self._deadline_s = time.monotonic() + STOP_S
+        """A node starts a finalise hook, or closes what it holds, or has done so."""
+        self._finalising.note_hook(node, hook, time.monotonic())
+
+    def note_progress(self, node: str, text: str) -> None:
+        """A plugin tells how far it has come."""
+        now_s = time.monotonic()
+        self._finalising.note_progress(node, now_s)
+        if now_s - self._told_s.get(node, 0.0) >= _TELL_S:
+            self._told_s[node] = now_s
+            self._output.log("INFO", f"{node}: {text}")
 
     def counts_failure_of(self, name: str) -> bool:
         """Whether it matters that a node fails: not if it was killed as the run ended well."""
@@ -116,14 +132,14 @@ class Shutdown:
             process.kill()
 
     def _kill_not_begun(self) -> None:
-        """Kill what was not told to begin: nothing was sent by it or to it, no hook has run.
+        """Kill all if nodes were not told to begin: no hook has run, so there is nothing to save.
 
-        It may be the only one here that can tell peers of the end, and has a moment for that.
+        They alone can tell peers of the end, and have a moment for that.
         """
+        if self._start.has_begun:
+            return
         for process in self._processes:
-            if not {*process.names} & (self._begun | self._processes.killed):
-                if self.phase is Phase.DRAINING:
-                    self._output.log("INFO", f"{names_of(process)} had not started yet: killed")
+            if not self._processes.killed.issuperset(process.names):
                 if self._peers.exist:
                     self._processes.killed.update(process.names)
                     self._channels.send_to_node(process.names[0], Stop())
@@ -174,9 +190,13 @@ class Shutdown:
         if now_s >= self._kill_early_s:
             self._kill_early_s = math.inf
             for process in self._processes:
-                if self._begun.isdisjoint(process.names):
-                    process.kill()
-        if self.phase is Phase.STOPPING:
+                process.kill()
+        if self.phase is Phase.KILLED and now_s >= self._deadline_s and not self.is_hopeless:
+            self.is_hopeless = True
+            for process in self._processes:
+                text = f"{nodes_of(process)} had not ended {_KILLED_S:g} s after it was killed"
+                self._outcome.fail(text)
+        elif self.phase is Phase.STOPPING:
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
             if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
@@ -190,46 +210,50 @@ class Shutdown:
                 self._stop()
 
     def _look_at_stopping(self, now_s: float) -> None:
-        left_s = self._deadline_s - now_s
-        if left_s <= 0.0:
-            for process in self._processes:
-                self._fail_to_end(process, now_s)
-            self._kill_all()
+        for text in self._finalising.remarks(now_s):
+            self._output.log("INFO", text)
+        running = [p for p in self._processes if not self._processes.killed.issuperset(p.names)]
+        left_s = {process: self._left_s(process, now_s) for process in running}
+        self._begin_to_read([process for process in running if left_s[process] < _READ_EARLY_S])
+        overdue = [process for process in running if left_s[process] <= 0.0]
+        for process in overdue:
+            self._fail_to_end(process, now_s)
+        self.kill(overdue)
+        if len(overdue) == len(running):
+            self._give_up_soon()
             return
-        if left_s < _READ_EARLY_S:
-            self._begin_to_read([*self._processes])
-        if self._peers.exist and self._processes.have_reported():
-            may_go = self._peers.finish(self._outcome.reports, now_s)
-            if may_go or left_s < _CLOSING_S:
-                self._channels.send(Leave())
+        have_stopped = all(self._finalising.has_begun(process.names) for process in running)
+        if have_stopped and self._peers.exist and self._peers.finish(self._outcome.reports, now_s):
+            self._channels.send(Leave())
+
+    def _left_s(self, process: RunningNode, now_s: float) -> float:
+        """How long a process may go on without a sign of progress."""
+        reported_s = [self._outcome.final_report_s(name) for name in process.names]
+        if all(reported_s):
+            return max(reported_s) + LEAVE_S - now_s
+        return self._finalising.left_s(process.names, now_s)
 
     def _fail_to_end(self, process: RunningNode, now_s: float) -> None:
         """Its nodes have had their time."""
-        if self._begun.isdisjoint(process.names):
-            self._outcome.fail(
-                f"{nodes_of(process)} had not started, and had not ended {STOP_S:g} s after it was"
-                " killed"
-            )
-            return
         late = [name for name in process.names if not self._outcome.has_final_report(name)]
-        unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
-        why = "; ".join(unfinished) or "its process did not end"
         at_it = self._finalising_in(process)
         who = f"node '{at_it}'" if at_it else nodes_of(process)
-        since = "it began to finalise" if at_it else "the end began"
-        self._outcome.fail(f"{who} had to be killed {STOP_S:g} s after {since}: {why}")
+        unfinished = [clause for name in late for clause in self._unfinished(name, now_s)]
+        if late:
+            limit_s = self._finalising.limits_s[at_it or late[0]]
+            after, why = f"after {limit_s:g} s without progress", "; ".join(unfinished)
+        else:
+            after, why = f"{LEAVE_S:g} s after its final report", "its process did not end"
+        self._outcome.fail(f"{who} had to be killed {after}: {why}")
 
     def _finalising_in(self, process: RunningNode) -> str:
         """The node that keeps the others of its process waiting while it finalises; else empty."""
-        if len(process.names) == 1:
-            return ""
-        at_it = filter(self._declarations.is_finalising, process.names)
-        return next((name for name in at_it if not self._outcome.has_final_report(name)), "")
+        return self._finalising.current(process.names) if len(process.names) > 1 else ""
 
     def _unfinished(self, name: str, now_s: float) -> list[str]:
         """Clauses about a node that has not made its final report."""
-        hook, is_finalising = self._detector.executing(name), self._declarations.is_finalising(name)
-        clauses = self._declarations.unfinished(name)
+        hook, is_finalising = self._detector.executing(name), self._finalising.has_begun([name])
+        clauses = self._finalising.unfinished(name)
         if hook and not is_finalising:
             clauses.insert(0, f"'{name}' was still executing '{hook}'")
         if clauses:
@@ -248,16 +272,20 @@ class Shutdown:
         self.phase = Phase.STOPPING
         now_s = time.monotonic()
         self._outcome.begin_to_end(now_s)
-        self._deadline_s = now_s + STOP_S
+        self._finalising.begin(now_s)
         self._peers.stop(self._outcome.exit_code, self._outcome.reason)
         self._channels.send(Stop())
         self._kill_not_begun()
         self._on_stop()
 
     def _kill_all(self) -> None:
-        self.phase = Phase.KILLED
         self.kill([*self._processes])
-        self._deadline_s = time.monotonic() + STOP_S
+        self._give_up_soon()
+
+    def _give_up_soon(self) -> None:
+        """All are killed; what outlasts that is left to the reaper after a while."""
+        self.phase = Phase.KILLED
+        self._deadline_s = time.monotonic() + _KILLED_S
 
     def kill(self, processes: Sequence[RunningNode]) -> None:
         """Kill processes, and tell where their nodes stood."""

@@ -47,6 +47,7 @@ class StallDetector:
         self._plugins: dict[str, str] = {}
         self._silent = set(names)
         self._loaded: set[str] = set()
+        self._ready: set[str] = set()
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
         self._moved: dict[str, Any] = {}
@@ -100,6 +101,10 @@ class StallDetector:
     def note_loaded(self, name: str) -> None:
         """The plugin of a node has been imported."""
         self._loaded.add(name)
+
+    def note_ready(self, name: str) -> None:
+        """A node has initialised as far as it can alone."""
+        self._ready.add(name)
 
     def has_begun(self, name: str) -> bool:
         """Whether a node may run hooks."""
@@ -163,6 +168,9 @@ class StallDetector:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
+            elif self.is_complete and not self._ready.issuperset(self._names):
+                initialising = [name for name in self._names if name not in self._ready]
+                yield "INFO", f"still initialising: {', '.join(initialising)}"
             elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
                 yield from self._remarks_on_starving(now_s)
 

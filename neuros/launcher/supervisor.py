@@ -18,6 +18,7 @@ from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, Overheard, PauseState, Settling
+from neuros.launcher.finalising import Finalising
 from neuros.launcher.outcome import (
     Outcome,
     Output,
@@ -27,8 +28,9 @@ from neuros.launcher.outcome import (
 )
 from neuros.launcher.peers import Peers
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
-from neuros.launcher.shutdown import STOP_S, Shutdown
+from neuros.launcher.shutdown import DRAIN_S, Shutdown
 from neuros.launcher.stall_detector import Backlog, StallDetector
+from neuros.launcher.start import Start
 from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
@@ -41,7 +43,6 @@ _PARTED_S = 1.0
 """A process that has hung up ends within this time, or something has closed its descriptors."""
 _KEPT_STILL_S = 1.0
 """Between two looks at the time there is a fifth of that, unless this process may not run."""
-_NOT_BEGUN = "no hook has run yet, and --duration counts from the first one: Ctrl+C ends the run"
 
 
 class Supervisor:
@@ -57,7 +58,8 @@ class Supervisor:
         listener: where nodes and observers connect to the control channel.
         wishes: reasons for which this program wants the run to end, drained; appended to by any
             thread.
-        duration_s: wall time from the first hook to a drained end, ``None``: no limit.
+        duration_s: wall time from time 0 to a drained end, ``None``: no limit.
+        finalise_s: how long nodes may finalise without progress, ``None``: as their files say.
         peers: who starts the other nodes of the project, where not all are started here.
         is_held: whether the nodes start paused, for a session.
         on_stop: called once nodes have been told to end; it must not take long.
@@ -84,6 +86,7 @@ class Supervisor:
         listener: ControlListener,
         wishes: Sequence[str] = (),
         duration_s: float | None = None,
+        finalise_s: float | None = None,
         peers: Peers | None = None,
         waker: socket.socket | None = None,
         is_held: bool = False,
@@ -95,7 +98,7 @@ class Supervisor:
         self._output = output = Overheard(output, lambda message: self.observers.tell(message))
         self._wishes = wishes
         self._duration_s = duration_s
-        self._paused_before_s = 0.0  # the first hook
+        self._paused_before_s = 0.0  # time 0 of the run
         self._peers = peers or Peers("", (), files)
         names = [file.node.name for file in files]
         self._channels = Channels(listener)
@@ -111,12 +114,17 @@ class Supervisor:
         peers_to_ask = self._peers if self._peers.exist else None
         self._probing = Probing(names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
+        self._start = Start(names, self._peers)
+        limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
+        self._finalising = Finalising(limits_s, run_folder)
         self._shutdown = Shutdown(
             self._channels,
             self._processes,
             self._detector,
             self._reader,
             self._declarations,
+            self._start,
+            self._finalising,
             self._probing,
             self._peers,
             self.outcome,
@@ -132,7 +140,7 @@ class Supervisor:
             self._channels,
             self.pause,
             lambda: self._detector.is_driven,
-            lambda reason: self._shutdown.drain(reason, STOP_S),
+            lambda reason: self._shutdown.drain(reason, DRAIN_S),
         )
         self._signals = signals
         self._refused: set[ControlLink] = set()
@@ -196,17 +204,18 @@ class Supervisor:
             case control.Hello():
                 self._on_hello(link, message)
             case control.Loaded():
-                if self._shutdown.let_begin(self._channels.nodes_of(link)):
-                    self._channels.send_to(link, control.Begin())
+                self._start.note_loaded(self._channels.nodes_of(link))
+            case control.Ready(node):
+                self._start.note_ready(node)
+                self._detector.note_ready(node)
             case control.Hooks():
                 self._declarations.take(message)
+                self._finalising.declare(message.node, message.finalise)
                 self._detector.note_loaded(message.node)
             case control.Finalising(node, hook):
                 self._shutdown.note_finalising(node, hook)
-            case control.FirstHook():
-                if self.outcome.started_s is None:
-                    self.outcome.started_s = time.monotonic()
-                    self._paused_before_s = self.pause.total_s
+            case control.Progress(node, text):
+                self._shutdown.note_progress(node, text)
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
                 self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
@@ -306,6 +315,8 @@ class Supervisor:
             self._backlog.begin_anew()
             self._shutdown.excuse(still_s)
         self._shutdown.heed_peers()
+        if self._shutdown.phase is Phase.RUNNING and not self._start.is_over:
+            self._look_at_start(now_s)
         self._shutdown.look(now_s)
         self._keep_pause()
         self._show(self._detector.remarks_on_hooks())
@@ -314,6 +325,15 @@ class Supervisor:
         self.observers.look_at(self._shutdown.phase)
         if self._shutdown.phase is Phase.RUNNING:
             self._look_at_run(now_s)
+
+    def _look_at_start(self, now_s: float) -> None:
+        if self._start.may_initialise():
+            self._channels.send(control.Begin())
+        if self._start.may_run():
+            self.outcome.started_s = now_s
+            self._paused_before_s = self.pause.total_s
+            self._shutdown.end_of_start()  # hooks that send unasked would start before it
+            self._channels.send(control.Activate())
 
     def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
         for severity, text in remarks:
@@ -330,7 +350,7 @@ class Supervisor:
 
     def _look_at_run(self, now_s: float) -> None:
         if self._wishes:
-            self._shutdown.drain(self._wishes[0], STOP_S)
+            self._shutdown.drain(self._wishes[0], DRAIN_S)
             return
         if self.pause.is_on:
             self._detector.begin_anew(now_s)
@@ -338,14 +358,12 @@ class Supervisor:
             return
         end_s = self._end_s
         if end_s is not None and now_s >= end_s:
-            self._shutdown.drain(f"{self._duration_s:g} s are over", STOP_S)
+            self._shutdown.drain(f"{self._duration_s:g} s are over", DRAIN_S)
             return
         for source in (self._detector, self._backlog, self._peers):
             self._show(source.remarks(now_s))
-        if self._detector.has_just_stalled(now_s):
+        if self._start.is_over and self._detector.has_just_stalled(now_s):
             self._channels.send(control.Explain())
-            if self._duration_s is not None and self.outcome.started_s is None:
-                self._output.log("WARN", _NOT_BEGUN)
         if overdue := self._peers.overdue(now_s):
             self._shutdown.fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked

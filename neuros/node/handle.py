@@ -27,11 +27,13 @@ class PluginServices:
 
     Args:
         ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
+        tell_progress: called with what a plugin says of its progress.
         show_world: called with what shows the simulated world of the node.
 
     Attributes:
         closers: called once when the node ends, last added first.
         engine: the node's, ``None`` until its plugin is loaded.
+        is_active: set at time 0 of the run, when every node of the project is ready.
         is_ending: whether no further hook starts.
         results: what the plugin has noted.
         make_packet: a new message with default values, for a type in ROS notation.
@@ -46,17 +48,20 @@ class PluginServices:
         time: SimulatedTime,
         failures: Failures,
         ask_for_end: Callable[..., object],
+        tell_progress: Callable[[str], object],
         show_world: Callable[[WorldLook], None],
         results: Results,
     ) -> None:
         self.engine: Engine | None = None
         self.is_ending = False
+        self.is_active = threading.Event()
         self.waiting_threads: set[threading.Thread] = set()
         self.make_packet = packets.make
         self._loop = loop
         self.time = time
         self._failures = failures
         self._ask_for_end = ask_for_end
+        self.tell_progress = tell_progress
         self.show_world = show_world
         self.results = results
         self.closers: list[Callable[[], None]] = []
@@ -278,6 +283,13 @@ class NodeHandle:
                 return place
         raise ModelError(f"'{path}' does not exist: looked for {', '.join(map(str, places))}")
 
+    def progress(self, text: str) -> None:
+        """Tell the user how far a long hook has come; a finalise hook then has time again.
+
+        A node that makes no progress for ``finalise_s`` seconds while it finalises is killed.
+        """
+        self._services.tell_progress(str(text))
+
     def expect_end(self, sim_s: float) -> None:
         """Tell after how many seconds of simulated time this plugin will end the project.
 
@@ -320,6 +332,16 @@ class NodeHandle:
     def fail(self, error: BaseException) -> None:
         """End the node as failed, from any thread: for errors that no hook can raise."""
         self._services.fail_from_thread(error)
+
+    def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
+        """Wait, in another thread, for time 0 of the run: every node of the project is ready.
+
+        Returns False, before that, once ``cancelled()`` is true or the node ends.
+        """
+        while not self._services.is_active.wait(_POLL_S):
+            if self._services.is_ending or cancelled():
+                return False
+        return True
 
     def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
         """Send from another thread, as if a hook with those outputs had returned them.

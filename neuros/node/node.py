@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.control import Finalising, FirstHook, Message, Shutdown
+from neuros.control import Finalising, Message, Progress, Ready, Shutdown
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
@@ -101,6 +101,7 @@ class NodeRuntime:
             self._time,
             self.failures,
             lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
+            lambda text: tell(Progress(self.name, text)),
             lambda look: self.reports.show_world(look),
             Results(self.run_dir),
         )
@@ -124,7 +125,7 @@ class NodeRuntime:
             self._time,
             instruments,
             enter=self._enter,
-            on_first_hook=lambda: tell(FirstHook(self.name)),
+            on_ready=lambda: tell(Ready(self.name)),
             on_initialised=on_initialised,
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
@@ -180,12 +181,22 @@ class NodeRuntime:
         self._load_plugin()
         self.reports.open(self._make(), self._logger)
 
-    def start(self) -> None:
-        """Let the engine run hooks as soon as every receiver is there."""
+    def start(self, *, awaits_others: bool = False) -> None:
+        """Initialise as soon as every receiver is there, and then run the other hooks.
+
+        ``awaits_others``: these wait for :meth:`activate`, too.
+        """
         if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
             self._has_timer = True
             self._middleware.loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
-        self._guard(self._loaded.start)
+        self._guard(partial(self._loaded.start, awaits_others=awaits_others))
+        if not awaits_others:
+            self._services.is_active.set()
+
+    def activate(self) -> None:
+        """Every node of the project is ready: run tick and function hooks."""
+        self._guard(self._loaded.activate)
+        self._services.is_active.set()
 
     @property
     def why_not_reset(self) -> str:
@@ -382,11 +393,8 @@ class NodeEffects:
     Args:
         enter: puts the context of the node in place.
         instruments: what looks at packets, in this order.
-        on_first_hook: called before the first hook.
+        on_ready: called once the node waits for all others to become ready.
         on_initialised: called after each initialise hook.
-
-    Attributes:
-        has_run: whether a hook has started.
     """
 
     def __init__(
@@ -399,7 +407,7 @@ class NodeEffects:
         instruments: Sequence[Instrument],
         *,
         enter: Callable[[], None],
-        on_first_hook: Callable[[], object],
+        on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
         self._loop, self._copy = middleware.loop, middleware.packets.copy
@@ -416,9 +424,8 @@ class NodeEffects:
         self._sent: dict[str, Tap] = {}
         self._taps_to_itself: dict[Connection, Tap] = {}
         self._enter = enter
-        self._on_first_hook = on_first_hook
+        self.note_ready = on_ready
         self._on_initialised = on_initialised
-        self.has_run = False
 
     def tap(self, way: Way, port: Port, connection: Connection | None = None) -> Tap:
         """A place where packets pass, with the instruments that want to look at them."""
@@ -434,9 +441,6 @@ class NodeEffects:
             HookError: if it raises any exception.
         """
         self._enter()
-        if not self.has_run:
-            self.has_run = True
-            self._on_first_hook()
         spec = hook.spec
         try:
             result = spec.function(self._handle, *arguments)

@@ -85,7 +85,8 @@ class NodeProcess:
         self._is_paused = False
         self._step: Advance | None = None
         self._is_settling = False
-        self._has_begun = self._is_draining = self._has_been_reset = False
+        self._has_begun = self._is_active = self._is_finalising = False
+        self._is_draining = self._has_been_reset = False
         self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
@@ -108,6 +109,8 @@ class NodeProcess:
             thread = ControlThread(self._link, signalled, self, self._steps)
             thread.start()
             self._guard(self._live)
+            self.report()  # hooks are over: what peers want to know is known before a long end
+            self._is_finalising = True
             for node in self._nodes:
                 self._guard(functools.partial(node.finalise, runs_hooks=self._has_begun))
                 self._guard(functools.partial(self._report_last, node))
@@ -125,6 +128,8 @@ class NodeProcess:
             case control.Begin():
                 self.post(self._begin)
                 self._may_begin.set()
+            case control.Activate():
+                self.post(self._activate)
             case control.Stop():
                 self.ask_to_stop()
             case control.Leave():
@@ -198,7 +203,8 @@ class NodeProcess:
     def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
-            node.reports.write_logs()
+            if not self._is_finalising:  # a file that grows would pass for progress of the plugin
+                node.reports.write_logs()
             self._tell(node.reports.report())
 
     def _report_last(self, node: NodeRuntime) -> None:
@@ -309,7 +315,7 @@ class NodeProcess:
                     self._fail(node.name, error)
                     return
                 self._tell(declared(node.name, node.specs))
-                loop.post(node.start)
+                loop.post(functools.partial(node.start, awaits_others=not self._is_active))
         self._tell(control.WasReset(why_not))
 
     def _why_not_reset(self) -> str:
@@ -364,7 +370,12 @@ class NodeProcess:
             node.reports.begin()
         self.report()
         for node in self._nodes:
-            node.start()
+            node.start(awaits_others=True)
+
+    def _activate(self) -> None:
+        self._is_active = True
+        for node in self._nodes:
+            node.activate()
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)
@@ -570,7 +581,7 @@ def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtR
     return control.AtRest(
         names,
         asked.number,
-        len(engines) == len(nodes) and all(engine.has_begun for engine in engines),
+        len(engines) == len(nodes) and all(engine.is_active for engine in engines),
         {
             str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
             for w in windows

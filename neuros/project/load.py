@@ -19,6 +19,7 @@ from neuros.project.checks import (
 from neuros.project.dashboard import dashboard_of
 from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
 from neuros.project.model import (
+    FINALISE_S,
     NETWORK,
     NETWORK_MODULE,
     Access,
@@ -106,6 +107,7 @@ class _Builder:
             access=_if_valid(lambda: access_of(keys), Access()),
             parameters=_if_valid(lambda: parameters_of(keys.get("parameters", {})), {}),
             module=module,
+            finalise_s=_if_valid(lambda: float(keys.get("finalise_s", FINALISE_S)), FINALISE_S),
         )
 
     def _plugin(self, element: Element) -> tuple[str, Path]:

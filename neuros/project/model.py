@@ -25,6 +25,7 @@ NETWORK = "NETWORK"
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
 _KEYS_OF_TRANSPORT = ("compression", "quality")
+FINALISE_S = 5.0
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _UNITS = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
 
@@ -97,6 +98,7 @@ class Node:
         access: what its container is let in to.
         parameters: values of ROS parameters, by full name.
         module: the name of the plugin where it is one of an installed package, else empty.
+        finalise_s: how long it may finalise without progress before it is killed, in seconds.
     """
 
     name: str
@@ -114,6 +116,7 @@ class Node:
     access: Access = field(default_factory=Access)
     parameters: Mapping[str, Value] = field(default_factory=lambda: _NOTHING, hash=False)
     module: str = ""
+    finalise_s: float = FINALISE_S
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""

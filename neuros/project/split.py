@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.project.model import (
+    FINALISE_S,
     Budgets,
     Connection,
     Folders,
@@ -95,6 +96,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             resources=resources_of(node),
             access=access_of(node),
             parameters=parameters_of(node.get("parameters", {})),
+            finalise_s=node.get("finalise_s", FINALISE_S),
         ),
         connections=tuple(
             Connection.of(keys, namespace=names.namespace) for keys in content["connections"]
@@ -171,6 +173,7 @@ def _node_keys(node: Node) -> dict[str, Any]:
         "affinity": list(node.affinity),
         **keys_of(node.resources, node.access),
         "parameters": parameters_to_json(node.parameters),
+        "finalise_s": 0 if node.finalise_s == FINALISE_S else node.finalise_s,
     }
     return {
         "name": node.name,

@@ -142,6 +142,7 @@ class Bench:
         self.hook_s = 0.0
         self.is_taken_in = True
         self.ways_given = 0
+        self.told_ready = 0
         self.posted: deque[tuple[str, Callable[[], None]]] = deque()
         node = node_for("node", specs, connections, external_inputs, external_outputs)
         self.by_name: dict[str, Any] = {str(c): c for c in connections}
@@ -232,6 +233,9 @@ class Bench:
 
     def give_way(self) -> None:
         self.ways_given += 1
+
+    def note_ready(self) -> None:
+        self.told_ready += 1
 
     def has_taken_in(self) -> bool:
         return self.is_taken_in

@@ -70,6 +70,7 @@ class NetworkNode:
         )
 
     def give_way(self) -> None: ...
+    def note_ready(self) -> None: ...
 
     def has_taken_in(self) -> bool:
         return True

@@ -53,6 +53,7 @@ class Written:
         return True
 
     def give_way(self) -> None: ...
+    def note_ready(self) -> None: ...
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
         return lambda position: self.log.append(("acknowledge", str(connection), position))

@@ -62,7 +62,7 @@ def whole_bench(make_engine: Callable[..., Any], specs: list[HookSpec]) -> Bench
 class Run:
     """A node, and neighbours that keep the rules but for when they do something."""
 
-    def __init__(self, specs: list[HookSpec]) -> None:
+    def __init__(self, specs: list[HookSpec], *, awaits_others: bool = False) -> None:
         self.bench = whole_bench(LoggedEngine, specs)
         self.bench.during_call = self.on_call
         self.calls_until_arrival = 0
@@ -70,7 +70,7 @@ class Run:
         engine = self.bench.engine
         for connection in (*OUTGOING, CONNECTIONS[3]):
             engine.on_registered(connection)
-        engine.start()
+        engine.start(awaits_others=awaits_others)
         self.is_draining = False
 
     @property
@@ -110,6 +110,8 @@ class Run:
             bench.engine.drain([place for place in places if advance_ns >> place & 1])
         elif what == 10:
             bench.is_taken_in = not bench.is_taken_in
+        elif what == 12:
+            bench.engine.activate()
         elif what == 11:
             self.calls_until_arrival = 1 + advance_ns % 3
 
@@ -131,6 +133,7 @@ class Again:
         self.bench.post_loop_back = self._post_loop_back  # type: ignore[method-assign]
         engine: Any = self.bench.engine
         self.start, self.drain, self.stop = engine.start, engine.drain, engine.stop_hooks
+        self.activate = engine.activate
         self.pause, self.resume, self.step = engine.pause, engine.resume, engine.step
         self.on_packet, self.on_timer = engine.on_packet, engine.on_timer
         self.on_acknowledgement = engine.on_acknowledgement
@@ -158,13 +161,15 @@ class Again:
         return ran
 
 
-steps = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 30_000_000)), max_size=150)
+steps = st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30_000_000)), max_size=150)
 
 
 @settings(max_examples=150, deadline=None)
-@given(steps)
-def test_a_node_does_again_what_it_did(given_steps: list[tuple[int, int]]) -> None:
-    run = Run(hooks())
+@given(steps, st.booleans())
+def test_a_node_does_again_what_it_did(
+    given_steps: list[tuple[int, int]], awaits_others: bool
+) -> None:
+    run = Run(hooks(), awaits_others=awaits_others)
     for what, advance_ns in given_steps:
         run.step(what, advance_ns)
     run.bench.engine.stop_hooks()

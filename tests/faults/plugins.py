@@ -15,7 +15,7 @@ DRAINS_WITHIN_S = 5.0
 DURATION_S = 1.5
 _LOOKS_FOR_S = 1.0
 _ATTEMPTS = 3
-_CUT_SHORT = "had to be killed 5 s after "
+_CUT_SHORT = "had to be killed after 5 s without progress"
 
 
 def place_of(cell: Cell) -> Place:

@@ -64,7 +64,7 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
     file.write_text(json.dumps({**json.loads(file.read_text()), "budgets": budgets}))
     finished = bench.launch()
     assert finished.exit_code == finished.record["exit_code"] == 1
-    held = r"had to be killed 5 s after the end began: 'gil' was still executing 'hold';"
+    held = r"had to be killed after 5 s without progress: 'gil' was still executing 'hold';"
     assert re.search(
         f"nodes? 'gil'.* {held} finalise hook 'save' of 'gil' did not run", finished.output
     )
@@ -74,7 +74,7 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
     assert len(finished.record["broken_budgets"]) == 1, "it is not known what was lost"
     if bench.back_end == "process":
         assert (
-            "node 'hangs' had to be killed 5 s after the end began:"
+            "node 'hangs' had to be killed after 5 s without progress:"
             " finalise hook 'close' of 'hangs' did not finish" in finished.output
         )
         assert "hangs was at this point when it was killed:\n" in finished.output
@@ -91,7 +91,7 @@ def test_so_is_one_whose_finalise_hook_hangs_though_all_else_went_well(tmp_path:
         assert_ended(
             finished,
             1,
-            "node 'a' had to be killed 5 s after it began to finalise: finalise hook 'close' of"
+            "node 'a' had to be killed after 5 s without progress: finalise hook 'close' of"
             " 'a' did not finish; finalise hook 'save' of 'b' did not run",
         )
         assert "in close\n" in finished.record["nodes"]["a"]["stack"]

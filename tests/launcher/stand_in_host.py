@@ -12,7 +12,7 @@ import os
 import socket
 import sys
 import threading  # noqa: F401 - as in every node: it gives threads their names
-import time
+import time  # noqa: F401 - for what it does
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +46,20 @@ class Host:
     def send(self, kind: str, **fields: Any) -> None:
         self.socket.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
 
-    def ask(self, kind: str) -> None:
+    def ask(self, kind: str, **fields: Any) -> None:
         """Ask for something as an observer, over a connection of its own."""
         if self.observer is None:
             self.observer = socket.socket(self.family)
             self.connect(self.observer)
             self.observer.sendall(b'{"kind": "watch"}\n')
-        self.observer.sendall(json.dumps({"kind": kind}).encode() + b"\n")
+        self.observer.sendall(json.dumps({"kind": kind, **fields}).encode() + b"\n")
 
     def tell(self, kind: str, **fields: Any) -> None:
         """Send a message about the (first) node."""
         self.send(kind, **{"node": NAMES[0], **fields})
 
     def loaded(self) -> None:
-        """Its plugins are loaded; goes on when hooks may start."""
+        """Its plugins are loaded; goes on when initialise hooks may start."""
         self.report()
         self.send("loaded")
         self.wait_for("begin")
@@ -71,19 +71,17 @@ class Host:
             self.send(kind, **{"node": name, "metrics": metrics | self.connections, **fields})
 
     def up(self, **fields: Any) -> None:
-        """Hello, loaded, and the first hook has begun."""
+        """Hello, loaded, ready; goes on at time 0, when all others are up, too."""
         self.hello(**fields)
         self.loaded()
-        self.tell("first_hook")
+        self.ready()
+
+    def ready(self) -> None:
+        for name in NAMES:
+            self.send("ready", node=name)
+        self.wait_for("activate")
         for name in NAMES:
             Path(f"{name}.up").touch()
-
-    def up_last(self) -> None:
-        """The same, once all others are up."""
-        others = set(os.environ["ALL"].split()) - set(NAMES)
-        while not all(os.path.exists(f"{name}.up") for name in others):
-            time.sleep(0.005)
-        self.up()
 
     def hear(self) -> dict[str, Any] | None:
         """The next that the supervisor says, ``None`` when it has hung up."""
@@ -92,6 +90,9 @@ class Host:
 
     def wait_for(self, kind: str) -> None:
         while (message := self.hear()) and message["kind"] != kind:
+            if message["kind"] == "stop":  # before what it waits for
+                self.report(is_final=True)
+                sys.exit()
             self.answer(message)
 
     def answer(self, message: dict[str, Any]) -> None:

@@ -96,7 +96,7 @@ def test_a_supervisor_runs_nodes_that_connect_over_tcp(run: Run) -> None:
 
 def test_and_sees_those_that_crash(run: Run) -> None:
     run.listener = TcpListener
-    outcome = run(a="host.up_last(); import os; os._exit(7)", b=WELL_BEHAVED)
+    outcome = run(a="host.up(); import os; os._exit(7)", b=WELL_BEHAVED)
     assert outcome.reason == "node 'a' ended unexpectedly: exit code 7"
 
 

@@ -17,6 +17,7 @@ from neuros.launcher.peers import (
     STOPPING,
     Peers,
     PeerState,
+    Stage,
     state_from,
 )
 from neuros.project.model import Connection, Folders, Node, NodeFile
@@ -76,18 +77,37 @@ def said_last(launcher: Launcher) -> PeerState:
 # ------------------------------------------------------------------ finding each other
 
 
-def test_neighbours_that_are_missing_are_named_after_five_seconds_and_then_every_ten(
+def test_nodes_that_are_missing_are_named_after_five_seconds_and_then_every_ten(
     launcher: Launcher,
 ) -> None:
-    waits = "still waiting for nodes elsewhere: b (hint)"
+    waits = "still waiting for nodes elsewhere: b, c (hint)"
     heard = {now_s: texts for now_s in range(20) if (texts := launcher.remarks(float(now_s)))}
-    assert heard == {5: [waits], 15: [waits]}, "c is no neighbour of a"
+    assert heard == {5: [waits], 15: [waits]}
 
 
 def test_who_has_come_is_said_once_and_not_waited_for(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
     assert launcher.remarks(0.0) == ["found elsewhere: b (far)"]
+    assert launcher.remarks(100.0) == ["still waiting for nodes elsewhere: c (hint)"]
+
+
+def test_nodes_elsewhere_have_come_as_far_as_the_last_of_them(launcher: Launcher) -> None:
+    launcher.hears("b", replace(ELSEWHERE, stage=Stage.READY))
+    launcher.hears("c", replace(ELSEWHERE, run="third", stage=Stage.LOADED))
+    assert launcher.peers.have_reached(Stage.LOADED)
+    assert not launcher.peers.have_reached(Stage.READY)
+    launcher.peers.reach(Stage.READY)
+    assert said_last(launcher).stage == Stage.READY
+    launcher.remarks(0.0)
+    assert launcher.remarks(5.0) == ["nodes elsewhere are still starting: c"]
+    launcher.hears("c", replace(ELSEWHERE, run="third", number=2, stage=Stage.READY))
+    assert launcher.peers.have_reached(Stage.READY)
     assert launcher.remarks(100.0) == []
+
+
+def test_a_node_that_was_not_heard_of_has_come_nowhere(launcher: Launcher) -> None:
+    launcher.hears("b", replace(ELSEWHERE, stage=Stage.READY))
+    assert not launcher.peers.have_reached(Stage.LOADING)
 
 
 def test_the_rest_of_a_run_before_this_one_is_not_heeded(launcher: Launcher) -> None:
@@ -102,8 +122,9 @@ def test_the_rest_of_a_run_before_this_one_is_not_heeded(launcher: Launcher) -> 
 def test_nodes_elsewhere_are_waited_for_no_longer_than_asked() -> None:
     launcher = Launcher(timeout_s=7)
     assert [launcher.peers.overdue(now_s) for now_s in (100.0, 106.9)] == ["", ""]
-    assert launcher.peers.overdue(107.0).startswith("not found elsewhere within 7 s: b (hint): ")
+    assert launcher.peers.overdue(107.0).startswith("not found elsewhere within 7 s: b, c (hint): ")
     launcher.hears("b", ELSEWHERE)
+    launcher.hears("c", ELSEWHERE)
     assert launcher.peers.overdue(200.0) == ""
 
 
@@ -240,7 +261,7 @@ def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> No
 
 
 def test_a_state_comes_through_as_it_was() -> None:
-    state = PeerState("r", "h", 4, RUNNING, 0, "é", "o", 1.5, received(3))
+    state = PeerState("r", "h", 4, Stage.LOADED, RUNNING, 0, "é", "o", 1.5, received(3))
     assert state_from(state.to_text()) == state
 
 

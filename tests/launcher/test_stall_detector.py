@@ -72,6 +72,7 @@ def detector_of(*names: str) -> StallDetector:
     detector.greet(names, {}, 0.0)
     for name in names:
         detector.report(report(name), 0.0)
+        detector.note_ready(name)
     return detector
 
 
@@ -209,6 +210,19 @@ def test_nodes_that_start_slowly_are_named() -> None:
     detector.note_loaded("c")  # and waits for the others in its process
     detector.report(replace(LOADING, node="c"), 4.0)
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
+
+
+def test_nodes_that_keep_the_others_waiting_are_named() -> None:
+    slow = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads()))
+    slow.greet(["a", "b"], {}, 0.0)
+    slow.note_ready("a")
+    for name in ("a", "b"):
+        slow.report(report(name), 4.0)
+    assert remarks(slow, 5.0) == ["still initialising: b"]
+    slow.note_ready("b")
+    for name in ("a", "b"):
+        slow.report(report(name), 14.0)
+    assert remarks(slow, 15.0) == []
 
 
 def test_when_all_is_well_nothing_is_said() -> None:

@@ -16,8 +16,9 @@ from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import shutdown, stall_detector
+from neuros.launcher import shutdown
 from neuros.launcher.channels import Channels
+from neuros.launcher.peers import PeerState, Stage
 
 
 @pytest.fixture
@@ -67,20 +68,8 @@ host.report(is_final=True)
     assert (outcome.exit_code, outcome.failures) == (0, [])
 
 
-@pytest.mark.parametrize(
-    ("ends", "told", "exit_code"),
-    [
-        (SHUTS_DOWN, "drain", 0),
-        ("host.up_last(); host.ask('interrupt'); host.serve()", "stop", 130),
-    ],
-)
-def test_a_node_that_is_loaded_once_the_run_is_ending_is_not_told_to_begin(
-    run: Run,
-    told_to_begin: list[Sequence[str]],
-    ends: str,
-    told: str,
-    exit_code: int,
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_node_that_is_loaded_once_the_run_is_stopping_is_not_told_to_begin(
+    run: Run, told_to_begin: list[Sequence[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is killed; the kill may be on its way for long."""
     kill = RunningProcess.kill
@@ -94,19 +83,84 @@ def test_a_node_that_is_loaded_once_the_run_is_ending_is_not_told_to_begin(
 
     monkeypatch.setattr(RunningProcess, "kill", kill_late)
     run.when_file_exists("b.loaded", lambda: late[0].kill())
-    loads_late = f"""
+    loads_late = """
 host.hello()
 Path('b.up').touch()
-host.wait_for('{told}')
+while host.hear()['kind'] != 'stop':
+    pass
 host.send('loaded')
 host.tell('failed', text='it cannot be imported')
 Path('b.loaded').touch()
 host.wait_for('never')
 """
-    outcome = run(a=ends, b=loads_late)
-    assert (outcome.exit_code, outcome.failures) == (exit_code, [])
-    assert not outcome.has_final_report("b")
-    assert told_to_begin == [("a",)]
+    interrupts = """
+while not os.path.exists("b.up"):
+    time.sleep(0.01)
+host.hello()
+host.ask("interrupt")
+host.wait_for("never")
+"""
+    outcome = run(a=interrupts, b=loads_late)
+    assert (outcome.exit_code, outcome.failures) == (130, [])
+    assert outcome.reports == {}
+    assert told_to_begin == []
+
+
+@pytest.mark.parametrize(("tells", "goes_on_at"), [("loaded", "begin"), ("ready", "activate")])
+def test_no_node_goes_on_before_all_have_caught_up(run: Run, tells: str, goes_on_at: str) -> None:
+    """Each notes when it may go on; the last one makes the others wait until it has told."""
+    goes_on = f"""
+host.hello()
+if {tells!r} == "ready":
+    host.loaded()
+if NAMES == ["c"]:
+    time.sleep(0.3)
+    Path("c.tells").touch()
+host.send({tells!r}, **({{"node": NAMES[0]}} if {tells!r} == "ready" else {{}}))
+host.wait_for({goes_on_at!r})
+assert Path("c.tells").exists()
+host.ask("end", reason="enough")
+host.send("loaded")
+host.send("ready", node=NAMES[0])
+host.serve()
+"""
+    outcome = run(a=goes_on, b=goes_on, c=goes_on)
+    assert (outcome.exit_code, outcome.failures) == (0, [])
+
+
+def test_a_drained_end_that_is_asked_for_early_waits_until_all_have_initialised(run: Run) -> None:
+    initialises_late = """
+host.hello()
+host.loaded()
+time.sleep(0.3)
+host.send("ready", node="b")
+kinds = []
+while "activate" not in kinds:
+    message = host.hear()
+    kinds.append(message["kind"])
+    host.answer(message)
+assert "drain" in kinds, kinds
+host.serve()
+"""
+    shuts_down = """
+host.hello()
+host.loaded()
+host.tell("shutdown", reason="enough", drain_s=5)
+host.send("ready", node="a")
+host.serve()
+"""
+    outcome = run(a=shuts_down, b=initialises_late)
+    assert (outcome.exit_code, outcome.failures) == (0, [])
+    assert outcome.reason == "a ended the project: enough"
+    assert "a ended the project: enough; the end comes once every node has initialised" in (
+        run.output.said
+    )
+
+
+def test_a_node_that_fails_as_it_is_loaded_ends_the_run_of_those_that_wait(run: Run) -> None:
+    fails = "host.hello(); host.tell('failed', text='no such module'); host.wait_for('never')"
+    outcome = run(a="host.hello(); host.loaded(); host.serve()", b=fails)
+    assert (outcome.exit_code, outcome.reason) == (1, "node 'b' failed: no such module")
 
 
 def test_nothing_begins_where_not_all_could_be_started(
@@ -143,13 +197,11 @@ def test_one_that_has_not_started_and_outlasts_its_kill_is_named_so(
             kill(process)
 
     monkeypatch.setattr(RunningProcess, "kill", kill_at_the_second_time)
-    monkeypatch.setattr(shutdown, "STOP_S", 0.5)
-    interrupts = "host.up_last(); host.ask('interrupt'); host.serve()"
-    outcome = run(a=interrupts, b="host.hello(); Path('b.up').touch(); host.wait_for('never')")
+    monkeypatch.setattr(shutdown, "_KILLED_S", 0.5)
+    interrupts = "host.hello(); host.ask('interrupt'); host.wait_for('never')"
+    outcome = run(a=interrupts, b="host.hello(); time.sleep(60)")
     assert outcome.exit_code == 130
-    assert outcome.failures == [
-        "node 'b' had not started, and had not ended 0.5 s after it was killed"
-    ]
+    assert outcome.failures == ["node 'b' had not ended 0.5 s after it was killed"]
 
 
 def test_of_two_plugins_that_cannot_be_imported_both_are_told(
@@ -176,9 +228,9 @@ def test_the_first_of_two_that_end_it_is_named(run: Run) -> None:
     assert not any("b ended the project" in text for text in run.output.said)
 
 
-def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> None:
-    waits_first = "host.hello(); host.loaded(); import time; time.sleep(0.4); " + (
-        "host.tell('first_hook'); host.serve()"
+def test_the_duration_counts_from_when_all_are_ready_and_ends_drained(run: Run) -> None:
+    waits_first = "host.hello(); host.loaded(); time.sleep(0.4); " + (
+        "host.send('ready', node='a'); host.serve()"
     )
     outcome = run(a=waits_first, duration_s=0.3)
     assert outcome.exit_code == 0
@@ -186,9 +238,9 @@ def test_the_duration_counts_from_the_first_hook_and_ends_drained(run: Run) -> N
     assert 0.3 <= outcome.ending_s - outcome.started_s < 0.6
 
 
-def test_a_pause_before_the_first_hook_leaves_the_duration_as_it_is(run: Run) -> None:
+def test_a_pause_before_all_are_ready_leaves_the_duration_as_it_is(run: Run) -> None:
     paused = "host.ask('pause'); time.sleep(1.0); host.ask('resume')"
-    act = f"host.hello(); host.loaded(); import time; {paused}; host.tell('first_hook')"
+    act = f"host.hello(); host.loaded(); {paused}; host.send('ready', node='a')"
     outcome = run(a=f"{act}; host.serve()", duration_s=0.3)
     assert outcome.reason == "0.3 s are over"
     assert 0.3 <= outcome.ending_s - outcome.started_s < 1.0
@@ -249,29 +301,20 @@ def test_packets_under_way_are_waited_for_and_named_if_they_do_not_come(run: Run
     assert text.endswith("a packet is under way on `a.o -> b.x`")
 
 
-def test_a_node_that_had_not_been_loaded_is_not_waited_for_and_is_no_failure(run: Run) -> None:
-    loading = "host.hello(); open('loading', 'w'); import time; time.sleep(60)"
-    ends_then = """
-import os, time
-host.up()
-while not os.path.exists('loading'):
-    time.sleep(0.01)
-host.tell('shutdown', reason='', drain_s=5)
-host.serve()
-"""
-    outcome = run(a=ends_then, b=loading)
-    assert (outcome.exit_code, outcome.failures) == (0, [])
-    assert "'b' had not started yet: killed" in run.output.said
-    assert run.lasted_s < 4
+def test_a_node_that_is_still_loading_is_waited_for(run: Run) -> None:
+    """Here by a user of the dashboard, who ends the run before it has begun."""
+    starts = "host.loaded(); host.ready(); host.serve()"
+    ends = f"host.hello(); host.ask('end', reason='enough'); {starts}"
+    outcome = run(a=ends, b=f"host.hello(); time.sleep(1); {starts}")
+    assert (outcome.exit_code, outcome.failures, outcome.reason) == (0, [], "enough")
+    assert all(outcome.has_final_report(name) for name in "ab")
 
 
 # ------------------------------------------------------------------ failures
 
 
 def test_a_node_fails(run: Run) -> None:
-    fails = (
-        "host.up_last(); host.tell('failed', text='p.py:3: hook \\'f\\': ZeroDivisionError\\nmore')"
-    )
+    fails = "host.up(); host.tell('failed', text='p.py:3: hook \\'f\\': ZeroDivisionError\\nmore')"
     outcome = run(a=fails, b=WELL_BEHAVED)
     assert outcome.exit_code == 1
     assert outcome.reason == "node 'a' failed: p.py:3: hook 'f': ZeroDivisionError"
@@ -294,7 +337,7 @@ def test_a_failure_without_words_is_one_all_the_same(run: Run) -> None:
     ],
 )
 def test_a_node_that_ends_by_itself_is_a_failure(run: Run, act: str, how: str) -> None:
-    outcome = run(a=f"host.up_last(); {act}", b=WELL_BEHAVED)
+    outcome = run(a=f"host.up(); {act}", b=WELL_BEHAVED)
     assert outcome.exit_code == 1
     assert outcome.reason == f"node 'a' ended unexpectedly: {how}"
     assert outcome.has_final_report("b")
@@ -363,7 +406,7 @@ def test_how_a_process_ends_after_its_final_report_is_of_no_importance(run: Run)
 
 def test_every_failure_is_noted_and_the_first_decides(run: Run) -> None:
     outcome = run(
-        a="host.up_last(); host.tell('failed', text='one'); host.wait_for('stop')",
+        a="host.up(); host.tell('failed', text='one'); host.wait_for('stop')",
         b="host.up(); host.wait_for('stop'); host.tell('failed', text='other')",
     )
     assert outcome.failures == ["node 'a' failed: one", "node 'b' failed: other"]
@@ -392,24 +435,16 @@ def test_a_deadlock_names_its_cycle(run: Run) -> None:
     )
 
 
-def test_a_duration_that_has_not_begun_is_named_when_nothing_moves(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stall_detector, "STALL_S", 0.1)
-    run.after("no hook has run yet, and --duration counts from the first one", run.press_ctrl_c)
-    outcome = run(
-        a="host.is_idle = False; host.hello(); host.loaded(); host.serve()", duration_s=0.1
-    )
-    assert outcome.exit_code == 130
-
-
 def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
     outcome = run(a="host.is_idle = False; " + WELL_BEHAVED, b=WELL_BEHAVED, duration_s=2.5)
     assert outcome.exit_code == 0
 
 
 def test_nor_where_other_nodes_run_elsewhere(run: Run) -> None:
-    assert run(a=WELL_BEHAVED, duration_s=2.5, elsewhere=("b",)).exit_code == 0
+    state = PeerState("another run", "far", 1, Stage.READY).to_text()
+    hears = f"host.hello(); host.send('heard', node='b', text={state!r}); host.loaded()"
+    outcome = run(a=f"{hears}; host.ready(); host.serve()", duration_s=2.5, elsewhere=("b",))
+    assert outcome.exit_code == 0
 
 
 # ------------------------------------------------------------------ several nodes in one process

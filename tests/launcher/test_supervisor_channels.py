@@ -105,11 +105,11 @@ def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
 ) -> None:
     node.socket.sendall(b"GET / HTTP/1.1\r\n")
     node.send(Hello(("a", "b")))
-    node.socket.sendall(b'{"kind": "first_hook"}\n')
+    node.socket.sendall(b'{"kind": "ready"}\n')
     (link, stranger), _, (_, known) = channels.receive()
     assert str(stranger).startswith("an unknown program sent something that is not a control")
     assert str(known) == (
-        "the process of a and b sent a wrong control message 'first_hook': field node is missing"
+        "the process of a and b sent a wrong control message 'ready': field node is missing"
     )
     channels.hang_up(link)
     node.socket.settimeout(5.0)

@@ -111,7 +111,7 @@ def test_a_node_that_does_not_end_is_killed_after_five_seconds(run: Run) -> None
     outcome = run(a=SHUTS_DOWN, b=f"host.up(); host.wait_for('stop'); {DEAF}")
     assert outcome.exit_code == 1
     assert re.fullmatch(
-        r"node 'b' had to be killed 5 s after the end began:"
+        r"node 'b' had to be killed after 5 s without progress:"
         r" 'b' did not begin to finalise and had not reported for \d s",
         outcome.reason,
     )
@@ -150,7 +150,7 @@ in_teardown()
 """
     outcome = run(a=SHUTS_DOWN, b=stuck)
     assert outcome.reason == (
-        "node 'b' had to be killed 5 s after the end began: its process did not end"
+        "node 'b' had to be killed 5 s after its final report: its process did not end"
     )
     assert "in in_teardown" in outcome.stacks["b"]
     where = "where the threads of 'b' stood when killed:\n"
@@ -158,7 +158,7 @@ in_teardown()
 
 
 def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
-    stops = "host.up_last(); host.tell('hooks', hooks=[], finalise=['save', 'close']); " + (
+    stops = "host.up(); host.tell('hooks', hooks=[], finalise=['save', 'close']); " + (
         "host.tell('shutdown', reason='', drain_s=0.2); "
         "import os, signal; os.kill(os.getpid(), signal.SIGSTOP)"
     )
@@ -166,7 +166,7 @@ def test_a_stopped_node_holds_up_nobody(run: Run) -> None:
     assert outcome.has_final_report("b")
     assert outcome.exit_code == 1
     assert outcome.reason == (
-        "node 'a' had to be killed 5 s after the end began:"
+        "node 'a' had to be killed after 5 s without progress:"
         " finalise hooks 'save' and 'close' of 'a' did not run"
     )
     assert run.lasted_s < 7
@@ -185,7 +185,7 @@ close()
 """
     outcome = run(a=SHUTS_DOWN, b=hangs)
     assert outcome.reason == (
-        "node 'b' had to be killed 5 s after the end began: finalise hook 'close' of 'b' did not"
+        "node 'b' had to be killed after 5 s without progress: finalise hook 'close' of 'b' did not"
         " finish; finalise hook 'last' of 'b' did not run"
     )
     assert outcome.stacks["b"].endswith(", in close")
@@ -207,9 +207,9 @@ host.tell('finalising', hook='')
         c=closes.replace("hook='')", "hook='')\nhost.tell('finalising', hook=None)"),
     )
     assert sorted(outcome.failures) == [
-        "node 'b' had to be killed 5 s after the end began:"
+        "node 'b' had to be killed after 5 s without progress:"
         " what 'b' has registered with node.on_close did not end",
-        "node 'c' had to be killed 5 s after the end began:"
+        "node 'c' had to be killed after 5 s without progress:"
         " 'c' had finalised, but did not make its final report",
     ]
 
@@ -260,7 +260,7 @@ def test_many_of_them_are_not_shown_one_by_one(run: Run) -> None:
 def test_a_node_that_is_not_understood_makes_the_run_fail(
     run: Run, message: str, complaint: str
 ) -> None:
-    outcome = run(a=f"host.up_last(); {message}; {message}; host.serve()", b=WELL_BEHAVED)
+    outcome = run(a=f"host.up(); {message}; {message}; host.serve()", b=WELL_BEHAVED)
     assert outcome.exit_code == 1
     assert outcome.reason.startswith(f"control channel: the process of a {complaint}")
     assert outcome.failures == [outcome.reason], "it is said once"
@@ -273,11 +273,81 @@ def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
     assert "a waits for `x` from b; and more" in run.output.said
 
 
-def test_a_run_that_was_stopped_while_it_ended_has_its_time_afterwards(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("neuros.launcher.shutdown.STOP_S", 1.0)
+# ------------------------------------------------------------------ time to finalise
 
+
+def finalises(body: str) -> str:
+    """A node that does this in a finalise hook, which takes 2 s in all."""
+    return f"""
+host.up()
+host.send("hooks", node="a", hooks=[], finalise=["save"])
+host.tell("shutdown", reason="", drain_s=5)
+host.wait_for("stop")
+host.tell("finalising", hook="save")
+for count in range(8):
+    {body}
+    time.sleep(0.25)
+host.tell("finalising", hook=None)
+host.report(is_final=True)
+"""
+
+
+@pytest.mark.parametrize(
+    "shows",
+    [
+        "host.tell('progress', text=f'{count} of 8')",
+        "open('a/weights', 'a').write('w')",
+        "Path('a', f'picture_{count}.png').touch()",
+        "os.makedirs(f'a/b/{count}'); open(f'a/b/{count}/file', 'w').write('w')",
+    ],
+)
+def test_a_node_that_shows_progress_as_it_finalises_is_not_killed(run: Run, shows: str) -> None:
+    outcome = run(a=finalises(shows), finalise_s=0.8)
+    assert (outcome.exit_code, outcome.failures) == (0, [])
+    assert "saving: 'a' (finalise hook 'save')" in run.output.said
+
+
+@pytest.mark.parametrize("shows", ["pass", "host.report()", "open('weights', 'a').write('w')"])
+def test_a_node_that_shows_none_is_killed_when_its_time_is_over(run: Run, shows: str) -> None:
+    outcome = run(a=finalises(shows), finalise_s=0.8)
+    assert outcome.exit_code == 1
+    assert outcome.failures == [
+        "node 'a' had to be killed after 0.8 s without progress: finalise hook 'save' of 'a' did"
+        " not finish"
+    ]
+
+
+def test_a_node_that_shows_none_is_killed_alone(run: Run) -> None:
+    outcome = run(
+        a=finalises("host.tell('progress', text='saving')"),
+        b="host.up(); host.wait_for('stop'); time.sleep(60)",
+        finalise_s=0.8,
+    )
+    assert len(outcome.failures) == 1
+    assert outcome.failures[0].startswith("node 'b' had to be killed after 0.8 s without progress")
+    assert outcome.has_final_report("a")
+
+
+def test_what_a_plugin_tells_of_its_progress_is_shown_at_most_once_per_second(run: Run) -> None:
+    run(a=finalises("host.tell('progress', text=f'{count} of 8')"))
+    told = [text for text in run.output.said if text.startswith("a: ")]
+    assert told[0] == "a: 0 of 8"
+    assert 2 <= len(told) <= 3
+
+
+def test_a_second_ctrl_c_ends_a_node_that_shows_progress_for_ever(run: Run) -> None:
+    def press_twice() -> None:
+        run.press_ctrl_c()
+        run.press_ctrl_c()
+
+    run.after("saving: 'a'", press_twice)
+    act = finalises("host.tell('progress', text='saving')").replace("range(8)", "range(10**6)")
+    outcome = run(a=act, finalise_s=0.8)
+    assert outcome.exit_code == 130
+    assert run.lasted_s < 6
+
+
+def test_a_run_that_was_stopped_while_it_ended_has_its_time_afterwards(run: Run) -> None:
     def stand_still() -> None:
         time.sleep(1.5)  # as under SIGSTOP
         (run.folder / "goes on").touch()
@@ -291,5 +361,5 @@ while not os.path.exists('goes on'):
     time.sleep(0.01)
 host.report(is_final=True)
 """
-    outcome = run(a=waits)
+    outcome = run(a=waits, finalise_s=1.0)
     assert (outcome.exit_code, outcome.failures) == (0, [])

@@ -106,6 +106,7 @@ class ModelNode:
         return True
 
     def give_way(self) -> None: ...
+    def note_ready(self) -> None: ...
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         if self.is_over:

@@ -226,7 +226,7 @@ class StepLock:
 
 
 class FreeRun:
-    """Repeats: a bout of steps, wait for the wall clock, hand over the packets that are due.
+    """From time 0 of the run on: a bout of steps, wait for the wall clock, send what is due.
 
     Handing over waits while a reliable connection is blocked, and stepping with it; model and data
     are free for visitors of the lock meanwhile. An error ends the node. It ends by itself when the
@@ -277,9 +277,10 @@ class FreeRun:
 
     def _run(self) -> None:
         try:
-            self.pacer.start(self._sim_time())
-            while self._bout():
-                pass
+            if self._node.wait_until_active(self._stopped.is_set):
+                self.pacer.start(self._sim_time())
+                while self._bout():
+                    pass
         except BaseException as error:
             if not self._stopped.is_set():
                 self._node.fail(error)

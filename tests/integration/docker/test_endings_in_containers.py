@@ -64,7 +64,7 @@ def test_a_node_that_had_to_be_killed_is_a_failure_and_it_is_said_where_it_stood
         "gil": "'gil' was still executing 'hold'; finalise hook 'save' of 'gil' did not run",
         "hangs": "finalise hook 'close' of 'hangs' did not finish",
     }.items():
-        assert f"'{node}' had to be killed 5 s after the end began: {what}" in finished.output
+        assert f"'{node}' had to be killed after 5 s without progress: {what}" in finished.output
         assert f"{node} was at this point when it was killed:\n" in finished.output
         assert f'File "{bench.folder}/{node}.py", line ' in finished.record["nodes"][node]["stack"]
 
