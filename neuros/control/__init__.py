@@ -208,10 +208,10 @@ class Finalising(Message):
 
 @dataclass
 class Progress(Message):
-    """A plugin tells how far it has come; a node that finalises has time again."""
+    """A node is getting on, so it has time again while it finalises; ``text`` of its plugin."""
 
     node: str
-    text: str
+    text: str = ""
 
 
 @dataclass

@@ -114,10 +114,10 @@ class Shutdown:
         self._finalising.note_hook(node, hook, time.monotonic())
 
     def note_progress(self, node: str, text: str) -> None:
-        """A plugin tells how far it has come."""
+        """A node is getting on; its plugin may tell how far it has come."""
         now_s = time.monotonic()
         self._finalising.note_progress(node, now_s)
-        if now_s - self._told_s.get(node, 0.0) >= _TELL_S:
+        if text and now_s - self._told_s.get(node, 0.0) >= _TELL_S:
             self._told_s[node] = now_s
             self._output.log("INFO", f"{node}: {text}")
 

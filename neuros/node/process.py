@@ -28,6 +28,7 @@ from neuros.node.failures import as_node_error, callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
+from neuros.node.saving import Saving
 from neuros.node.stepping import SessionSteps
 from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder
 from neuros.project.model import Connection, NodeFile
@@ -85,7 +86,8 @@ class NodeProcess:
         self._is_paused = False
         self._step: Advance | None = None
         self._is_settling = False
-        self._has_begun = self._is_active = self._is_finalising = False
+        self._has_begun = self._is_active = False
+        self._saving: tuple[str, Saving] | None = None  # of the node that finalises
         self._is_draining = self._has_been_reset = False
         self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
@@ -110,8 +112,8 @@ class NodeProcess:
             thread.start()
             self._guard(self._live)
             self.report()  # hooks are over: what peers want to know is known before a long end
-            self._is_finalising = True
             for node in self._nodes:
+                self._saving = node.name, Saving(node.run_dir)
                 self._guard(functools.partial(node.finalise, runs_hooks=self._has_begun))
                 self._guard(functools.partial(self._report_last, node))
             self._guard(self._peers.close)
@@ -203,9 +205,13 @@ class NodeProcess:
     def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
-            if not self._is_finalising:  # a file that grows would pass for progress of the plugin
+            if self._saving is None:  # else a log that grows would pass for progress of the plugin
                 node.reports.write_logs()
             self._tell(node.reports.report())
+        if self._saving is not None:
+            name, saving = self._saving
+            if saving.is_writing:
+                self._tell(control.Progress(name))
 
     def _report_last(self, node: NodeRuntime) -> None:
         node.reports.write_logs()
