@@ -1,10 +1,9 @@
 """JSON values with their positions in the file.
 
 Python's ``json`` keeps neither the positions of keys and values nor duplicate keys (the last one
-wins silently), and both are needed to tell a user what is wrong where. Of the libraries that keep
-positions, json-source-map loses duplicates and has had no release for years; json5 reports no
-positions. So this scanner reads objects and arrays, and leaves scalars to the standard library's
-decoder.
+wins silently), and both are needed to tell a user what is wrong where. So the brackets are read
+here, and Python's ``json`` reads the scalars. PyYAML, which keeps positions, refuses what JSON
+allows: a key of 1025 characters, a character in two escapes, a colon in the line after its key.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ import math
 import os
 import re
 from bisect import bisect_right
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,7 +24,7 @@ from neuros.ordinary_files import open_ordinary
 
 _MAX_DEPTH = 100
 _MOST_BYTES = 4 << 20
-_SPACE = re.compile(r"[ \t\n\r]*")
+_TOKEN = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\w.+-]+|[^ \t\r\n]|\Z', re.DOTALL)
 _HALF_CHARACTER = re.compile("[\ud800-\udfff]")
 
 
@@ -190,117 +189,102 @@ def read_file(path: Path) -> tuple[Element, list[Problem]]:
 
 def parse(source: Source, start: int = 0, pointer: str = "") -> tuple[Element, list[Problem]]:
     """Parse the JSON document from ``start`` to the end. Raises :class:`SourceError`."""
-    scanner = _Scanner(source)
-    element = scanner.document(start, pointer)
+    scanner = _Scanner(source, _TOKEN.finditer(source.text, start))
+    if source.text.startswith("\ufeff"):
+        scanner.fail(0, pointer, "the file begins with a byte order mark", "save it without")
+    element = scanner.value(pointer)
+    if scanner.token[0]:
+        text = "there is more text after the end of the document"
+        scanner.fail(scanner.token.start(), pointer, text)
     return element, scanner.duplicates
 
 
-@dataclass
 class _Scanner:
-    source: Source
-    duplicates: list[Problem] = field(default_factory=list)
-    depth: int = 0
+    """Reads the tokens of a document; the last of them is empty."""
 
-    @cached_property
-    def _decoder(self) -> json.JSONDecoder:
-        return json.JSONDecoder(parse_constant=_refuse_constant)
+    def __init__(self, source: Source, tokens: Iterator[re.Match[str]]) -> None:
+        self._source, self._tokens = source, tokens
+        self.token, self.duplicates = next(tokens), list[Problem]()
 
-    def document(self, start: int, pointer: str) -> Element:
-        if self.source.text.startswith("\ufeff"):
-            self._fail(0, pointer, "the file begins with a byte order mark", "save it without")
-        element = self._value(self._skip(start), pointer)
-        end = self._skip(element.end)
-        if end != len(self.source.text):
-            self._fail(end, pointer, "there is more text after the end of the document")
-        return element
-
-    def _value(self, start: int, pointer: str) -> Element:
-        opening = self.source.text[start : start + 1]
+    def value(self, pointer: str, depth: int = 1) -> Element:
+        """The value that begins with the current token, which is the one behind it afterwards."""
+        start, opening = self.token.start(), self.token[0]
         if opening not in ("{", "["):
-            return self._scalar(start, pointer)
-        self.depth += 1
-        if self.depth > _MAX_DEPTH:
-            self._fail(start, pointer, "is nested too deeply")
-        element = Element({} if opening == "{" else [], self.source, start, start, pointer)
-        read = self._object_item if opening == "{" else self._array_item
-        element.end = self._sequence(element, "}" if opening == "{" else "]", read)
-        self.depth -= 1
-        return element
+            value, end = self._scalar(pointer)
+            return Element(value, self._source, start, end, pointer)
+        if depth > _MAX_DEPTH:
+            self.fail(start, pointer, "is nested too deeply")
+        found = Element({} if opening == "{" else [], self._source, start, start, pointer)
+        closing, what = ("}", "a member") if opening == "{" else ("]", "an item")
+        self._advance()
+        while self.token[0] != closing:
+            self._member(found, depth)
+            position = self.token.start()
+            if self.token[0] == ",":
+                self._advance()
+                if self.token[0] == closing:
+                    self.fail(position, pointer, f"a comma before '{closing}'", "remove the comma")
+            elif self.token[0] != closing:
+                self.fail(position, pointer, f"expected ',' or '{closing}' after {what}")
+        found.end = self._advance()
+        return found
 
-    def _scalar(self, start: int, pointer: str) -> Element:
-        try:
-            value, end = self._decoder.raw_decode(self.source.text, start)
-        except json.JSONDecodeError as error:
-            return self._fail_value(start, error, pointer)
-        except ValueError as error:  # NaN and the like, or an integer of thousands of digits
-            self._fail(start, pointer, str(error))
-        if isinstance(value, str) and (half := half_character(value)):
-            self._fail(start, pointer, half, "a character beyond \\uffff takes two escapes")
-        if isinstance(value, float) and math.isinf(value):
-            self._fail(start, pointer, "the number is too large")
-        return Element(value, self.source, start, end, pointer)
-
-    def _sequence(self, parent: Element, closing: str, read: Any) -> int:
-        """Read items up to the closing bracket; returns the position behind it."""
-        text, position = self.source.text, self._skip(parent.start + 1)
-        if text.startswith(closing, position):
-            return position + 1
-        while True:
-            position = self._skip(read(parent, position))
-            if text.startswith(closing, position):
-                return position + 1
-            if not text.startswith(",", position):
-                what = "a member" if closing == "}" else "an item"
-                self._fail(position, parent.pointer, f"expected ',' or '{closing}' after {what}")
-            comma, position = position, self._skip(position + 1)
-            if text.startswith(closing, position):
-                self._fail(comma, parent.pointer, f"a comma before '{closing}'", "remove the comma")
-
-    def _array_item(self, parent: Element, start: int) -> int:
-        item = self._value(start, f"{parent.pointer}/{len(parent.value)}")
-        parent.value.append(item)
-        return item.end
-
-    def _object_item(self, parent: Element, start: int) -> int:
-        if not self.source.text.startswith('"', start):
-            self._fail(start, parent.pointer, "expected a key in double quotes")
-        key = self._scalar(start, parent.pointer)
-        pointer = f"{parent.pointer}/{escape(key.value)}"
-        colon = self._skip(key.end)
-        if not self.source.text.startswith(":", colon):
-            self._fail(colon, pointer, "expected ':' after the key")
-        member = self._value(self._skip(colon + 1), pointer)
+    def _member(self, parent: Element, depth: int) -> None:
+        """Add a member or an item to an object or an array."""
+        if isinstance(parent.value, list):
+            pointer = f"{parent.pointer}/{len(parent.value)}"
+            parent.value.append(self.value(pointer, depth + 1))
+            return
+        start = self.token.start()
+        if not self.token[0].startswith('"'):
+            self.fail(start, parent.pointer, "expected a key in double quotes")
+        key, _ = self._scalar(parent.pointer)
+        pointer = f"{parent.pointer}/{escape(key)}"
+        if self.token[0] != ":":
+            self.fail(self.token.start(), pointer, "expected ':' after the key")
+        self._advance()
+        member = self.value(pointer, depth + 1)
         member.key_start = start
-        first = parent.value.get(key.value)
-        if first is not None:
-            line, _ = self.source.place(first.key_start)
-            self.duplicates.append(
-                member.key_problem(f"the key '{key.value}' occurs twice", f"first in line {line}")
-            )
-        parent.value[key.value] = member
-        return member.end
+        if first := parent.value.get(key):
+            line, _ = self._source.place(first.key_start)
+            text, hint = f"the key '{key}' occurs twice", f"first in line {line}"
+            self.duplicates.append(member.key_problem(text, hint))
+        parent.value[key] = member
 
-    def _skip(self, position: int) -> int:
-        match = _SPACE.match(self.source.text, position)
-        return match.end() if match else position
-
-    def _fail_value(self, start: int, error: json.JSONDecodeError, pointer: str) -> NoReturn:
-        if self.source.text.startswith('"', start):
+    def _scalar(self, pointer: str) -> tuple[Any, int]:
+        start, text = self.token.start(), self.token[0]
+        try:
+            value = _DECODER.decode(text)
+        except json.JSONDecodeError as error:
+            if not text.startswith('"'):
+                self.fail(start, pointer, "expected a value")
             message = error.msg.removesuffix(" at").replace(" starting", "")
             hint = "is the closing quote missing?" if "\\" not in message else ""
-            text = f"bad string: {message[0].lower()}{message[1:]}"
-            self._fail(error.pos, pointer, text, hint)
-        self._fail(start, pointer, "expected a value")
+            message = f"bad string: {message[0].lower()}{message[1:]}"
+            self.fail(start + error.pos, pointer, message, hint)
+        except ValueError as error:  # NaN and the like, or an integer of thousands of digits
+            self.fail(start, pointer, str(error))
+        if isinstance(value, str) and (half := half_character(value)):
+            self.fail(start, pointer, half, "a character beyond \\uffff takes two escapes")
+        if isinstance(value, float) and math.isinf(value):
+            self.fail(start, pointer, "the number is too large")
+        return value, self._advance()
 
-    def _fail(self, position: int, pointer: str, text: str, hint: str = "") -> NoReturn:
-        rest = self.source.text[position : position + 2]
+    def _advance(self) -> int:
+        """Go to the next token; returns the end of the current one."""
+        end = self.token.end()
+        self.token = next(self._tokens)
+        return end
+
+    def fail(self, position: int, pointer: str, text: str, hint: str = "") -> NoReturn:
+        rest = self._source.text[position : position + 2]
         if not rest:
             hint = hint or "the file ends here"
         elif rest[0] == "#" or rest in ("//", "/*"):
             hint = "JSON has no comments"
         elif rest[0] == "'":
             hint = "JSON has double quotes only"
-        raise SourceError(self.source.problem(position, pointer, f"syntax error: {text}", hint))
+        raise SourceError(self._source.problem(position, pointer, f"syntax error: {text}", hint))
 
 
 def place_of(file: Path, pointer: str) -> tuple[int, int]:
@@ -321,3 +305,6 @@ def problem_in(file: Path, pointer: str, text: str, hint: str = "") -> Problem:
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a JSON number")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_refuse_constant)

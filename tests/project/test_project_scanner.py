@@ -125,6 +125,8 @@ def test_the_last_of_duplicate_keys_counts_and_each_further_one_is_reported() ->
         ('{"a" 1}', "f:1:6: /a: syntax error: expected ':' after the key"),
         ('{"a": tru}', "f:1:7: /a: syntax error: expected a value"),
         ("[NaN]", "f:1:2: /0: syntax error: NaN is not a JSON number"),
+        ("[50// Hz", "f:1:4: /: syntax error: expected ',' or ']' after an item "
+                     "(JSON has no comments)"),
         ("1 # one", "f:1:3: /: syntax error: there is more text after the end of the document "
                     "(JSON has no comments)"),
     ],
